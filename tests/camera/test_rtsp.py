@@ -179,17 +179,6 @@ def test_a_clock_of_the_camera_that_runs_slow_makes_nothing_old(
     assert max(waiting.waited_s(k / 25 * (1 - slow), k / 25) for k in range(25 * for_s)) <= most_s
 
 
-def test_a_heap_that_comes_slowly_is_old_to_its_end() -> None:
-    """1.9 s without a picture, then those of that time at twice the rate."""
-    waiting = TransferDelay()
-    for k in range(100):
-        waiting.waited_s(k / 25, k / 25)
-    for k in range(80):
-        arrival_s = 3.96 + 1.9 + k / 50
-        known_s = waiting.waited_s(4.0 + k / 25, arrival_s)
-        assert known_s == pytest.approx(max(arrival_s - (4.0 + k / 25), 0.0), abs=0.25)
-
-
 def test_a_clock_of_the_camera_that_is_set_back_makes_nothing_old() -> None:
     waiting, times_s = TransferDelay(), (50.0, 50.04, 3.0, 3.04)
     waits_s = [waiting.waited_s(t_s, 100.0 + k / 25) for k, t_s in enumerate(times_s)]

@@ -19,11 +19,11 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link import CflibLink, MockLink, ProbeLink
+from perchctl.link import CflibLink, ProbeLink
 from perchctl.link.cflib_link import LANDING_WAIT_S
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
-from perchctl.sim import Scenario, SimProcess, SimulatedVehicle
+from perchctl.sim import Scenario, SimProcess
 from perchctl.vehicle import (
     CAN_FLY,
     FLYING,
@@ -188,22 +188,6 @@ def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) ->
         sample = newest(link)
         assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
         assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
-
-
-def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:
-    """By its stamps over the radio; simulated in lockstep, by the firmware's own clock."""
-    with linked(sim) as link:
-        let_pass(sim, 2.0)
-        assert newest(link).start == 0
-        sim.reboot()
-        until(lambda: any(sample.start == 1 for sample in link.telemetry()))
-    vehicle = SimulatedVehicle(LOW_CEILING)
-    mock = MockLink(vehicle)
-    mock.advance_to(0.5)
-    assert mock.telemetry()[-1].start == 0
-    vehicle.firmware.reboot()
-    mock.advance_to(1.0)
-    assert mock.telemetry()[-1].start == 1
 
 
 # --- In the air, and left ---------------------------------------------------------------------

@@ -25,8 +25,6 @@ from perchctl.link.connection import send_packets
 from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import execute
-from perchctl.sim.firmware.controller import Setpoint
-from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -161,23 +159,6 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
         assert packet is not None
         execute(firmware, packet)  # type: ignore[arg-type]
     assert in_lockstep(command) == firmware.made
-
-
-@pytest.mark.parametrize(("command", "calls"), [
-    (Idle(), []),
-    (PositionSetpoint(0.25, -0.5, 1.5, math.pi / 2),
-     [("low_level", (Setpoint.position(0.25, -0.5, 1.5, 90.0),))]),
-    (PositionSetpoint(math.nan, 0.0, 1.0, 0.0), []),
-    (RawThrust(40000), [("low_level", (Setpoint.raw(0.0, 0.0, 0.0, 40000),))]),
-    (RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
-     [("low_level", (Setpoint.raw(22.5, -45.0, 0.0, 40000),))]),
-    (Land(-0.25, 3.0), [*[("high_level", (HlLand(-0.25, 3.0, None),))] * LAND_TIMES,
-                        ("notify_setpoint_stop", ())]),
-    (EmergencyStop(), [("emergency_stop", ())]),
-])  # fmt: skip
-def test_the_lockstep_vehicle_flies_the_command(command: Command, calls: list[Any]) -> None:
-    """Values that a float of four bytes holds exactly; what is no number it does not fly."""
-    assert in_lockstep(command) == calls
 
 
 class LosesTheFirst(Radio):

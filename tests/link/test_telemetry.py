@@ -4,7 +4,6 @@ of a vehicle that is moved by hand."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,13 +28,8 @@ from perchctl.link.telemetry import (
     Timebase,
     telemetry_from,
 )
-from perchctl.mission import Observation, Phase, PlannerState
-from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
-from perchctl.mission.context import Context
-from perchctl.mission.state import Condition
-from perchctl.profile import LinkConfig, Profile
+from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
-from tests.helpers.mission import READY, telemetry
 
 SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
 
@@ -126,28 +120,6 @@ def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
     sample = assembler.accept("attitude", STILL["attitude"], 2.02, 1)
     assert sample is not None
     assert (sample.start, sample.behind_s) == (1, pytest.approx(0.01))
-
-
-HANGS = telemetry(1.0, 2.0, thrust=0.0, supervisor=READY)
-HANGING = PlannerState(
-    phase=Phase.COMPLETE, released_s=0.0, contact_z_m=2.0, hover_thrust=50000.0,
-    ground_m=(0.0, 0.0, 0.0),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("behind_s", [0.0, 0.15, 2.0])
-def test_a_frozen_position_proves_no_place(behind_s: float) -> None:
-    """A position block that alone stops arriving looks like a vehicle at rest. What rests on
-    acceleration, thrust and the supervisor's word, which are fresh, is proven all the same."""
-    obs = Observation(1.0, replace(HANGS, behind_s=behind_s))
-    proven = PROOFS & conditions_since(Context(HANGING, obs, Profile())).keys()
-    assert not (proven & BY_PLACE and behind_s > 0.0)
-    assert Condition.WEIGHT_HANGS in proven
-    old = replace(HANGS, t_s=1.0 - 0.15)
-    assert (
-        not PROOFS
-        & conditions_since(Context(HANGING, replace(obs, telemetry=old), Profile())).keys()
-    )
 
 
 # --- A vehicle that is moved by hand: the link itself is tested by the command that uses it, in
