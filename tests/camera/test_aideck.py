@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
-from perchctl.camera import aideck as aideck_module
 from perchctl.camera.aideck import (
     STALLED_S,
     AiDeckSource,
     MosaicFilter,
-    _Picture,
     has_mosaic,
     without_mosaic,
 )
@@ -39,7 +36,7 @@ from tests.helpers.aideck import (
     raw_packets,
 )
 from tests.helpers.commands import run
-from tests.helpers.live import Clock, begun, level, next_frame, resized
+from tests.helpers.live import Clock, begun, level, next_frame
 from tests.helpers.waiting import until
 
 CAMERA = load_calibration("example_aideck_324x244.yaml")
@@ -149,20 +146,6 @@ def test_a_fault_costs_its_own_picture_and_no_connection(
     after = next_frame(source)
     assert (level(after), after.index) == (160, 1)
     assert source.connections == 1
-
-
-@pytest.mark.parametrize("said", [(65_000, 65_000), (325, 244), (0, 244)])
-def test_a_jpeg_whose_size_bytes_are_damaged_is_not_decoded(
-    said: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = b"".join(p[4:] for p in jpeg_packets(picture(80))[1:])
-
-    def pixels(data: bytes) -> np.ndarray[Any, Any] | None:
-        return _Picture(0.0, 324, 244, True, len(data), bytearray(data)).pixels()
-
-    assert pixels(whole) is not None
-    monkeypatch.setattr(aideck_module, "grey_pixels", lambda data: pytest.fail("decoded"))
-    assert pixels(resized(whole, *said)) is None
 
 
 @pytest.mark.parametrize("end", [

@@ -4,17 +4,13 @@ of a vehicle that is moved by hand."""
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.errors import TimedOut
-from perchctl.link import MotionLink, listening
-from perchctl.link.cflib_link import SILENCE_S
+from perchctl.link import MotionLink
 from perchctl.link.listening import MOTION_BLOCK
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
@@ -173,23 +169,3 @@ def test_a_turn_that_is_no_number_is_dropped_alone(name: str, number: float) -> 
     taken = link.samples()
     assert len(taken) == 2
     assert np.isfinite([[a.roll_rad, a.pitch_rad, a.yaw_rad, *a.gyro_radps] for a in taken]).all()
-
-
-def test_nothing_begins_before_the_block_came_and_its_silence_is_a_problem(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """What is unknown is not still."""
-    monkeypatch.setattr(listening, "start_block", lambda *_: None)
-    monkeypatch.setattr(listening, "check_firmware", lambda *_: None)
-    monkeypatch.setattr(listening, "FIRST_SAMPLE_TIMEOUT_S", 0.0)
-    connection: Any = SimpleNamespace(cf=SimpleNamespace(log=None))
-    link = Listened()
-    with pytest.raises(TimedOut, match="sends no telemetry"):
-        link._prepare(connection)
-    link.hear()
-    link._prepare(connection)
-    assert link.problem(link.now_s + SILENCE_S) is None
-    assert "nothing heard" in str(link.problem(link.now_s + SILENCE_S + 0.1))
-    link.now_s += SILENCE_S + 0.1
-    link.hear()
-    assert link.problem(link.now_s) is None
