@@ -20,7 +20,7 @@ from perchctl.mission import Phase
 from perchctl.profile import Profile
 from perchctl.record import read_log
 from perchctl.sim import Neighbour, Scenario, draw_scenario
-from tests.helpers.flights import SEED, fly_short, short_profile
+from tests.helpers.flights import short_profile
 
 APART_M = 0.8
 MISS_M = 0.02
@@ -60,15 +60,3 @@ def test_a_pair_perches_side_by_side(tmp_path: Path) -> None:
         seen = xy[np.isfinite(xy[:, 0])]
         assert np.linalg.norm(seen - scenario.target_xy_m, axis=1).max() < APART_M / 4
         assert not any("taken up anew" in (r["lock_note"] or "") for r in log.records)
-
-
-@pytest.mark.long
-def test_where_only_the_other_s_is_in_view_it_lands_and_says_why() -> None:
-    """Before it has gone anywhere."""
-    here = draw_scenario(short_profile(), SEED).target_xy_m
-    flown = fly_short(
-        {"target.expected_xy_m": here}, no_target=True, neighbours=(Neighbour((0.4, 0.0)),)
-    )
-    assert flown.way == ["APPROACH", "SEARCH", "LANDING", "LANDED"]
-    assert "0.40 m from target.expected_xy_m is not followed" in flown.report.reason
-    assert flown.farthest_m < 0.15
