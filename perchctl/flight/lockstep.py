@@ -217,8 +217,8 @@ def fly_lockstep(
 
 
 def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """Return a feed of the simulated motion capture that is called at the link's time; None with
-    decks, and where the target is the positioning system, since the loop feeds then.
+    """Return a feed of the simulated motion capture that is called at the link's time; None
+    without a capture.
 
     Lets the time pass until the vehicle's body is seen, and starts the estimate there. Raises
     ConnectionFailed if it is not seen.

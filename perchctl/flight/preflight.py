@@ -135,8 +135,6 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
 
 
 # --- Whether a target that is the positioning system stays in view on the way up. Pure ---
-# The way up is known: straight, then to `planner.approach_xy_m`. The higher the vehicle, the less
-# of the ceiling is in its picture; without the target it has no position.
 
 
 LEAN_DEG = 5.0  # on its way up, and against a draught

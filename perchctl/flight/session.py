@@ -205,9 +205,8 @@ def started_feed(
     clock: Clock,
     ground_z_m: float = 0.0,
 ) -> PositionFeed | None:
-    """Settle the vehicle's estimate on the capture's positions, and feed them until `stack` ends:
-    the link is closed before that, since a landing vehicle still needs them. None with decks, and
-    where the target is the positioning system, as which the loop sends what it sees.
+    """Settle the vehicle's estimate, and feed it a capture's positions until `stack` ends, after
+    the link is closed: a landing vehicle still needs them. None without a capture.
 
     Errors: those of `CflibLink.settle`, and InvalidValue, UsageError, ConnectionFailed."""
     if config.by == "target":
