@@ -23,7 +23,7 @@ from perchctl.link.crtp import (
     Packet,
     encode,
 )
-from perchctl.link.external_position import Settling, Standing, estimator_parameters
+from perchctl.link.external_position import Standing, estimator_parameters, settle
 from perchctl.link.firmware import check_firmware, decks_found, read_parameters, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
@@ -112,14 +112,10 @@ class CflibLink:
         ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        Settling(
-            self.connection.cf,
-            self._uri,
-            self._positioning,
-            feed or Standing(self.external, ground_z_m, self._positioning.rate_hz, self._clock),
-            lambda: self._blocks.newest,
-            self._clock,
-        ).run()
+        cf, config, clock = self.connection.cf, self._positioning, self._clock
+        standing = Standing(self.external, ground_z_m, config.rate_hz, clock)
+        wait = standing.wait if feed is None else time.sleep
+        settle(cf, self._uri, config, feed or standing, lambda: self._blocks.newest, clock, wait)
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent

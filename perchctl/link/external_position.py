@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -63,84 +62,78 @@ def start_parameters(start: Placed) -> dict[str, float]:
     return {f"kalman.initial{name}": value for name, value in values.items()}
 
 
-@dataclass
-class Settling:
-    """The start of one vehicle's estimator on the ground, where `feed` places it.
+def settle(
+    cf: Any,
+    uri: str,
+    config: PositioningConfig,
+    feed: PositionFeed | Standing,
+    newest: Callable[[], Telemetry | None],
+    clock: Callable[[], float],
+    wait: Callable[[float], None] = time.sleep,
+) -> None:
+    """Reset the estimator until it agrees with the feed, on the ground. Bounded.
 
-    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass.
+    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass. Raises ConnectionFailed
+    for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
     """
-
-    cf: Any
-    uri: str
-    config: PositioningConfig
-    feed: PositionFeed | Standing
-    newest: Callable[[], Telemetry | None]
-    clock: Callable[[], float]
-    wait: Callable[[float], None] = time.sleep
-
-    def __post_init__(self) -> None:
-        if isinstance(self.feed, Standing):
-            self.wait = self.feed.wait
-
-    def run(self) -> None:
-        """Reset the estimator until it agrees with the feed. Bounded.
-
-        Raises ConnectionFailed for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
-        """
-        end_s = self.clock() + self.config.connect_timeout_s
-        while (status := self.feed.status(self.clock())).problem is not None or not status.sent:
-            if self.clock() >= end_s:
-                raise TimedOut(
-                    f"no position from outside within {self.config.connect_timeout_s:g} s: "
-                    f"{status.problem or 'none was sent'}"
-                )
-            self.wait(POLL_S)
-        for _ in range(RESETS):
-            if may_fly(self.newest(), self.clock()):
-                raise ConnectionFailed(
-                    f"the vehicle at {self.uri} may be flying: its estimate is set on the ground "
-                    f"only"
-                )
-            start = self.feed.place()
-            assert start is not None  # one was sent
-            self._reset(start)
-            if self._agrees(start):
-                return
-        by_target = self.config.by == "target"
-        where = "the origin, where it stands" if by_target else f"where {self.config.label} sees it"
-        raise TimedOut(
-            f"the estimate of {self.uri} does not come to {where}: does it stand still, and do "
-            f"positions arrive, and of this vehicle?"
-        )
-
-    def _reset(self, start: Placed) -> None:
-        set_parameters(self.cf, self.uri, start_parameters(start))
+    end_s = clock() + config.connect_timeout_s
+    while (status := feed.status(clock())).problem is not None or not status.sent:
+        if clock() >= end_s:
+            raise TimedOut(
+                f"no position from outside within {config.connect_timeout_s:g} s: "
+                f"{status.problem or 'none was sent'}"
+            )
+        wait(POLL_S)
+    for _ in range(RESETS):
+        if may_fly(newest(), clock()):
+            raise ConnectionFailed(
+                f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
+            )
+        start = feed.place()
+        assert start is not None  # one was sent
+        set_parameters(cf, uri, start_parameters(start))
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
         for value in (1, 0):
-            set_parameters(self.cf, self.uri, {RESET_PARAMETER: value}, read_back=False)
-            self.wait(RESET_PULSE_S * value)
+            set_parameters(cf, uri, {RESET_PARAMETER: value}, read_back=False)
+            wait(RESET_PULSE_S * value)
+        if _agree(feed, start, newest, clock, wait):
+            return
+    where = (
+        "the origin, where it stands" if config.by == "target" else f"where {config.label} sees it"
+    )
+    raise TimedOut(
+        f"the estimate of {uri} does not come to {where}: does it stand still, and do positions "
+        f"arrive, and of this vehicle?"
+    )
 
-    def _agrees(self, start: Placed) -> bool:
-        """Return True once feed and estimate have agreed over fresh samples of both for
-        `AGREE_FOR_S`, and the vehicle has stood at `start`."""
-        end_s = self.clock() + AGREE_WITHIN_S
-        since_s: float | None = None
-        while (now_s := self.clock()) < end_s:
-            status, placed, sample = self.feed.status(now_s), self.feed.place(), self.newest()
-            agree = (
-                status.problem is None
-                and placed is not None
-                and sample is not None
-                and knows_its_position(sample, now_s)
-                and math.dist(placed.position_m, start.position_m) <= STILL_M
-                and math.dist(placed.position_m, sample.position_m) <= AGREE_M
-                and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= AGREE_RAD
-            )
-            since_s = (now_s if since_s is None else since_s) if agree else None
-            if since_s is not None and now_s - since_s >= AGREE_FOR_S:
-                return True
-            self.wait(POLL_S)
-        return False
+
+def _agree(
+    feed: PositionFeed | Standing,
+    start: Placed,
+    newest: Callable[[], Telemetry | None],
+    clock: Callable[[], float],
+    wait: Callable[[float], None],
+) -> bool:
+    """Return True once feed and estimate have agreed over fresh samples of both for `AGREE_FOR_S`,
+    and the vehicle has stood at `start`."""
+    end_s = clock() + AGREE_WITHIN_S
+    since_s: float | None = None
+    while (now_s := clock()) < end_s:
+        status, placed, sample = feed.status(now_s), feed.place(), newest()
+        agree = (
+            status.problem is None
+            and placed is not None
+            and sample is not None
+            and knows_its_position(sample, now_s)
+            and math.dist(placed.position_m, start.position_m) <= STILL_M
+            and math.dist(placed.position_m, sample.position_m) <= AGREE_M
+            and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= AGREE_RAD
+        )
+        since_s = (now_s if since_s is None else since_s) if agree else None
+        if since_s is not None and now_s - since_s >= AGREE_FOR_S:
+            return True
+        wait(POLL_S)
+    return False
 
 
 class Standing:

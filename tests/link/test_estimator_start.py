@@ -18,8 +18,8 @@ from perchctl.link.external_position import (
     AGREE_WITHIN_S,
     RESET_PARAMETER,
     RESETS,
-    Settling,
     Standing,
+    settle,
 )
 from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import PositioningConfig
@@ -85,7 +85,8 @@ class Bench:
         feed: Any = self.feed or self
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(external_position, "set_parameters", self.set_parameters)
-            Settling(None, "udp://x", CONFIG, feed, self.newest, self.clock, self.wait).run()
+            wait = self.wait if self.feed is None else self.feed.wait
+            settle(None, "udp://x", CONFIG, feed, self.newest, self.clock, wait)
 
     def refused(self, kind: type[PerchError]) -> str:
         """The one sentence by which it is refused, within the bound."""
