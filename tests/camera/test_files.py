@@ -17,7 +17,6 @@ from perchctl.camera import (
     profile_record,
     without_password,
 )
-from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig, Profile
 from perchctl.vision import CameraModel, Frame
@@ -195,17 +194,6 @@ def test_the_wrong_size_names_both() -> None:
     check_size((640, 480), camera, "camera:0")
     with pytest.raises(InvalidValue, match=r"720x576.*640x480"):
         check_size((720, 576), camera, "camera:0")
-
-
-def test_grey_from_every_kind_of_array() -> None:
-    grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
-    colour = np.repeat(grey[:, :, None], 3, axis=2)
-    alpha = np.concatenate([colour, np.full((3, 4, 1), 255, np.uint8)], axis=2)
-    for image in (grey, grey[:, :, None], colour, alpha, grey.astype(np.uint16) << 8):
-        out = to_grey(image)
-        assert out.dtype == np.uint8
-        assert out.flags.c_contiguous
-        assert np.array_equal(out, grey)
 
 
 def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(

@@ -17,7 +17,6 @@ from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame
-from tests.helpers.interlaced import Pass
 
 SHAPE = (480, 640)
 
@@ -110,23 +109,6 @@ def test_recordings_may_repeat_and_what_a_source_calls_repeated_is() -> None:
 
 
 # --- Pictures that a receiver gives out again ---------------------------------------------
-
-
-def test_over_any_source_equal_bytes_are_a_repetition_and_not_frozen_until_it_is_stuck() -> None:
-    frames = list(Pass(camera_receiver_hz=60.0).frames(60))
-    truth = [False] + [a.index == b.index for a, b in zip(frames[1:], frames, strict=False)]
-    assert 30 < sum(truth) < 40
-    slot, health, taken, kinds = NewestSlot(), FrameHealth(), [], []
-    for k, frame in enumerate(frames + [frames[-1]] * 40):
-        slot.put(frame.image, k / 60, k / 60)
-        taken.append(slot.take())
-        assert taken[-1] is not None
-        kinds.append(health.assess(taken[-1]))
-    assert [each.repeated for each in taken[: len(frames)] if each] == truth
-    assert set(kinds[: len(frames)]) == {"ok", "repeated"}
-    stuck = kinds[len(frames) :]
-    assert (stuck[0], stuck[-1]) == ("repeated", "frozen")
-    assert 20 <= stuck.index("frozen") <= 26, "0.4 s after it was new"
 
 
 def test_a_repetition_takes_no_new_pictures_place() -> None:
