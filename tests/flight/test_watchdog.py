@@ -281,7 +281,7 @@ def test_after_the_loop_only_the_operators_stop_cuts_and_at_once(closing: str) -
         rig.dog.end(motors_off=closing == "motors off")
     assert [rig.after(s) for s in (0.01, 0.5, 1.1, 9.0)] == [None] * 4
     rig.operator = Operator.STOP
-    assert rig.after(9.02) == (None if closing == "motors off" else EmergencyStop())
+    assert rig.after(0.06) == (None if closing == "motors off" else EmergencyStop())
 
 
 @pytest.mark.parametrize("by_planner", [True, False])
