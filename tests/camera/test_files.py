@@ -68,6 +68,17 @@ def test_the_profile_s_latency_counts_unless_another_is_given(
     assert frame.t_arrival_s - frame.t_s == pytest.approx(counts_s)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_each_source_that_is_opened_by_a_profile_is_turned_right(
+    mirrored: bool, tmp_path: Path
+) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
+    cv2.imwrite(f"{tmp_path}/a.png", image)
+    frame = open_camera(f"images:{tmp_path}", clock, CameraConfig(mirrored=mirrored)).poll(0.0)
+    assert frame is not None
+    np.testing.assert_array_equal(frame.image, image[:, ::-1] if mirrored else image)
+
+
 def test_images_by_pattern_and_single_and_those_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="neither a folder nor a pattern"):
         open_camera(f"images:{tmp_path}/nowhere", clock)
