@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -93,7 +93,6 @@ class FlightInputs:
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
     frames: int = 0
-    ground_z_m: float = 0.0  # of the estimate, where the flight begins
     _note: str | None = None
 
     def __post_init__(self) -> None:
@@ -312,13 +311,9 @@ class Turns:
     """Counts the loop's turns, and reports them to their watchers. In lockstep there are no
     timings: the same seed gives the same turns."""
 
-    def __init__(
-        self,
-        clock: Clock,
-        watchers: Iterable[Watcher],
-        wall: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self._wall = wall if isinstance(clock, (WallClock, SimulatedClock)) else None
+    def __init__(self, clock: Clock, watchers: Iterable[Watcher]) -> None:
+        in_real_time = isinstance(clock, (WallClock, SimulatedClock))
+        self._wall = time.perf_counter if in_real_time else None
         self._watchers = [w for w in watchers if isinstance(w, LogKeeper)]
         self._count = 0
         self._began_s = 0.0

@@ -97,8 +97,6 @@ def fly(parts: FlightParts) -> FlightReport:
         recorded=turns.are_watched,
     )
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
-    if inputs.history.newest is not None:
-        inputs.ground_z_m = inputs.history.newest.position_m[2]
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
     parts.link.set_guard(watchdog, told)
     try:

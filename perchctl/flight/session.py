@@ -179,7 +179,7 @@ def _simulated_clock(
     """Return the simulated vehicle's time, and what its scenario did at the time of an event."""
     from perchctl.sim import EventExplainer, draw_scenario
 
-    clock = SimulatedClock(simulated.shared_time, simulated.shared_time.MARGIN_S)
+    clock = SimulatedClock(simulated.shared_time)
     explain = EventExplainer(draw_scenario(options.profile, options.seed))
     return clock, lambda event: explain(event, event.t_s - clock.zero_s)
 
