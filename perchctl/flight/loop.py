@@ -98,7 +98,7 @@ def fly(parts: FlightParts) -> FlightReport:
     )
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
-    parts.link.set_guard(watchdog, told)
+    parts.link.set_guard(watchdog.poll, told)
     try:
         return _mission(parts, inputs, watchdog, turns)
     except BaseException as error:

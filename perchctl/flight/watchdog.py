@@ -62,7 +62,7 @@ class LastTick:
 
 
 class Watchdog:
-    """Decides what the link sends while the loop is silent (`Guard`).
+    """Decides what the link sends while the loop is silent: its `poll` is the link's guard.
 
     `tick`, `rescuing` and `end` are called by the loop's thread, `poll` by the link's; each writes
     its own fields.

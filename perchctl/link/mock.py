@@ -141,7 +141,7 @@ class MockLink:
             return
         self._watched_s = self.now_s
         self._collect()
-        command = self._guard.poll(self.now_s, self._newest, self._arrived)
+        command = self._guard(self.now_s, self._newest, self._arrived)
         if command is not None:
             self.send(command)
             self._on_sent(SentCommand(self.now_s, "watchdog", command))

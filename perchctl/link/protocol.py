@@ -19,17 +19,11 @@ def ignore_sent(sent: SentCommand) -> None:
     return
 
 
-class Guard(Protocol):
-    """Decides what is sent while the flight loop is silent."""
-
-    def poll(
-        self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
-    ) -> Command | None:
-        """Return what the link has to send now in the loop's place, None almost always.
-
-        Called about every 50 ms, in a thread of the link's own where it has one, but not while a
-        command waits that cannot go out; `newest` is the newest telemetry that has arrived,
-        and `waiting` what the loop has not taken in yet, oldest first."""
+Guard = Callable[[float, Telemetry | None, Sequence[Telemetry]], Command | None]
+"""Returns what the link has to send now in the loop's place, None almost always; it gets the time,
+the newest telemetry, and what the loop has not taken in yet, oldest first. Called about every
+50 ms, in a thread of the link's own where it has one, but not while a command waits that cannot go
+out."""
 
 
 class Link(Protocol):
