@@ -3,8 +3,7 @@
 Nothing here blocks without a bound, nothing blocking is called from cflib's
 callbacks, and the link is closed only when nothing flies: `close_link` sends a
 zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints stop").
-A radio that falls silent is waited for, and a driver that has ended is opened again, for as
-long as the link is open: what was ordered meanwhile goes out first.
+A radio that falls silent is waited for, and a driver that has ended is opened again.
 """
 
 from __future__ import annotations
