@@ -103,24 +103,6 @@ POSITION_DECKS = ("bcFlow2", "bcFlow", "bcLighthouse4", "bcLoco", "bcDWM1000")
 
 
 @dataclass(frozen=True)
-class MeasuredBy:
-    """Names what measures a vehicle's position: all its decks, by the firmware's names, and whether
-    positions come from outside (None: not known)."""
-
-    decks: tuple[str, ...] = ()
-    external: bool | None = None
-
-    @property
-    def position_decks(self) -> tuple[str, ...]:
-        return self.placed_by(())
-
-    def placed_by(self, further: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the positioning decks, those of names in `further` (`positioning.decks`) among
-        them."""
-        return tuple(deck for deck in self.decks if deck in (*POSITION_DECKS, *further))
-
-
-@dataclass(frozen=True)
 class Idle:
     """Send nothing (on the ground, or while the vehicle lands by itself)."""
 

@@ -38,7 +38,6 @@ SLOW_FIRST = (
     "flight/test_realtime.py",
     "test_docs.py",
     "test_fly_command.py",
-    "flight/test_one_error.py",
     "target/test_make_target.py",
     "target/test_design.py",
     "link/test_cflib_link.py",

@@ -3,7 +3,6 @@ follows the flight."""
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import socket
@@ -20,8 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import load_calibration
 from perchctl.commands import app
 from perchctl.commands.fly import fly_and_report, resolve
-from perchctl.errors import EXIT_CODES, ConnectionFailed, Interrupted
-from perchctl.link.connection import open_connection
+from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
 from perchctl.sim import SimProcess
@@ -82,9 +80,9 @@ def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:
         ("--uri udp://127.0.0.1:99999 --yes", 30, ["65535"]),
         (f"--uri {NOWHERE}", 2, ["sim:", "--source"]),
         (f"--uri {NOWHERE} --source sim: --yes", 2, ["sim:", "--source"]),
-        ("--source webcam", 30, ["'webcam'", "camera:N"]),
+        ("--source webcam:0", 30, ["'webcam:0'", "camera:N"]),
         ("--source=", 30, ["camera:N"]),
-        ("--dry-run --source webcam", 30, ["'webcam'", "camera:N"]),
+        ("--dry-run --source webcam:0", 30, ["'webcam:0'", "camera:N"]),
         ("--seed -1", 30, ["-1", "negative"]),
         (f"--uri {NOWHERE} --source camera:x --yes", 20, ["camera:x"]),
         (f"--uri {NOWHERE} --source camera:9 --yes", 20, ["camera:9"]),
@@ -180,7 +178,7 @@ def test_a_silent_peer(profile: str, eyes: str) -> None:
 def test_a_radio_that_is_not_there(profile: str, eyes: str) -> None:
     said = run("fly", "-p", profile, "--uri", RADIO, "--source", eyes, "--yes")
     assert said.code == 10
-    for words in (RADIO, "no Crazyradio is plugged in", 'ATTRS{idVendor}=="1915"'):
+    for words in (RADIO, "no Crazyradio is plugged in", "udev"):
         assert words in said.stderr
 
 
@@ -191,17 +189,6 @@ def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str) -> None:
     assert said.code == 10
     assert "nothing listens there" in said.stderr
     assert "link error callback" not in said.stderr
-
-
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
-)
-def test_the_library_s_prints_stay_off_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    """cflib tells of its sockets on stdout, where the one object belongs. (It leaves one open.)"""
-    with pytest.raises(ConnectionFailed, match="nothing listens there"):
-        open_connection("tcp://127.0.0.1:9", 5.0)
-    assert capfd.readouterr().out == ""
-    gc.collect()
 
 
 @pytest.mark.long

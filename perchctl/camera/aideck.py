@@ -12,7 +12,6 @@ is not used.
 
 from __future__ import annotations
 
-import re
 import socket
 import struct
 from dataclasses import dataclass
@@ -23,14 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
-from perchctl.camera.network import StreamSource
-from perchctl.camera.source import Clock
-from perchctl.errors import InvalidValue
+from perchctl.camera.jpeg import grey_pixels, jpeg_extent
+from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
-FORM = "aideck://HOST[:5000]"
 STALLED_S = 2.0
 """A picture that takes longer from its first byte to its last is dropped: its end would be taken
 for its time of arrival."""
@@ -41,30 +36,11 @@ MOST_SIDE_PX = 1024
 # What waits unread while the reader stalls is then given out one by one, dated when it is read.
 # Linux holds at most twice this, three raw pictures or some forty JPEGs; then the deck has to wait.
 _RECEIVE_BYTES = 131072
-_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|[0-9A-Fa-f:]+")
 _PACKET = struct.Struct("<HBB")
 _HEADER = struct.Struct("<BHHBBI")
 _MAGIC, _RAW, _JPEG = 0xBC, 0, 1
 _APP = 5
 _FUNCTIONS = (1, 2, 3, 4, _APP, 14, 15)
-
-
-def aideck_address(spec: str) -> tuple[str, int]:
-    """Return host and port of ``aideck://HOST[:PORT]``. Raises InvalidValue."""
-    wrong = InvalidValue(
-        f"camera source {without_password(spec)!r} is no AI-deck's address; write {FORM}, as in "
-        f"aideck://192.168.4.1"
-    )
-    try:
-        parts = urlsplit(spec)
-        port = PORT if parts.port is None else parts.port
-    except ValueError:
-        raise wrong from None
-    host = parts.hostname or ""
-    more = parts.username or parts.path.strip("/") or parts.query or parts.fragment
-    if parts.scheme != "aideck" or not _HOST_NAME.fullmatch(host) or port == 0 or more:
-        raise wrong
-    return host, port
 
 
 @dataclass
@@ -89,26 +65,24 @@ class _Picture:
             return None
         if not self.is_jpeg:
             return np.frombuffer(data, np.uint8).reshape(shape)
-        try:
-            is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
-        except Damaged:
-            return None
+        is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
         image = grey_pixels(data) if is_whole else None
         return image if image is not None and image.shape == shape else None
 
 
-class AiDeckSource(StreamSource):
+class AiDeckSource(LiveSource):
     """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG pictures.
 
     A picture's time is that of its first byte less `latency_s`: the deck sends the header as soon
     as the picture is taken, and only the transfer behind it, of 60 ms and more for a raw one,
-    hangs on the air. Its age of arrival is the last byte's. A picture that is not whole is dropped
-    (`damaged`); what is no packet ends the connection, and the next one begins with a whole packet.
+    hangs on the air. Its age of arrival is the last byte's. A picture that is not whole is dropped;
+    what is no packet ends the connection, and the next one begins with a whole packet.
     """
 
-    def __init__(self, host: str, port: int, latency_s: float, clock: Clock) -> None:
-        super().__init__(f"aideck://{host}:{port}", latency_s, clock)
-        self._address = host, port
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(url, latency_s, clock)
+        parts = urlsplit(url)
+        self._address = parts.hostname, parts.port or PORT
         self._grey = MosaicFilter()
         self._picture: _Picture | None = None
 
@@ -142,7 +116,6 @@ class AiDeckSource(StreamSource):
         """Take the data of one of the streamer's packets: a picture's header, or a part of one."""
         header = _header_of(data, came_s)
         if header is not None:
-            self.damaged += self._picture is not None
             self._picture = header
             return
         picture = self._picture
@@ -154,7 +127,6 @@ class AiDeckSource(StreamSource):
         self._picture = None
         image = picture.pixels() if self._clock() - picture.began_s <= STALLED_S else None
         if image is None:
-            self.damaged += 1
             return
         grey = self._grey(image)
         as_came = picture.is_jpeg and grey is image  # no mosaic was taken out of it

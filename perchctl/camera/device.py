@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable, Iterable
@@ -12,7 +13,7 @@ from typing import Any
 import cv2
 
 from perchctl.camera.source import Clock, LiveSource, one_line
-from perchctl.errors import InvalidValue, NotFound, PerchError
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 
 LOST_AFTER_FAILURES = 25
@@ -54,68 +55,40 @@ class DeviceSource(LiveSource):
     """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
 
     A picture that cannot be read or decoded is dropped. After `LOST_AFTER_FAILURES` in a row the
-    camera counts as lost: it is released, and opened again as soon as it is back. One that has
-    never given a picture fails at once. `opener` returns anything with read() and release(), as
-    `open_capture` does, and its errors.
+    camera counts as lost: it is released, and opened again as soon as it is back. `opener` returns
+    anything with read() and release(), as `open_capture` does, and its errors.
     """
 
+    reconnect_wait_s = REOPEN_EVERY_S
+    most_failed = math.inf
+    retry_s = RETRY_S
+
     def __init__(
-        self,
-        name: str,
-        latency_s: float,
-        clock: Clock,
-        opener: Callable[[], Any],
-        retry_s: float = RETRY_S,
-        reopen_every_s: float = REOPEN_EVERY_S,
+        self, name: str, latency_s: float, clock: Clock, opener: Callable[[], Any]
     ) -> None:
         super().__init__(name, latency_s, clock)
         self._opener = opener
-        self._retry_s = retry_s
-        self._reopen_every_s = reopen_every_s
-        self._capture = opener()
-        self._start(self._grab)
 
-    def _grab(self) -> None:
+    def _connection(self) -> str:
+        capture, failures = self._opener(), 0
         try:
-            while (why := self._read_until_lost()) is not None:
-                if self._count == 0:
-                    self._fail(f"{self._name} {why}; plug it in again, or name another camera")
-                    return
-                self._capture.release()
-                self._reopen(why)
+            while not self._stop.is_set():
+                why = "stopped delivering frames"
+                try:
+                    ok, image = capture.read()
+                    if ok:
+                        self._put(image)
+                        failures = 0
+                        continue
+                except Exception as error:  # whatever a damaged picture does to OpenCV
+                    why = f"gives pictures that cannot be decoded ({one_line(error)})"
+                failures += 1
+                if failures >= LOST_AFTER_FAILURES:
+                    raise NotFound(f"{self._name} {why}; plug it in again, or name another camera")
+                self._stop.wait(self.retry_s)
+            return "closed"
         finally:
-            self._capture.release()
-
-    def _read_until_lost(self) -> str | None:
-        """Return why the camera counts as lost; None if the source was closed."""
-        failures = 0
-        while not self._stop.is_set():
-            why = "stopped delivering frames"
-            try:
-                ok, image = self._capture.read()
-                if ok:
-                    self._put(image)
-                    failures = 0
-                    continue
-            except Exception as error:  # whatever a damaged picture does to OpenCV
-                why = f"gives pictures that cannot be decoded ({one_line(error)})"
-            failures += 1
-            if failures >= LOST_AFTER_FAILURES:
-                return why
-            self._stop.wait(self._retry_s)
-        return None
-
-    def _reopen(self, why: str) -> None:
-        """Try until the camera is open, or the source is closed."""
-        lost = f"it {why}, and is opened again every {self._reopen_every_s:g} s"
-        self._why_silent = lost
-        while not self._stop.wait(self._reopen_every_s):
-            try:
-                self._capture = self._opener()
-                return
-            except Exception as error:
-                reason = str(error) if isinstance(error, PerchError) else one_line(error)
-                self._why_silent = f"{lost}; the last attempt: {reason}"
+            capture.release()
 
 
 # --- The cameras of this computer: their numbers, names and lasting paths
@@ -176,24 +149,17 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
     """Return the N of what stands behind ``camera:``: a number, a name or a part of one (quotes
     and capitals do not matter), or a path of the device.
 
-    Errors: InvalidValue, nothing given, or several that fit; NotFound.
+    Errors: InvalidValue, several that fit; NotFound.
     """
     wanted = text.strip().strip("\"'").strip()
     if wanted.isascii() and wanted.isdigit():
         return int(wanted)
-    if not wanted or wanted.lstrip("-").isdigit():
-        raise InvalidValue(
-            f"camera source 'camera:{text}' lacks a camera's number or name, as in camera:0 or "
-            f"camera:USB Video; perchctl check --cameras lists them"
-        )
     known = find_cameras(devices, names)
-    low = wanted.casefold()
     if wanted.startswith("/"):
         fitting = [c for c in known if c.number in _video_numbers([Path(wanted).resolve()])]
     else:
-        fitting = [c for c in known if c.name.casefold() == low] or [
-            c for c in known if low in f"{c.name} {Path(c.stable_path).name}".casefold()
-        ]
+        named = ((c, f"{c.name} {Path(c.stable_path).name}".casefold()) for c in known)
+        fitting = [camera for camera, name in named if wanted.casefold() in name]
     if len(fitting) == 1:
         return fitting[0].number
     if fitting:

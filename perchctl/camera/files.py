@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import Damaged, grey_pixels, jpeg_extent
+from perchctl.camera.jpeg import grey_pixels, jpeg_extent
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
@@ -137,23 +137,15 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
     Raises ValueError for one that is cut off, or that OpenCV does not read.
     """
-    if is_cut_off(data):
+    # Decoders fill the rest with grey, and say so on stderr without the file's name.
+    png_ends = not data.startswith(b"\x89PNG") or b"IEND" in data
+    jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_extent(data) is not None
+    if not (png_ends and jpeg_ends):
         raise ValueError("is cut off")
     image = grey_pixels(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
-    return to_grey(image)
-
-
-def is_cut_off(data: bytes) -> bool:
-    """Return whether a JPEG or PNG has no end: decoders fill the rest with grey, and say so on
-    stderr without the file's name."""
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data
-    try:
-        return data.startswith(b"\xff\xd8") and jpeg_extent(data) is None
-    except Damaged:
-        return False
+    return image
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:

@@ -5,7 +5,6 @@ A frame judged bad gives no measurement; the detector need not search it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -39,21 +38,6 @@ SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
 (1 = unrelated); columns less so, because a receiver's bandwidth smooths along lines."""
 
 
-@dataclass(frozen=True)
-class HealthVerdict:
-    """What a picture is like; a measurement only if it is `usable`."""
-
-    kind: Kind
-
-    @property
-    def usable(self) -> bool:
-        return self.kind == "ok"
-
-    @property
-    def text(self) -> str:
-        return VERDICT_TEXTS[self.kind]
-
-
 class FrameHealth:
     """Judges the frames of one source in their order; it remembers the last picture."""
 
@@ -61,8 +45,8 @@ class FrameHealth:
         self._picture: NDArray[np.uint8] | None = None
         self._changed_s = 0.0
 
-    def assess(self, frame: Frame, live: bool = True) -> HealthVerdict:
-        """Judge the next frame.
+    def assess(self, frame: Frame, live: bool = True) -> Kind:
+        """Judge the next frame: it is a measurement only if it is "ok".
 
         A camera's noise makes each live picture differ from the last, so equal bytes
         mean that the receiver or the stream repeats an old one; so does what the source
@@ -72,11 +56,11 @@ class FrameHealth:
         before, self._picture = self._picture, frame.image
         if live and before is not None and same_bytes(before, frame.image):
             frozen = frame.t_s - self._changed_s >= FROZEN_AFTER_S
-            return HealthVerdict("frozen" if frozen else "repeated")
+            return "frozen" if frozen else "repeated"
         if live and frame.repeated:
-            return HealthVerdict("repeated")
+            return "repeated"
         self._changed_s = frame.t_s
-        return HealthVerdict(content(frame.image))
+        return content(frame.image)
 
 
 def content(image: NDArray[np.uint8]) -> Kind:

@@ -7,7 +7,6 @@ decoder gigabytes and minutes, so the size is read before anything of a stream i
 from __future__ import annotations
 
 import re
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,25 +25,12 @@ _SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Start of frame: behind its length and precision stand height and width."""
 
 
-class Damaged(Exception):
-    """The bytes at a start-of-image marker are no whole JPEG; `at`: where its structure breaks."""
+def jpeg_extent(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
+    """Return the length of the JPEG at the start of `data`, and the width and height that it says;
+    None if it is incomplete.
 
-    def __init__(self, at: int) -> None:
-        super().__init__(at)
-        self.at = at
-
-
-class Extent(NamedTuple):
-    """The length of a JPEG in bytes, and the width and height that it says."""
-
-    end: int
-    size_px: tuple[int, int]
-
-
-def jpeg_extent(data: bytes | bytearray) -> Extent | None:
-    """Return the extent of the JPEG at the start of `data`; None if it is incomplete.
-
-    Raises Damaged where a segment is followed by no marker, or another picture begins.
+    Of a damaged one, where a segment is followed by no marker or another picture begins, return
+    where its structure breaks, and no size: (0, 0).
     """
     at, size_px, in_scan = 2, (0, 0), False
     while True:
@@ -60,9 +46,9 @@ def jpeg_extent(data: bytes | bytearray) -> Extent | None:
             at += 1  # a fill byte
             continue
         if data[at] != 0xFF or code < 0xC0 or code == _SOI:
-            raise Damaged(at)
+            return at, (0, 0)
         if code == _EOI:
-            return Extent(at + 2, size_px)
+            return at + 2, size_px
         if at + 9 > len(data):
             return None
         if code in _SIZES:
@@ -78,33 +64,30 @@ class JpegSplitter:
     It follows the JPEG's own structure instead of the multipart headers. Wrong lengths, odd
     boundaries and missing headers therefore do no harm, and a picture is out with its last byte.
     A damaged picture is dropped, and the search goes on where its structure breaks: up to 64 kB
-    later if the damage is in a segment's length. `damaged` counts the pictures that were dropped.
+    later if the damage is in a segment's length.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self.damaged = 0
 
-    def feed(self, data: bytes) -> list[tuple[bytes, Extent]]:
-        """Append bytes; return the pictures that are complete now, oldest first."""
+    def feed(self, data: bytes) -> list[tuple[bytes, tuple[int, int]]]:
+        """Append bytes; return the pictures that are complete now, oldest first, with the width and
+        height that they say."""
         self._buffer += data
-        pictures: list[tuple[bytes, Extent]] = []
+        pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
             self._bound()
             return pictures  # no picture ends in what is new
         while (start := self._buffer.find(_START)) >= 0:
             del self._buffer[:start]
-            try:
-                extent = jpeg_extent(self._buffer)
-            except Damaged as damage:
-                # The start of the next picture may be what broke this one's structure.
-                del self._buffer[: damage.at]
-                self.damaged += 1
-                continue
+            extent = jpeg_extent(self._buffer)
             if extent is None:
                 break
-            pictures.append((bytes(self._buffer[: extent.end]), extent))
-            del self._buffer[: extent.end]
+            end, size_px = extent
+            if all(size_px):
+                pictures.append((bytes(self._buffer[:end]), size_px))
+            # The start of the next picture may be what broke this one's structure.
+            del self._buffer[:end]
         else:
             del self._buffer[:-2]  # the next start may stand half in this piece
         self._bound()
@@ -114,7 +97,6 @@ class JpegSplitter:
         """Give up a picture that never ends."""
         if len(self._buffer) > MAX_PICTURE_BYTES:
             self._buffer.clear()
-            self.damaged += 1
 
 
 def grey_pixels(data: bytes) -> NDArray[np.uint8] | None:

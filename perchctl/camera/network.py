@@ -1,178 +1,112 @@
 """Cameras over a network: ``http://`` (Motion-JPEG) and ``rtsp://``, each read by a thread.
 
-They connect, read, and connect again, with a limit; the newest frame wins. PyAV's mpjpeg reader
-is not used for Motion-JPEG: without a length in front of each picture it gives one out with the
-next one's first bytes, a whole period late (41 ms instead of 0.2 ms at 25 Hz).
+PyAV's mpjpeg reader is not used for Motion-JPEG: without a length in front of each picture it
+gives one out with the next one's first bytes, a whole period late (41 ms instead of 0.2 ms at
+25 Hz).
 """
 
 from __future__ import annotations
 
 import math
-import ssl
+import re
+from base64 import b64encode
 from collections import deque
 from contextlib import closing
 from http.client import HTTPResponse
 from typing import Any
-from urllib.error import HTTPError, URLError
-from urllib.parse import urljoin, urlsplit, urlunsplit
-from urllib.request import HTTPRedirectHandler, ProxyHandler, Request, build_opener
+from urllib.error import HTTPError
+from urllib.parse import unquote, urlsplit, urlunsplit
+from urllib.request import (
+    HTTPDigestAuthHandler,
+    HTTPPasswordMgrWithDefaultRealm,
+    ProxyHandler,
+    Request,
+    build_opener,
+    parse_http_list,
+    parse_keqv_list,
+)
 
-from perchctl.camera.credentials import authorization, without_password
 from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels
-from perchctl.camera.source import Clock, LiveSource, one_line
-
-MAX_FAILED_CONNECTIONS = 5
-"""Connections in a row that bring no picture before the source gives up."""
-
-
-class StreamSource(LiveSource):
-    """Reconnects when the stream ends, stalls or breaks; gives up after
-    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    answers that there is no such stream before the first picture came (`not_found`).
-
-    It connects from `begin` until `close`, which waits for the end of a read. A subclass has
-    `_connection`. `damaged` counts the pictures that were dropped.
-    """
-
-    connect_timeout_s = 3.0
-    read_timeout_s = 2.0
-    reconnect_wait_s = 0.3
-
-    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
-        super().__init__(without_password(url), latency_s, clock)
-        self._url = url
-        self.not_found = False
-        self.connections = 0
-        self.damaged = 0
-
-    def begin(self) -> None:
-        """Connect, and read in a thread."""
-        self._start(self._run)
-
-    def _connection(self) -> str:
-        """Read one connection until it ends; return why it ended. It may raise any Exception."""
-        raise NotImplementedError
-
-    def _run(self) -> None:
-        failed = 0
-        while not self._stop.is_set():
-            before = self._arrived
-            self.connections += 1
-            try:
-                reason = self._connection()
-            except Exception as error:
-                # Whatever damaged bytes do to a library: a new connection may bring whole ones.
-                reason = _reason(error)
-            if self.not_found:
-                self._fail(f"{self._name}: {reason}")
-                return
-            failed = 0 if self._arrived > before else failed + 1
-            if failed >= MAX_FAILED_CONNECTIONS:
-                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
-                return
-            self._stop.wait(self.reconnect_wait_s)
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, URLError) and isinstance(error.reason, Exception):
-        error = error.reason
-    if isinstance(error, TimeoutError):
-        return "no answer in time"
-    if isinstance(error, ConnectionRefusedError):
-        return "connection refused"
-    return one_line(error)
-
+from perchctl.camera.source import Clock, LiveSource
+from perchctl.errors import NotFound
 
 # --- Motion-JPEG over HTTP --------------------------------------------
 
 
 READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
-_REDIRECTS = (301, 302, 303, 307, 308)
+_NOT_MENDED = (401, 403, 404, 410)
+"""What the server answers to another attempt, too."""
+_DIGEST = re.compile(r"\bDigest\s+(.*)", re.IGNORECASE)
 
 
-class _NoRedirects(HTTPRedirectHandler):
-    """Takes a redirect for a refusal: another host would get the name and the password."""
-
-    def redirect_request(self, *_: Any) -> None:
-        return None
-
-
-class MjpegSource(StreamSource):
+class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    It gives up at once, too, where the server wants another name and password, or redirects to
-    another address. Name and password are sent once the server asks for them, digest or basic.
-    It goes straight to the camera: a proxy for the internet is not for it.
+    It gives up at once, too, where the server wants another name and password. They are sent once
+    the camera asks for them, digest (MD5) or basic, and to no address that it redirects to. It goes
+    straight to the camera: a proxy for the internet is not for it.
     """
+
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(url, latency_s, clock)
+        parts = urlsplit(url)
+        self._bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+        self._name_and_password = unquote(parts.username or ""), unquote(parts.password or "")
 
     def _connection(self) -> str:
         try:
             with closing(self._opened()) as response:
                 self._read(response)
         except HTTPError as refused:
-            self.not_found = self._count == 0 and refused.code in (401, 403, 404, 410, *_REDIRECTS)
-            with refused:
-                return _refusal(refused, self._url)
-        except URLError as error:
-            if not isinstance(error.reason, ssl.SSLCertVerificationError):
-                raise
-            self.not_found = self._count == 0
-            return (
-                f"its certificate is not trusted ({error.reason.verify_message}); name a file with "
-                f"that certificate in the environment variable SSL_CERT_FILE, or use http://"
-            )
+            refused.close()
+            reason = f"the server answers {refused.code} {refused.reason}"
+            if refused.code == 401:
+                reason += ", so write its name and password as in http://NAME:PASSWORD@HOST/PATH"
+            if refused.code in _NOT_MENDED:
+                raise NotFound(f"{self._name}: {reason}") from None
+            return reason
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
-        """Return the stream's response, with name and password once the server has asked for them.
-        Raises HTTPError for any other answer."""
-        parts = urlsplit(self._url)
-        bare = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
-        opener = build_opener(ProxyHandler({}), _NoRedirects)
-        request = Request(bare, headers=_HEADERS)
+        """Return the stream's response, with name and password once the camera has asked for them:
+        once, since cameras lock out who tries again and again."""
+        opener, request = build_opener(ProxyHandler({})), Request(self._bare, headers=_HEADERS)
+        response: HTTPResponse
         try:
-            response: HTTPResponse = opener.open(request, timeout=self.read_timeout_s)
+            response = opener.open(request, timeout=self.read_timeout_s)
         except HTTPError as refused:
-            asked = refused.headers.get_all("WWW-Authenticate") or []
-            given = authorization(asked, request, parts) if refused.code == 401 else None
-            if given is None:
+            if refused.code != 401 or not any(self._name_and_password):
                 raise
             refused.close()
-            request.add_unredirected_header("Authorization", given)
+            asked = ", ".join(refused.headers.get_all("WWW-Authenticate") or [])
+            request.add_unredirected_header("Authorization", self._answer(asked, request))
             response = opener.open(request, timeout=self.read_timeout_s)
         return response
 
+    def _answer(self, asked: str, request: Request) -> str:
+        """Return the Authorization header, by a digest where the camera takes one: basic shows the
+        password."""
+        found = _DIGEST.search(asked)
+        if found is None:
+            return "Basic " + b64encode(":".join(self._name_and_password).encode()).decode()
+        passwords = HTTPPasswordMgrWithDefaultRealm()
+        passwords.add_password(None, request.full_url, *self._name_and_password)
+        challenge = parse_keqv_list(parse_http_list(found[1]))
+        return f"Digest {HTTPDigestAuthHandler(passwords).get_authorization(request, challenge)}"
+
     def _read(self, response: HTTPResponse) -> None:
         splitter = JpegSplitter()
-        earlier = self.damaged
         while not self._stop.is_set():
             data = response.read1(READ_BYTES)
             if not data:
                 return
             # If the network delivered several at once only the newest is worth decoding.
-            for picture, extent in reversed(splitter.feed(data)):
-                width, height = extent.size_px
-                image = grey_pixels(picture) if 0 < width * height <= MOST_STREAM_PX else None
+            for picture, (width, height) in reversed(splitter.feed(data)):
+                image = grey_pixels(picture) if width * height <= MOST_STREAM_PX else None
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
-                splitter.damaged += 1
-            self.damaged = earlier + splitter.damaged
-
-
-def _refusal(refused: HTTPError, url: str) -> str:
-    """Say why an answer holds no stream."""
-    hint = ""
-    if refused.code in _REDIRECTS:
-        to = without_password(urljoin(url, refused.headers.get("Location", "")))
-        hint = f": it redirects to {to}; name that address in camera.source"
-    elif refused.code == 401:
-        hint = (
-            "; write a name and a password that it takes, for basic or digest authentication by "
-            "MD5, as in http://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)"
-        )
-    return f"the server answers {refused.code} {refused.reason}{hint}"
 
 
 # --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's
@@ -228,13 +162,17 @@ class TransferDelay:
         return way_s - self._ways[0][1]
 
 
-class RtspSource(StreamSource):
+class RtspSource(LiveSource):
     """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
 
     Given up at once, too, where the camera wants another name and password.
     """
 
     connect_timeout_s = 5.0
+
+    def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
+        super().__init__(url, latency_s, clock)
+        self._url = url
 
     def _connection(self) -> str:
         import av  # late: most flights have another camera
@@ -245,11 +183,12 @@ class RtspSource(StreamSource):
             with av.open(self._url, options=_OPTIONS, timeout=timeouts_s) as stream:
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            # Without FFmpeg's own texts, which hold the URL with its password.
+            # Not the error's whole text, which holds the URL with its password.
             name = type(error).__name__
-            self.not_found = self._count == 0 and name in _FINAL
-            reason = (_FINAL | _PASSING).get(name) or getattr(error, "strerror", None)
-            return str(reason or name)
+            reason = str(_REASONS.get(name) or getattr(error, "strerror", None) or name)
+            if name in _FINAL:
+                raise NotFound(f"{self._name}: {reason}") from None
+            return reason
 
     def _read(self, stream: Any) -> str:
         """Read one connection until it ends, and return why. Raises PyAV's errors."""
@@ -269,7 +208,6 @@ class RtspSource(StreamSource):
                 frames = [(f.to_ndarray(format="gray"), f.time) for f in packet.decode()[-1:]]
             except (av.error.FFmpegError, ValueError):
                 damaged += 1
-                self.damaged += 1
                 if damaged >= MAX_DAMAGED:
                     return "its pictures cannot be decoded"
                 continue
@@ -279,19 +217,17 @@ class RtspSource(StreamSource):
         return "the stream ended"
 
 
-_FINAL = {
-    "HTTPUnauthorizedError": "it wants another name or password (401), as in "
-    "rtsp://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)",
-    "HTTPForbiddenError": "this name may not see the stream (403)",
-    "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
-    "HTTPBadRequestError": "it does not understand the request (400)",
-    "DecoderNotFoundError": "its pictures are in a form that FFmpeg cannot decode",
-}
+_FINAL = (
+    "HTTPUnauthorizedError",
+    "HTTPForbiddenError",
+    "HTTPNotFoundError",
+    "HTTPBadRequestError",
+    "DecoderNotFoundError",
+)
 """PyAV's errors that another attempt would not mend, by name."""
-_PASSING = {
-    "ConnectionRefusedError": "connection refused",
-    "OSError": "the host cannot be reached, or its name is unknown: correct it",
+_REASONS = {
+    "OSError": "the host cannot be reached, or its name is unknown",
     "ExitError": "no answer in time",
     "InvalidDataError": "no answer in time, or none of RTSP",
-    "TimeoutError": "no answer in time",
 }
+"""In the place of FFmpeg's own, which say less."""

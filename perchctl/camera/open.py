@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
+from perchctl.camera.aideck import AiDeckSource
 from perchctl.camera.credentials import without_password
 from perchctl.camera.device import DeviceSource, open_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
-from perchctl.camera.network import MjpegSource, RtspSource, StreamSource
+from perchctl.camera.network import MjpegSource, RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, WrappedSource, unmirror_frame
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 
 REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
-    f"rtsp://HOST/PATH, {FORM}"
+    "rtsp://HOST/PATH, aideck://HOST[:5000]"
 )
-ALLOWED = f"{REAL}, sim:"
-SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "sim")
+STREAMS: dict[str, Callable[[str, float, Clock], LiveSource]] = {
+    "http": MjpegSource,
+    "https": MjpegSource,
+    "rtsp": RtspSource,
+    "aideck": AiDeckSource,
+}
+SCHEMES = ("camera", "video", "images", "sim", *STREAMS)
 FIRST_FRAME_WITHIN_S = 8.0
 
 
@@ -48,32 +53,45 @@ class SourceName:
         return without_password(self.spec)
 
 
-def parse_source(text: str, *, files: bool = False) -> SourceName:
-    """Return the source that a text names: a scheme in small or capital letters, and its place.
+def parse_source(text: str) -> SourceName:
+    """Return the source that a text names: a scheme in small or capital letters, and its place; or
+    a bare path of a video, a picture, a pattern or a folder of pictures. Nothing is opened.
 
-    `files`: a bare path names a video, a picture, a pattern or a folder of pictures. Nothing is
-    opened. Errors: InvalidValue for an unknown scheme or an AI-deck's address that is none;
-    NotFound for a bare path that does not exist.
+    Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path
+    that does not exist.
     """
     scheme, colon, place = text.partition(":")
-    scheme = scheme.lower() if colon else ""
-    if scheme == "aideck":
-        aideck_address(f"{scheme}:{place}")
-    if scheme in SCHEMES:
-        return SourceName(scheme, place)  # FFmpeg knows rtsp:// and not RTSP://
-    path = Path(text).expanduser()
-    is_path = "://" not in text and not (scheme and not path.suffix and "/" not in text)
-    if files and (path.is_dir() or any(c in text for c in "*?[")):
+    name = SourceName(scheme.lower() if colon else "", place)
+    if name.scheme in STREAMS:
+        _check_address(name)
+    if name.scheme in SCHEMES:
+        return name  # FFmpeg knows rtsp:// and not RTSP://
+    path, shown = Path(text).expanduser(), without_password(text)
+    if path.is_dir() or any(c in text for c in "*?["):
         return SourceName("images", text)
-    if files and path.is_file():
+    if path.is_file():
         return SourceName("images" if path.suffix.lower() in IMAGE_SUFFIXES else "video", text)
-    shown = without_password(text)
-    if files and is_path:
-        raise NotFound(
-            f"{shown} does not exist; a source is a video, picture or folder of pictures, or one "
-            f"of {REAL}"
+    if name.scheme:
+        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {REAL}, sim:")
+    raise NotFound(
+        f"{shown} does not exist; a source is a video, picture or folder of pictures, or one of "
+        f"{REAL}"
+    )
+
+
+def _check_address(name: SourceName) -> None:
+    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
+    try:
+        parts = urlsplit(name.spec)
+        is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        is_right = False
+    if not is_right:
+        raise InvalidValue(
+            f"camera source {str(name)!r} has no host or no port that can be read, as in "
+            f"{name.scheme}://192.168.1.20:5000/stream; a port is 1 to 65535; in a name or "
+            f"password @ is %40, : is %3A, / is %2F"
         )
-    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
 
 
 def open_camera(
@@ -113,7 +131,7 @@ def open_camera(
     if not isinstance(source, str):
         opened = ImagesSource(source, latency_s, pictures_hz)
     else:
-        name = parse_source(source, files=True)
+        name = parse_source(source)
         if name.scheme == "video" and name.place:
             opened = VideoSource(Path(name.place).expanduser(), latency_s)
         elif name.scheme == "images" and name.place:
@@ -132,58 +150,25 @@ def _live(
     clock: Clock,
     config: CameraConfig | None,
 ) -> LiveSource:
-    """Open a camera or stream whose first frame is still to come."""
+    """Return a camera or stream that is not opened yet."""
     if name.scheme == "camera":
         opener = partial(open_capture, name.place, size_px, config)
         return DeviceSource(str(name), latency_s, clock, opener)
-    stream: StreamSource | None = None
-    if name.scheme == "aideck":
-        stream = AiDeckSource(*aideck_address(name.spec), latency_s, clock)
-    elif name.scheme in _USUAL_PORT and name.place.strip("/"):
-        _check_address(name)
-        kind = RtspSource if name.scheme == "rtsp" else MjpegSource
-        stream = kind(name.spec, latency_s, clock)
-    if stream is not None:
-        stream.begin()
-        return stream
-    if name.spec == "sim:":
-        raise InvalidValue(
-            "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
-            f"other sources are {REAL}"
-        )
-    raise InvalidValue(f"camera source {str(name)!r} is unknown; allowed are {ALLOWED}")
-
-
-_USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
-
-
-def _check_address(name: SourceName) -> None:
-    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
-    try:
-        parts = urlsplit(name.spec)
-        is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        is_right = False
-    if not is_right:
-        raise InvalidValue(
-            f"camera source {str(name)!r} has no host or no port that can be read, as in "
-            f"{name.scheme}://192.168.1.20:{_USUAL_PORT[name.scheme]}/stream; a port is 1 to "
-            f"65535; in a name or password @ is %40, : is %3A, / is %2F"
-        )
+    if name.scheme in STREAMS:
+        return STREAMS[name.scheme](name.spec, latency_s, clock)
+    raise InvalidValue(
+        f"camera source {str(name)!r} names no camera or file; allowed are {REAL}, and sim: with a "
+        f"link of sim://"
+    )
 
 
 def _started(source: LiveSource, timeout_s: float) -> FrameSource:
-    """Wait for the first frame. Raises NotFound or TimedOut without one, with the source closed."""
+    """Wait for the first frame. Raises the source's failure, or TimedOut, with it closed."""
+    source.begin()
     if source.wait_first(timeout_s):
         return source
-    problem = source.problem(float("-inf"))
-    described = source.describe()
     source.close()
-    if isinstance(source, StreamSource) and source.not_found:
-        raise NotFound(f"no first frame: {problem}")
-    if problem is not None:
-        raise TimedOut(f"no first frame: {problem}")
-    raise TimedOut(
-        f"{described}: no first frame within {timeout_s:g} s; is the camera powered, and its "
-        f"receiver on the right channel?"
+    raise source.failure or TimedOut(
+        f"{source.describe()}: no first frame within {timeout_s:g} s; is the camera powered, and "
+        f"its receiver on the right channel?"
     )

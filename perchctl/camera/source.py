@@ -6,13 +6,14 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
+from urllib.error import URLError
 
 import cv2
 import numpy as np
 
 from perchctl.camera.credentials import without_password
 from perchctl.camera.health import Grey, same_bytes
-from perchctl.errors import InvalidValue
+from perchctl.errors import InvalidValue, PerchError, TimedOut
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraModel, Frame
 
@@ -113,35 +114,45 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
 
 def one_line(error: Exception) -> str:
     """Describe an unforeseen error within a sentence: its class, and its text without passwords."""
+    if isinstance(error, URLError) and isinstance(error.reason, Exception):
+        error = error.reason
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    if isinstance(error, ConnectionRefusedError):
+        return "connection refused"
     text = " ".join(without_password(str(error)).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return f"{type(error).__name__}: {text}"
 
 
 class LiveSource:
-    """Newest-frame slot between a grabbing thread and the loop.
+    """Newest-frame slot between a reading thread and the loop.
 
-    A subclass runs `_start(target)`; its thread calls `_put` for each picture, looks at `_stop`
-    and ends with `_fail` when the camera is lost for good. While it waits for a picture,
-    `_why_silent` may hold the reason, which `problem` then gives. A thread that ends in another
-    way, by an exception too, is a problem of the camera.
+    A subclass has `_connection`, which opens the camera and reads it. It is called again
+    `reconnect_wait_s` after it ended, until `most_failed` of them in a row have brought no picture.
+    Before the first picture an error of perchctl's own is final, too. `failure` holds it then.
     """
 
     live = True
     finished = False
+    connect_timeout_s = 3.0
+    read_timeout_s = 2.0
+    reconnect_wait_s = 0.3
+    most_failed = 5.0
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
-        self._name = name
+        self._name = without_password(name)
         self._latency_s = latency_s
         self._clock = clock
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._first = threading.Event()  # set by the first frame, or by failing before it
-        self._thread: threading.Thread | None = None
+        self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         self._slot = NewestSlot()
         self._last_arrival_s = clock()
         self._arrived = 0  # pictures, a receiver's repetitions too
-        self._failure: str | None = None
         self._why_silent = ""
+        self.connections = 0
+        self.failure: PerchError | None = None
         self.size_px: tuple[int, int] | None = None
 
     def poll(self, now_s: float) -> Frame | None:
@@ -150,8 +161,8 @@ class LiveSource:
 
     def problem(self, now_s: float) -> str | None:
         with self._lock:
-            if self._failure is not None:
-                return self._failure
+            if self.failure is not None:
+                return str(self.failure)
             silent_s = now_s - self._last_arrival_s
             why = f": {self._why_silent}" if self._why_silent else ""
         if silent_s > SILENT_AFTER_S:
@@ -162,36 +173,45 @@ class LiveSource:
         size = "no frame yet" if self.size_px is None else "{}x{} px".format(*self.size_px)
         return f"{self._name} ({size})"
 
+    def begin(self) -> None:
+        """Connect, and read in a thread."""
+        self._thread.start()
+
     def wait_first(self, timeout_s: float) -> bool:
         """Wait until the first frame is there; False when it fails or stays away so long."""
         self._first.wait(timeout_s)
-        return self._count > 0
-
-    @property
-    def _count(self) -> int:
-        """The number of pictures so far, each counted once."""
-        return self._slot.count
+        return self._arrived > 0
 
     def close(self) -> None:
         self._stop.set()
-        if self._thread is not None:
-            self._thread.join(CLOSE_WITHIN_S)
+        self._thread.join(CLOSE_WITHIN_S)
 
-    def _start(self, target: Callable[[], None]) -> None:
-        self._thread = threading.Thread(
-            target=self._grabbing, args=(target,), name=self._name, daemon=True
-        )
-        self._thread.start()
+    def _connection(self) -> str:
+        """Open the camera, read it until it ends, and return why it ended. It calls `_put` for
+        each picture, looks at `_stop`, and may raise any Exception."""
+        raise NotImplementedError
 
-    def _grabbing(self, target: Callable[[], None]) -> None:
-        """Run the grabbing thread's whole life, so that it does not end unnoticed."""
-        ended = "its thread has ended"
-        try:
-            target()
-        except Exception as error:
-            ended = f"its thread was ended by {one_line(error)}"
-        if self._failure is None and not self._stop.is_set():
-            self._fail(f"{self._name} gives no pictures any more: {ended}; start perchctl anew")
+    def _run(self) -> None:
+        failed = 0
+        while not self._stop.is_set():
+            before = self._arrived
+            self.connections += 1
+            try:
+                reason = self._connection()
+            except PerchError as error:
+                if self._arrived == 0:
+                    self._fail(error)
+                    return
+                reason = str(error)
+            except Exception as error:
+                # Whatever damaged bytes do to a library: a new connection may bring whole ones.
+                reason = one_line(error)
+            self._why_silent = reason
+            failed = 0 if self._arrived > before else failed + 1
+            if failed >= self.most_failed:
+                self._fail(TimedOut(f"{self._name} gave no picture in {failed} attempts: {reason}"))
+                return
+            self._stop.wait(self.reconnect_wait_s)
 
     def _put(
         self,
@@ -216,9 +236,8 @@ class LiveSource:
             self.size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 
-    def _fail(self, sentence: str) -> None:
-        with self._lock:
-            self._failure = sentence
+    def _fail(self, error: PerchError) -> None:
+        self.failure = error
         self._first.set()
 
 

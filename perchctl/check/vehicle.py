@@ -26,7 +26,7 @@ from perchctl.check.row import (
 from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
-from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
+from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, POSITION_DECKS, Telemetry
 
 LISTEN_S = 5.0
 MOVED_WARN_M = 0.05
@@ -59,7 +59,7 @@ class Vehicle:
     telemetry: Telemetry | None = None
     age_s: float = 0.0
     samples_hz: float = 0.0
-    measured_by: MeasuredBy = field(default_factory=MeasuredBy)
+    decks: tuple[str, ...] = ()
     moved_m: float = 0.0
 
     @property
@@ -70,7 +70,8 @@ class Vehicle:
         return self.telemetry
 
     def position_decks(self, profile: Profile) -> tuple[str, ...]:
-        return self.measured_by.placed_by(profile.positioning.decks)
+        known = (*POSITION_DECKS, *profile.positioning.decks)
+        return tuple(deck for deck in self.decks if deck in known)
 
 
 GONE_S = 1.0
@@ -91,7 +92,6 @@ def gone(link: ProbeLink) -> str:
 
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
-    measured_by = link.measured_by()
     link.telemetry()
     echoes = link.echoes(listen_s)
     samples = link.telemetry()
@@ -109,7 +109,7 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
         age_s=link.age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
         moved_m=moved_m(samples),
-        measured_by=measured_by,
+        decks=link.decks(),
     )
 
 
@@ -194,9 +194,9 @@ def _positioning(vehicle: Vehicle, profile: Profile) -> Finding:
     found = {
         "mocap": f"by {profile.positioning.label}, see its rows",
         "target": "by the target, see in view",
-        "deck": f"by {decks}" if decks else "by positions from outside",
+        "deck": f"by {decks}",
     }
-    problem = GroundCriteria.unmeasured(vehicle.measured_by, profile)
+    problem = GroundCriteria.unmeasured(vehicle.decks, profile)
     return by_problem(problem, found[profile.positioning.by])
 
 

@@ -267,7 +267,7 @@ def _now() -> str:
 def _source(text: str, view: bool = False) -> str:
     """Return the source that the command line names, as `open_camera` takes it. Raises NotFound,
     InvalidValue, UsageError."""
-    source = parse_source(text, files=True)
+    source = parse_source(text)
     if view and not source.live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
     return source.spec

@@ -170,7 +170,7 @@ def _live_sources(
         raise UsageError(
             f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
         )
-    name = parse_source(given, files=True)
+    name = parse_source(given)
     if "carry" not in parts and uri is None:
         return name.spec, None
     if not name.live:

@@ -26,6 +26,7 @@ import typer
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import (
+    VERDICT_TEXTS,
     FrameSource,
     Recording,
     WrappedSource,
@@ -117,7 +118,7 @@ def track(
     along the camera's x, y, z.
     """
     flown = load_profile(profile)
-    source = parse_source(source, files=True).spec
+    source = parse_source(source).spec
     if stills is None:  # files of pictures need not belong together
         stills = source.startswith("images:")
     if calibration is None:
@@ -263,10 +264,10 @@ class Tracker:
         """Return the frame's result, or those of its two fields; none for a live source's
         repetition of the last picture."""
         judged = self._perception.health.assess(frame, self._live or not self._stills)
-        if self._live and judged.kind == "repeated":
+        if self._live and judged == "repeated":
             return []
-        about = () if judged.kind in ("ok", "repeated") else (judged.text,)
-        if self._live and judged.kind in _NO_PICTURE:
+        about = () if judged in ("ok", "repeated") else (VERDICT_TEXTS[judged],)
+        if self._live and judged in _NO_PICTURE:
             return [Tracked(name, frame, notes=about)]
         results = []
         for picture, output in self._perception.look(frame):

@@ -45,18 +45,16 @@ class SimulatedClock:
 
     The simulator advances it with the wall's clock. On a busy computer it stands still until the
     slower of the two has caught up, so no age grows by that. `now` may be called from any thread.
-    `margin_s`: how far the simulator may run past the moment that the loop waits for. `zero_s`: its
-    reading at the simulator's start, such that it first agrees with `time.monotonic`.
+    `zero_s`: its reading at the simulator's start, such that it first agrees with `time.monotonic`.
     """
 
     def __init__(
         self,
         shared: SharedTime,
-        margin_s: float,
         wall: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._shared, self._margin_s = shared, margin_s
+        self._shared = shared
         self._wall, self._sleep = wall, sleep
         self._lock = threading.Lock()
         self._reached_s, self._moved_s = shared.reached_s, wall()
@@ -77,13 +75,13 @@ class SimulatedClock:
 
     def wait_until(self, t_s: float) -> None:
         if self._waits:
-            self._shared.limit_s = t_s - self.zero_s + self._margin_s
+            self._shared.limit_s = t_s - self.zero_s + self._shared.MARGIN_S
         while (left_s := t_s - self.now()) > 0:
             self._sleep(max(left_s, _POLL_S))
 
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:
-        """A context in which simulated time goes on for `margin_s` after each `wait_until` only."""
+        """A context in which simulated time goes on for `MARGIN_S` after each `wait_until` only."""
         self._waits = True
         try:
             yield

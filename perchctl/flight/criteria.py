@@ -1,15 +1,14 @@
 """Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
 
 Each gives what is wrong, or None. Of a vehicle at rest two things are known without a motion
-capture: where the ground is, and which way is up. A world with another axis up, or a body whose
-axes are turned, shows against the second once the vehicle stands in another heading than the one in
-which its body was defined; a height in millimetres against the first. The rest shows when a hand
-lifts and turns the vehicle (`perchctl check --lift`), or in its first centimetres in the air.
+capture: where the ground is, and which way is up. The rest shows when a hand lifts and turns the
+vehicle (`perchctl check --lift`), or in its first centimetres in the air.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +30,9 @@ from perchctl.vehicle import (
     FLYING,
     LOCKED,
     NO_BATTERY_READING_V,
+    POSITION_DECKS,
     TUMBLED,
     ExternalPosition,
-    MeasuredBy,
     Telemetry,
 )
 from perchctl.vision import TargetEstimate
@@ -42,7 +41,6 @@ KNOWN_SUPERVISOR_BITS = 0x0FFF
 REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
 WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
-HIGH_M = 4.0  # of a vehicle at its take-off place: what is higher is in another unit
 UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
 WANDERED_M = 0.1  # far beyond a capture's noise
 AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
@@ -124,14 +122,19 @@ class GroundCriteria:
     @property
     def height(self) -> Problem | None:
         """A vehicle off the ground by its settled estimate: it hangs, or is held."""
-        safety, z_m = self.profile.safety, self.telemetry.position_m[2]
+        return self._off_the_ground(
+            self.telemetry.position_m[2],
+            "the state estimate places the vehicle at",
+            "if it hangs, take it down and restart it; if the positioning system's zero is "
+            "elsewhere, set safety.ground_z_m",
+        )
+
+    def _off_the_ground(self, z_m: float, found: str, advice: str) -> Problem | None:
+        safety = self.profile.safety
         if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
             return None
         return Problem(
-            f"the state estimate places the vehicle at {z_m:.2f} m, and the ground is at "
-            f"{safety.ground_z_m:.2f} m",
-            "if it hangs, take it down and restart it; if the positioning system's zero is "
-            "elsewhere, set safety.ground_z_m",
+            f"{found} {z_m:.2f} m, and the ground is at {safety.ground_z_m:.2f} m", advice
         )
 
     @property
@@ -160,23 +163,18 @@ class GroundCriteria:
         return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
     @staticmethod
-    def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
+    def unmeasured(decks: Sequence[str], profile: Profile) -> Problem | None:
         """A vehicle without any position source, which would fly by a sum of accelerations."""
         config = profile.positioning
-        if config.by != "deck" or by.placed_by(config.decks) or by.external:
+        if config.by != "deck" or {*decks} & {*POSITION_DECKS, *config.decks}:
             return None
-        outside = "whether positions come from outside is not told"
-        if by.external is not None:
-            outside = "no position comes from outside"
         advice = (
             "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "
             "positioning: target"
         )
-        if by.decks:
-            advice += (
-                f"; if {' or '.join(by.decks)} measures it, name that one in positioning.decks"
-            )
-        return Problem(f"no positioning deck, and {outside}", advice)
+        if decks:
+            advice += f"; if {' or '.join(decks)} measures it, name that one in positioning.decks"
+        return Problem("no positioning deck", advice)
 
     @staticmethod
     def too_near(target: TargetEstimate | None) -> Problem | None:
@@ -195,14 +193,22 @@ class GroundCriteria:
     def world_problem(self, place: ExternalPosition) -> Problem | None:
         """An external position in another unit, with another axis up, or elsewhere, which waiting
         will not mend. By the target the world is the vehicle's own, so only the fence counts."""
+        x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
-        return (
-            self._in_millimetres(place)
-            or with_another_up(place, self.telemetry)
-            or self._off_the_ground(place)
-            or self._unreachable(place)
+        if max(abs(x), abs(y), abs(z)) >= ROOM_M:
+            return Problem(
+                f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these "
+                f"look like millimetres",
+                "set the unit of its stream to metres",
+            )
+        standing = self._off_the_ground(
+            z,
+            "the motion capture has the vehicle at",
+            "swapped axes, another rigid body or zero, or millimetres: perchctl check --lift "
+            "tells; safety.ground_z_m is the height that it has where it stands",
         )
+        return with_another_up(place, self.telemetry) or standing or self._unreachable(place)
 
     def _unreachable(self, place: ExternalPosition) -> Problem | None:
         """A place from which no flight reaches the expected target: perhaps another vehicle's."""
@@ -217,29 +223,6 @@ class GroundCriteria:
             f"the target is expected {away_m:.1f} m from where the vehicle stands (x {x:.2f}, y "
             f"{y:.2f} m), and the fence is {fence_m:g} m",
             "correct target.expected_xy_m, or positioning.body if it names another vehicle's body",
-        )
-
-    def _in_millimetres(self, place: ExternalPosition) -> Problem | None:
-        safety, (x, y, z) = self.profile.safety, place.position_m
-        far_m = max(abs(v) for v in place.position_m)
-        on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
-        if not far_m >= ROOM_M and not (z >= HIGH_M and on_ground):
-            return None
-        return Problem(
-            f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these look "
-            f"like millimetres",
-            "set the unit of its stream to metres",
-        )
-
-    def _off_the_ground(self, place: ExternalPosition) -> Problem | None:
-        safety, z_m = self.profile.safety, place.position_m[2]
-        if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
-            return None
-        return Problem(
-            f"the motion capture has the vehicle at {z_m:.2f} m, and the ground is at "
-            f"{safety.ground_z_m:.2f} m",
-            "swapped axes, another rigid body or zero: perchctl check --lift tells; "
-            "safety.ground_z_m is the height that it has where it stands",
         )
 
 

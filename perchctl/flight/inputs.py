@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -17,6 +17,7 @@ from perchctl.mission import (
     Observation,
     PlannerState,
     PoseSeen,
+    SentCommand,
     Turn,
     TurnInputs,
     TurnTiming,
@@ -30,7 +31,7 @@ from perchctl.perception import (
     battery_age_s,
 )
 from perchctl.positioning import FeedStatus, SightFeed
-from perchctl.profile import Profile, SafetyConfig
+from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, SendPosition, Telemetry
 from perchctl.vision import (
@@ -92,7 +93,6 @@ class FlightInputs:
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
     frames: int = 0
-    ground_z_m: float = 0.0  # of the estimate, where the flight begins
     _note: str | None = None
 
     def __post_init__(self) -> None:
@@ -115,9 +115,13 @@ class FlightInputs:
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
+        seen: FrameSeen | None = None
+        if frame is not None:
+            times_s = frame.t_s, frame.t_arrival_s
+            seen = FrameSeen(frame.index, *times_s, frame.fields, frame.repeated)
         self.taken = TurnInputs(
             tuple(samples),
-            frame=_seen(frame),
+            frame=seen,
             problem=problem,
             ended=self.source.finished,
             live=self.source.live,
@@ -212,27 +216,18 @@ class FlightInputs:
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
-        verdict = self.perception.health.assess(frame, live)
+        kind = self.perception.health.assess(frame, live)
         if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen: such
         # pictures are searched all the same, with a note.
-        self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
-        if not verdict.usable and self._note is None:
-            return verdict.text
-        return lateness_text(now_s - frame.t_s, self.profile.safety) if live else None
-
-
-def lateness_text(age_s: float, safety: SafetyConfig) -> str | None:
-    """Return why a live picture of this age is no measurement; None if it is one."""
-    return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
-
-
-def _seen(frame: Frame | None) -> FrameSeen | None:
-    if frame is None:
-        return None
-    return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
+        self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
+        if kind != "ok" and self._note is None:
+            return VERDICT_TEXTS[kind]
+        age_s = now_s - frame.t_s
+        is_late = live and age_s > self.profile.safety.max_frame_age_s
+        return f"the picture is {age_s:.1f} s late" if is_late else None
 
 
 # --- The target as positioning system, tick by tick -------------------
@@ -255,10 +250,6 @@ class TargetPositioning:
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = SightFeed(send, profile, pipeline.pose)
         self._touches = False
-
-    def status(self, now_s: float) -> FeedStatus:
-        """Return the status as that of a motion capture's feed."""
-        return self.feed.status(now_s)
 
     def begin(self, history: History, now_s: float, *, touches: bool) -> None:
         """Begin a tick, before its picture. `touches`: contact was proven and has not ended."""
@@ -303,10 +294,14 @@ def is_supported(history: History, now_s: float) -> bool:
 
 
 @runtime_checkable
-class TurnWatcher(Watcher, Protocol):
-    """A watcher of the turns without a tick, too: before take-off, and those decided anew."""
+class LogKeeper(Watcher, Protocol):
+    """A watcher of all that a flight log holds: of the turns without a tick, too, which are those
+    before take-off and those decided anew, and of what is sent in the loop's place."""
 
     def turn(self, turn: Turn) -> None: ...
+
+    def sent(self, sent: SentCommand) -> None:
+        """Called in the sender's own thread: must neither wait nor raise."""
 
 
 Decision = tuple[PlannerState, Command, FeedStatus | None]
@@ -316,14 +311,10 @@ class Turns:
     """Counts the loop's turns, and reports them to their watchers. In lockstep there are no
     timings: the same seed gives the same turns."""
 
-    def __init__(
-        self,
-        clock: Clock,
-        watchers: Iterable[Watcher],
-        wall: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self._wall = wall if isinstance(clock, (WallClock, SimulatedClock)) else None
-        self._watchers = [w for w in watchers if isinstance(w, TurnWatcher)]
+    def __init__(self, clock: Clock, watchers: Iterable[Watcher]) -> None:
+        in_real_time = isinstance(clock, (WallClock, SimulatedClock))
+        self._wall = time.perf_counter if in_real_time else None
+        self._watchers = [w for w in watchers if isinstance(w, LogKeeper)]
         self._count = 0
         self._began_s = 0.0
         self._laps_s = [0.0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from perchctl.sim import (
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
+from perchctl.vision import Frame, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2  # pictures that wait; a newer one replaces the oldest
@@ -121,12 +121,10 @@ class LockstepFlight:
     """A finished flight and what only the simulator can measure."""
 
     report: FlightReport
-    seed: int
     miss_m: float
     hanging: bool
     fell: bool
     locked: bool
-    simulated_s: float
     touchdown_mps: float
     scenario: Scenario
 
@@ -152,7 +150,7 @@ def fly_lockstep(
     *,
     scenario: Scenario | None = None,
     capture: CaptureSettings | None = None,
-    operator_at: dict[Phase, Operator] | None = None,
+    operator: Callable[[], Operator] = lambda: Operator.NONE,
     watchers: tuple[Watcher, ...] = (),
 ) -> LockstepFlight:
     """Fly one seed of the profile's scenario to its end, faster than real time.
@@ -160,24 +158,15 @@ def fly_lockstep(
     Args:
         log: a file to log to, or a watcher that is left open.
         scenario, capture: flown instead of the seed's own.
-        operator_at: the operator's command, given as soon as a phase is reached.
+        operator: the operator's command.
         watchers: others that look on.
 
     Errors: NotFound, InvalidValue (calibration, log file).
     """
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
+    opened: LogWatcher | None = None
     if isinstance(log, (Path, str)):
-        watcher = LogWatcher.lockstep(Path(log), profile, scenario.seed)
-        flight = fly_lockstep(
-            profile,
-            log=watcher,
-            scenario=scenario,
-            capture=capture,
-            operator_at=operator_at,
-            watchers=watchers,
-        )
-        flight.conclude(watcher)
-        return flight
+        log = opened = LogWatcher.lockstep(Path(log), profile, scenario.seed)
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
@@ -190,16 +179,14 @@ def fly_lockstep(
         log.truth = truth.for_log
         watchers = (*watchers, log)
         source = log.watched(source)
-    operator = _OperatorAt(operator_at or {})
-    pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
         link,
         source,
         LockstepClock(link),
         profile,
-        pipeline,
-        (*watchers, operator),
-        operator.read,
+        make_pipeline(profile, camera),
+        watchers,
+        operator,
         positions,
         tuple if log is None else log.remarks,
     )
@@ -208,62 +195,27 @@ def fly_lockstep(
     vehicle.watched = False
     link.close()
     link.advance_to(link.now_s + 1.0)
-    return _flown(report, vehicle, truth)
-
-
-_shared_pipelines: dict[Hashable, Pipeline] = {}
-
-
-def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
-    """Return a vision pipeline; flights of one profile and camera share it, since making one takes
-    as long as 10 pictures. Two are kept, for `simulate compare`. A profile with a mask gets a new
-    one each time: the mask's file may have changed."""
-    if profile.camera.mask is not None:
-        return make_pipeline(profile, camera)
-    key = profile.model_dump_json(), camera.contents
-    if key not in _shared_pipelines:
-        if len(_shared_pipelines) >= 2:
-            _shared_pipelines.clear()
-        _shared_pipelines[key] = make_pipeline(profile, camera)
-    return _shared_pipelines[key]
-
-
-def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:
     hanging = vehicle.world.magnet_engaged
-    fell = truth.fell or (report.phase is Phase.PERCHED and not hanging)
-    return LockstepFlight(
+    flight = LockstepFlight(
         report=report,
-        seed=vehicle.scenario.seed,
         miss_m=vehicle.world.gear_miss_m(),
         hanging=hanging,
-        fell=fell,
+        fell=truth.fell or (report.phase is Phase.PERCHED and not hanging),
         locked=bool(vehicle.firmware.supervisor_info & LOCKED),
-        simulated_s=vehicle.t_s,
         touchdown_mps=truth.touchdown_mps,
-        scenario=vehicle.scenario,
+        scenario=scenario,
     )
-
-
-class _OperatorAt(Watcher):
-    """Gives the operator's command once a phase has been reached."""
-
-    def __init__(self, at: dict[Phase, Operator]) -> None:
-        self._at = at
-        self._command = Operator.NONE
-
-    def read(self) -> Operator:
-        return self._command
-
-    def tick(self, tick: Tick) -> None:
-        self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
+    if opened is not None:
+        flight.conclude(opened)
+    return flight
 
 
 # --- External positions in lockstep: the simulated motion capture, by the same feed ---
 
 
 def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """Return a feed of the simulated motion capture that is called at the link's time; None with
-    decks, and where the target is the positioning system, since the loop feeds then.
+    """Return a feed of the simulated motion capture that is called at the link's time; None
+    without a capture.
 
     Lets the time pass until the vehicle's body is seen, and starts the estimate there. Raises
     ConnectionFailed if it is not seen.

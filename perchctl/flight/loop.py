@@ -9,16 +9,17 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import AtRest
-from perchctl.flight.inputs import FlightInputs, Turns
+from perchctl.flight.inputs import FlightInputs, LogKeeper, Turns
 from perchctl.flight.preflight import (
+    out_of_view,
     refuse,
-    refuse_out_of_view,
+    refuse_forbidden,
     refuse_strange,
     refuse_unmeasured,
     still_waiting_for,
@@ -94,10 +95,8 @@ def fly(parts: FlightParts) -> FlightReport:
         recorded=turns.are_watched,
     )
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
-    if inputs.history.newest is not None:
-        inputs.ground_z_m = inputs.history.newest.position_m[2]
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
-    parts.link.set_guard(watchdog, told)
+    parts.link.set_guard(watchdog.poll, told)
     try:
         return _mission(parts, inputs, watchdog, turns)
     except BaseException as error:
@@ -115,21 +114,15 @@ def fly(parts: FlightParts) -> FlightReport:
         )
         with contextlib.suppress(Exception):  # the log may be what failed
             turns.failed(inputs, error)
-        _tell_rescue(parts, error, rest)
+        for watcher in parts.watchers:
+            with contextlib.suppress(Exception):  # it may be the one that failed
+                watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
         raise
-
-
-@runtime_checkable
-class SentWatcher(Watcher, Protocol):
-    """A watcher of what was sent in the loop's place, too."""
-
-    def sent(self, sent: SentCommand) -> None:
-        """Called in the sender's own thread: must neither wait nor raise."""
 
 
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     """Return a callback that passes on what is sent in the loop's place to those who watch it."""
-    told = [watcher for watcher in parts.watchers if isinstance(watcher, SentWatcher)]
+    told = [watcher for watcher in parts.watchers if isinstance(watcher, LogKeeper)]
 
     def tell(sent: SentCommand) -> None:
         for watcher in told:
@@ -137,12 +130,6 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
                 watcher.sent(sent)
 
     return tell
-
-
-def _tell_rescue(parts: FlightParts, error: BaseException, rest: str) -> None:
-    for watcher in parts.watchers:
-        with contextlib.suppress(Exception):  # it may be the one that failed
-            watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
 
 
 def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) -> None:
@@ -154,7 +141,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
             raise Interrupted("interrupted before take-off: nothing was started")
         inputs.take_in(now_s)
         newest = inputs.history.newest
-        refuse(newest, parts.profile)
+        refuse_forbidden(newest, parts.profile)
         outside = _outside(parts, inputs, now_s)
         refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(inputs, now_s, outside)
@@ -167,7 +154,6 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
             inputs.target(now_s),
             0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
             outside,
-            parts.pipeline.camera,
         )
         if parts.source.finished:
             raise NotFound(
@@ -175,9 +161,11 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
                 f"go on, from a camera or a longer recording"
             )
         if not waiting:
-            if newest is not None and inputs.target_positioning is not None:
-                target = inputs.target_positioning.feed.target
-                refuse_out_of_view(target, newest, parts.profile, parts.pipeline.camera)
+            positioning = inputs.target_positioning
+            if newest is not None and positioning is not None and positioning.feed.target:
+                camera, yaw_rad = parts.pipeline.camera, newest.yaw_rad
+                place, start_m = positioning.feed.target, newest.position_m
+                refuse(out_of_view(place, start_m, yaw_rad, parts.profile, camera))
             return
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
@@ -193,10 +181,13 @@ def _mission(
     redone = log_noted = False
     logged = inputs.perception.calibration.newest
     while True:
-        now_s = clock.now()
-        turns.begin(now_s)
-        inputs.take_in(now_s, look=not _is_blind(state))
-        now_s = _present(parts, inputs, now_s)
+        began_s = now_s = clock.now()
+        turns.begin(began_s)
+        # Against the ceiling the picture shows no target and steers nothing.
+        inputs.take_in(began_s, look=state is None or state.phase is not Phase.COMPLETE)
+        if clock.now() - began_s > HUNG_S:  # a setpoint for the time before the hang is stale
+            now_s = clock.now()
+            inputs.present(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
         outside = _outside(parts, inputs, now_s)
         obs = _observe(parts, inputs, now_s, late_s, outside)
@@ -221,12 +212,11 @@ def _mission(
             parts.positions.stop()
             inputs.perception.drop_sights()
         events = Event.of_tick(before, state, obs, parts.profile)
+        notes = [*parts.remarks()]
         if obs.log_problem is not None and not log_noted:
             log_noted = True
-            text = f"the log of this flight is incomplete: {obs.log_problem}"
-            events.append(Event(now_s, EventKind.NOTE, text, state.phase))
-        for text in parts.remarks():
-            events.append(Event(now_s, EventKind.NOTE, text, state.phase))
+            notes.insert(0, f"the log of this flight is incomplete: {obs.log_problem}")
+        events += [Event(now_s, EventKind.NOTE, text, state.phase) for text in notes]
         for event in events:
             if event.kind is EventKind.PHASE:
                 passed.append(event)
@@ -266,23 +256,8 @@ def _mission(
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
     """Return the status of the external positions, or of those by the target; None with decks."""
     if inputs.target_positioning is not None:
-        return inputs.target_positioning.status(now_s)
+        return inputs.target_positioning.feed.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)
-
-
-def _present(parts: FlightParts, inputs: FlightInputs, began_s: float) -> float:
-    """Return the turn's time: after a hang of camera or vision the present, with what has arrived
-    meanwhile, since a setpoint for the time before the hang would be stale."""
-    now_s = parts.clock.now()
-    if now_s - began_s <= HUNG_S:
-        return began_s
-    inputs.present(began_s, now_s)
-    return now_s
-
-
-def _is_blind(state: PlannerState | None) -> bool:
-    """True against the ceiling, where the picture shows no target and steers nothing."""
-    return state is not None and state.phase is Phase.COMPLETE
 
 
 def _observe(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -19,29 +20,30 @@ from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
-from perchctl.target import (
-    TargetView,
-    overhead_text,
-    view_from,
-)
+from perchctl.target import TargetView, view_from
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 from perchctl.vision import CameraModel, TargetEstimate
 
 
-def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
+def refuse(problem: Problem | None) -> None:
+    """Raises SafetyAbort with the problem's sentence, if there is one."""
+    if problem is not None:
+        raise SafetyAbort(problem.sentence)
+
+
+def refuse_forbidden(telemetry: Telemetry | None, profile: Profile) -> None:
     """Raises SafetyAbort for what waiting will not mend."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
-        _refuse(criteria.forbidden)
-        _refuse(criteria.battery)
+        refuse(criteria.forbidden or criteria.battery)
 
 
 def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
     capture are being sent."""
     if profile.positioning.by == "deck":
-        _refuse(GroundCriteria.unmeasured(link.measured_by(), profile))
+        refuse(GroundCriteria.unmeasured(link.decks(), profile))
     elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
@@ -67,19 +69,9 @@ def refuse_strange(
         return
     place = status.measured if stands else None
     if place is not None:
-        _refuse(criteria.world_problem(place))
+        refuse(criteria.world_problem(place))
     if at_rest is not None:
-        _refuse(at_rest.strange(place, profile))
-
-
-def refuse_out_of_view(
-    target: Place | None, telemetry: Telemetry, profile: Profile, camera: CameraModel
-) -> None:
-    """Raises SafetyAbort if the way up leads out of sight of a target that is the positioning
-    system. `target`: its place in the estimate's world; None if something else measures."""
-    if target is not None:
-        start_m = telemetry.position_m
-        _refuse(out_of_view(target, start_m, telemetry.yaw_rad, profile, camera))
+        refuse(at_rest.strange(place, profile))
 
 
 def still_waiting_for(
@@ -91,7 +83,6 @@ def still_waiting_for(
     target: TargetEstimate | None = None,
     age_s: float = 0.0,
     outside: FeedStatus | None = None,
-    camera: CameraModel | None = None,
 ) -> str:
     """Return what is missing yet; empty when ready. Errors: TimedOut past the bound, SafetyAbort
     off the ground."""
@@ -100,38 +91,41 @@ def still_waiting_for(
         return _bounded("telemetry", waited_s, limit_s)
     if age_s > profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
-    if outside is not None and not by_sight and (problem := missing(outside, profile)):
-        return _bounded(f"positions of the motion capture ({problem.sentence})", waited_s, limit_s)
     criteria = GroundCriteria(telemetry, profile)
-    if problem := criteria.unsettled:
-        what = f"the state estimate to settle ({problem.found}; {problem.advice})"
-        return _bounded(what, waited_s, limit_s)
+    unsent = None if outside is None else missing(outside, profile)
     seen = None if outside is None else outside.measured
-    if seen is not None and (problem := apart(seen, telemetry)):
-        what = f"the state estimate to agree with {measurer(profile)} ({problem.sentence})"
-        return _bounded(what, waited_s, limit_s)
-    _refuse(criteria.height)
-    if problem := criteria.tilt:
-        return _bounded(f"the vehicle to stand level (it is {problem.found})", waited_s, limit_s)
-    if problem := criteria.motion:
-        return _bounded(f"the vehicle to stand still ({problem.found})", waited_s, limit_s)
-    if problem := criteria.not_allowed:
-        return _bounded(f"the supervisor to allow flight ({problem.found})", waited_s, limit_s)
-    if not has_frame:
-        what = f"a good picture ({camera_problem or 'none has come'})"
-        return _bounded(what, waited_s, profile.camera.start_timeout_s)
-    if outside is not None and by_sight and (problem := missing(outside, profile)):
-        if waited_s > limit_s and outside.is_unseen:
-            problem = not_in_view(target, camera_problem, telemetry, profile, camera)
-        what = f"a sight of the target, which measures the position ({problem.sentence})"
-        return _bounded(what, waited_s, limit_s)
-    _refuse(criteria.too_near(target))
-    return ""
+    waiting = _first(
+        {
+            "positions of the motion capture": None if by_sight else unsent,
+            "the state estimate to settle": criteria.unsettled,
+            f"the state estimate to agree with {measurer(profile)}": None
+            if seen is None
+            else apart(seen, telemetry),
+        }
+    )
+    if not waiting:
+        refuse(criteria.height)
+        waiting = _first(
+            {
+                "the vehicle to stand level": criteria.tilt,
+                "the vehicle to stand still": criteria.motion,
+                "the supervisor to allow flight": criteria.not_allowed,
+            }
+        )
+    if not waiting and not has_frame:
+        waiting = f"a good picture ({camera_problem or 'none has come'})"
+        limit_s = profile.camera.start_timeout_s
+    waiting = waiting or _first({"a sight of the target, which measures the position": unsent})
+    if not waiting:
+        refuse(criteria.too_near(target))
+        return ""
+    return _bounded(waiting, waited_s, limit_s)
 
 
-def _refuse(problem: Problem | None) -> None:
-    if problem is not None:
-        raise SafetyAbort(problem.sentence)
+def _first(problems: Mapping[str, Problem | None]) -> str:
+    """Return the first that has a problem, and in brackets which; empty without any."""
+    found = (f"{what} ({problem.sentence})" for what, problem in problems.items() if problem)
+    return next(found, "")
 
 
 def _bounded(what: str, waited_s: float, limit_s: float) -> str:
@@ -141,8 +135,6 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
 
 
 # --- Whether a target that is the positioning system stays in view on the way up. Pure ---
-# The way up is known: straight, then to `planner.approach_xy_m`. The higher the vehicle, the less
-# of the ceiling is in its picture; without the target it has no position.
 
 
 LEAN_DEG = 5.0  # on its way up, and against a draught
@@ -169,7 +161,9 @@ def out_of_view(
         if not sight.whole:
             return Problem(
                 f"the target is the positioning system, and from x {over[0]:.2f}, y {over[1]:.2f} "
-                f"m at take-off height the vehicle would not see it: {_too_far(sight)}",
+                f"m at take-off height the vehicle would not see it: it would be "
+                f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis, and "
+                f"{sight.height_m:.2f} m over the camera",
                 advice,
             )
     return None
@@ -200,41 +194,7 @@ def _seen_leaning(
     if not (level.whole and aside_m > 1e-9):
         return level
     away = -rot_z(yaw_rad)[:2, :2] @ np.array(level.aside_m) / aside_m
-    x, y = np.array(body_m[:2]) + _leant_m(level) * away
+    leant_m = level.height_m * math.tan(math.radians(LEAN_DEG))
+    x, y = np.array(body_m[:2]) + leant_m * away
     leaning = target_from((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
     return replace(level, whole=leaning.whole)
-
-
-def _leant_m(sight: TargetView) -> float:
-    return sight.height_m * math.tan(math.radians(LEAN_DEG))
-
-
-def _too_far(sight: TargetView) -> str:
-    if not sight.height_m > 0.0:
-        return "it would be no higher than the camera"
-    return (
-        f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis, {sight.height_m:.2f} m "
-        f"over the camera"
-    )
-
-
-def not_in_view(
-    seen: TargetEstimate | None,
-    note: str | None,
-    telemetry: Telemetry,
-    profile: Profile,
-    camera: CameraModel | None,
-) -> Problem:
-    """Return the problem of a target that was not measured from the ground. `note`: a remark on
-    the pictures."""
-    if seen is not None and seen.tracked:
-        return Problem(
-            f"it is seen, and was not measured at rest yet (the accelerometer reads "
-            f"{telemetry.acc_z_g:.2f} g)",
-            "let the vehicle stand still, and the target hang still",
-        )
-    found = "it is not in view" if note is None else f"it is not in view; {note}"
-    if camera is None:
-        return Problem(found, "put the vehicle under it")
-    where = overhead_text(profile.target, camera, profile.camera.mount)
-    return Problem(found, f"put the vehicle under it: {where}")

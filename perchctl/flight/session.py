@@ -22,25 +22,16 @@ from perchctl.errors import (
     no_simulator,
 )
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
-from perchctl.flight.criteria import AtRest
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.preflight import refuse_strange
 from perchctl.link import CflibLink, check_uri, vehicle_uri
 from perchctl.mission import FlightReport, Watcher
-from perchctl.positioning import (
-    CaptureSource,
-    PositionFeed,
-    load_comparison,
-    open_capture,
-)
+from perchctl.positioning import PositionFeed, load_comparison, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import CameraModel, make_pipeline
 
 if TYPE_CHECKING:
     from perchctl.sim import SimProcess
-
-STRANGE_S = 0.5  # external positions are examined for so long before they are used
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,10 @@ class FlyOptions:
 def check_options(options: FlyOptions) -> None:
     """Refuse what can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
-    _check_positioning(options.profile, simulated=options.simulated)
+    if options.profile.positioning.by == "mocap" and not options.simulated:
+        PositionFeed.check_reachable(options.profile.positioning)
+    elif options.profile.positioning.by == "mocap" and find_spec("motioncapture") is None:
+        raise no_motion_capture()  # the simulated room has a capture of its own
     source = parse_source(options.source)
     if source.scheme == "sim" and not options.simulated:
         raise UsageError(
@@ -110,8 +104,7 @@ def fly_session(
         clock: WallClock | SimulatedClock = WallClock()
         if options.simulated:
             simulated = stack.enter_context(simulated_vehicle(options, camera))
-            shared = simulated.shared_time
-            clock = SimulatedClock(shared, shared.MARGIN_S)
+            clock = SimulatedClock(simulated.shared_time)
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
@@ -121,13 +114,12 @@ def fly_session(
         if simulated is not None and simulated.capture is not None:
             system, host = simulated.capture
             positioning = positioning.model_copy(update={"system": system, "host": host})
-        capture = opened_capture(stack, positioning, clock)
         link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
             link.connect()
             if before_arming is not None:
                 before_arming()
-            positions = started_feed(stack, capture, link, positioning, clock, profile)
+            positions = started_feed(stack, link, positioning, clock, profile.safety.ground_z_m)
             switch.listening = True
             parts = FlightParts(
                 link,
@@ -177,16 +169,6 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
 # --- External positions for one flight in real time: capture, feed, and the thread between ---
 
 
-def _check_positioning(profile: Profile, *, simulated: bool) -> None:
-    config = profile.positioning
-    if config.by != "mocap":
-        return
-    if not simulated:
-        PositionFeed.check_reachable(config)
-    elif find_spec("motioncapture") is None:  # the simulated room has a capture of its own
-        raise no_motion_capture()
-
-
 def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
     """Raises SafetyAbort unless somebody has lately compared this vehicle with the motion capture
     by hand (`perchctl check --lift`): swapped axes do not show at rest. The simulator's room is
@@ -198,49 +180,25 @@ def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) 
         raise SafetyAbort(": ".join(objected))
 
 
-def opened_capture(
-    stack: contextlib.ExitStack, config: PositioningConfig, clock: Clock
-) -> CaptureSource | None:
-    """Return the open capture; None with decks. Raises InvalidValue, UsageError,
-    ConnectionFailed."""
+def started_feed(
+    stack: contextlib.ExitStack,
+    link: CflibLink,
+    config: PositioningConfig,
+    clock: Clock,
+    ground_z_m: float = 0.0,
+) -> PositionFeed | None:
+    """Settle the vehicle's estimate, and feed it a capture's positions until `stack` ends, after
+    the link is closed: a landing vehicle still needs them. None without a capture.
+
+    Errors: those of `CflibLink.settle`, and InvalidValue, UsageError, ConnectionFailed."""
+    if config.by == "target":
+        link.settle(None, ground_z_m)
     if config.by != "mocap":
         return None
     capture = open_capture(config, clock.now)
     stack.callback(capture.close)
-    return capture
-
-
-def started_feed(
-    stack: contextlib.ExitStack,
-    capture: CaptureSource | None,
-    link: CflibLink,
-    config: PositioningConfig,
-    clock: Clock,
-    profile: Profile,
-) -> PositionFeed | None:
-    """Settle the vehicle's estimate on the capture's positions, and feed them until `stack` ends:
-    the link is closed before that, since a landing vehicle still needs them. None with decks, and
-    where the target is the positioning system.
-
-    Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
-    if config.by == "target":
-        link.settle(None, profile.safety.ground_z_m)
-        return None  # what follows is seen, and sent, by the loop
-    if capture is None:
-        return None
     feed = PositionFeed(capture, link.external, config)
     stack.callback(feed.close)
     feed.start(clock.now)
-    _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed
-
-
-def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:
-    """Raises SafetyAbort for positions of another world, before an estimate is set to them. Late
-    ones are left to those who wait for them."""
-    end_s, newest, at_rest = clock.now() + STRANGE_S, None, AtRest()
-    while (now_s := clock.now()) < end_s:
-        newest = next(reversed(link.telemetry()), newest)
-        refuse_strange(feed.status(now_s), newest, profile, now_s, at_rest)
-        clock.wait_until(now_s + 0.02)

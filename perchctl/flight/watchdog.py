@@ -1,7 +1,7 @@
 """Who lands in the loop's place: the watchdog of a silent loop, and the rescue after an error.
 
-The watchdog decides here what the link sends (`Link.set_guard`) from where the loop's hanging does
-not reach. From `REPEAT_AFTER_S` of silence on the last position is held: never above the vehicle,
+The watchdog decides what the link sends (`Link.set_guard`) where the loop's hanging does not reach.
+From `REPEAT_AFTER_S` of silence on the last position is held: never above the vehicle,
 so that it neither climbs nor presses. While it sinks, a setpoint above stays: it brakes. From
 `safety.loop_late_land_s` on, or on the operator's order, or where the loop was already on its way
 down or had put the weight on the magnet, the lander of `perchctl.mission` goes on in its place.
@@ -62,7 +62,7 @@ class LastTick:
 
 
 class Watchdog:
-    """Decides what the link sends while the loop is silent (`Guard`).
+    """Decides what the link sends while the loop is silent: its `poll` is the link's guard.
 
     `tick`, `rescuing` and `end` are called by the loop's thread, `poll` by the link's; each writes
     its own fields.

@@ -3,8 +3,7 @@
 Nothing here blocks without a bound, nothing blocking is called from cflib's
 callbacks, and the link is closed only when nothing flies: `close_link` sends a
 zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints stop").
-A radio that falls silent is waited for, and a driver that has ended is opened again, for as
-long as the link is open: what was ordered meanwhile goes out first.
+A radio that falls silent is waited for, and a driver that has ended is opened again.
 """
 
 from __future__ import annotations
@@ -22,15 +21,9 @@ from perchctl.link.crtp import (
     UNLOCK_TIMES,
     Packet,
     encode,
-    encode_external,
 )
-from perchctl.link.external_position import (
-    NEEDED_BY,
-    Settling,
-    Standing,
-    estimator_parameters,
-)
-from perchctl.link.firmware import check_firmware, measured_by, set_parameters
+from perchctl.link.external_position import Standing, estimator_parameters, settle
+from perchctl.link.firmware import check_firmware, decks_found, read_parameters, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.telemetry import LogBlocks
@@ -43,7 +36,6 @@ from perchctl.vehicle import (
     Command,
     ExternalPosition,
     Idle,
-    MeasuredBy,
     RawThrust,
     Telemetry,
     is_known,
@@ -97,8 +89,8 @@ class CflibLink:
             self._leave(farewell=self._may_say_farewell())
             raise
 
-    def measured_by(self) -> MeasuredBy:
-        return MeasuredBy() if self.connection is None else measured_by(self.connection.cf)
+    def decks(self) -> tuple[str, ...]:
+        return () if self.connection is None else decks_found(read_parameters(self.connection.cf))
 
     def telemetry(self) -> list[Telemetry]:
         return self._blocks.take()
@@ -109,7 +101,7 @@ class CflibLink:
 
     def external(self, place: ExternalPosition) -> bool:
         try:
-            return self.connection is not None and self.connection.send(encode_external(place))
+            return self.connection is not None and self.connection.send(*encode(place))
         except Exception:  # the library's; commands report their own
             return False
 
@@ -119,14 +111,10 @@ class CflibLink:
         ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
-        Settling(
-            self.connection.cf,
-            self._uri,
-            self._positioning,
-            feed or Standing(self.external, ground_z_m, self._positioning.rate_hz, self._clock),
-            lambda: self._blocks.newest,
-            self._clock,
-        ).run()
+        cf, config, clock = self.connection.cf, self._positioning, self._clock
+        standing = Standing(self.external, ground_z_m, config.rate_hz, clock)
+        wait = standing.wait if feed is None else time.sleep
+        settle(cf, self._uri, config, feed or standing, lambda: self._blocks.newest, clock, wait)
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
@@ -170,12 +158,7 @@ class CflibLink:
         if newest is not None and not newest.has(ARMED):  # a Crazyflie 2.1 arms itself
             send_packets(connection.cf, ARM)
         self._unlock_thrust(connection)  # from here on it is known to be on the ground
-        set_parameters(
-            connection.cf,
-            self._uri,
-            estimator_parameters(self._positioning),
-            needed_by=NEEDED_BY,
-        )
+        set_parameters(connection.cf, self._uri, estimator_parameters(self._positioning))
         self._sender = Sender(
             self._hand_over,
             self._ask_guard,
@@ -203,7 +186,7 @@ class CflibLink:
         """Ask the guard, in the thread of the sender's that never touches cflib."""
         if self._guard is None:
             return None
-        return self._guard.poll(self._clock(), self._blocks.newest, self._blocks.waiting)
+        return self._guard(self._clock(), self._blocks.newest, self._blocks.waiting)
 
     def _hand_over(self, packet: Packet) -> bool:
         """Send a packet, in the sender's thread."""

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -15,7 +14,6 @@ from functools import partial
 from typing import Any
 
 from perchctl.errors import ConnectionFailed
-from perchctl.files import cannot_be_written
 from perchctl.link.crtp import Packet
 from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_folder
@@ -25,11 +23,8 @@ CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
 """Lost packets in a row after which cflib gives a radio up: about 200 s, cflib's own 100 are 0.2 s.
 
-More than any flight outlives without its radio, because waiting is the better way back. A driver
-that goes on repeating is heard with the first packet that the vehicle answers. One that has given
-up has to be opened again: the dongle is reset, and safelink agreed upon anew. Nothing hangs by
-the waiting: what finds no room is not handed over (`Connection.send`), and the age of the
-telemetry ends the flight long before."""
+Waiting is the better way back: a driver that goes on repeating is heard with the first packet that
+the vehicle answers; one that has given up resets its dongle, and agrees upon safelink anew."""
 REOPEN_PAUSE_S = 0.05
 SAFELINK_S = 0.15
 """The driver's ten attempts at a safelink take 20 to 50 ms."""
@@ -48,12 +43,9 @@ class Connection:
         from cflib.crazyflie import Crazyflie
 
         cache = user_folder("cache") / "toc"
-        try:
+        with contextlib.suppress(OSError):  # then the tables are read from the vehicle each time
             cache.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            more = ": set XDG_CACHE_HOME to a folder that can be written to"
-            raise cannot_be_written(cache, error, more) from None
-        self.cf: Any = Crazyflie(rw_cache=str(cache))
+        self.cf: Any = Crazyflie(rw_cache=str(cache) if cache.is_dir() else None)
         self.lost: str | None = None
         self.claim = contextlib.ExitStack()
         self._settled = threading.Event()  # connected, or failed
@@ -251,7 +243,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
     connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
-    program has the vehicle; InvalidValue without a folder for cflib's tables.
+    program has the vehicle.
     """
     share_s = timeout_s / CONNECT_TRIES
     with claim_vehicle(uri) as claim:
@@ -277,21 +269,13 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 def ready_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence it: its log has tracebacks of what is reported by callback as well, and what some of its
-    modules print on stdout, which is for the result, is logged instead."""
+    silence it: its log has tracebacks of what is reported by callback as well."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 
     logger = logging.getLogger("cflib")
     logger.addHandler(logging.NullHandler())
     logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
-
-    def log(*words: object, **_how: object) -> None:
-        logger.info(" ".join(map(str, words)))
-
-    for name, module in list(sys.modules.items()):
-        if name.startswith(("cflib.crtp", "cflib.cpx")):
-            vars(module).setdefault("print", log)
     radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()
@@ -312,26 +296,26 @@ def _as_cflib(packet: Packet) -> Any:
     return outgoing
 
 
+_PERMISSION = f"there is no permission to use it.\n{UDEV_HELP}"
+_CAUSES = {
+    "Resource busy": "another program has it open: a Crazyradio, or a USB cable, serves one "
+    "program at a time; end that one, or plug in another Crazyradio and name it as radio://1/...",
+    "Connection refused": "nothing listens there (connection refused)",
+    "Could not open usb": "no Crazyflie is plugged in by USB and switched on, or " + _PERMISSION,
+    "Cannot find": "no Crazyradio is plugged in, or " + _PERMISSION,
+    "Access denied": _PERMISSION,
+}
+"""What to say of a message of cflib's, by words in it: the first that fits."""
+
+
 def plain_cause(message: str) -> str:
-    """Return cflib's message without its traceback, and with the remedy where there is one."""
+    """Return cflib's message without its traceback, or the cause and its remedy where they are
+    known."""
+    for words, cause in _CAUSES.items():
+        if words in message:
+            return cause
     line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
-    line = line.removeprefix("Couldn't load link driver: ")
-    if "Resource busy" in message or "[Errno 16]" in message:
-        return (
-            f"another program has it open ({line}): a Crazyradio, or a USB cable, serves one "
-            f"program at a time; end that one, or plug in another Crazyradio and name it as "
-            f"radio://1/..."
-        )
-    if "Connection refused" in message:
-        return "nothing listens there (connection refused)"
-    missing = ""
-    if "Could not open usb" in message:
-        missing = "no Crazyflie is plugged in by USB and switched on, or "
-    elif "Cannot find" in message:
-        missing = "no Crazyradio is plugged in, or "
-    elif "Crazyradio" not in message and "Access denied" not in message:
-        return line
-    return f"{missing}there is no permission to use it ({line}).\n{UDEV_HELP}"
+    return line.removeprefix("Couldn't load link driver: ")
 
 
 def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
@@ -360,9 +344,8 @@ def _forget_dead_dongle(uri: str) -> None:
 
 
 # --- One program at a time for each vehicle: a lock that this user's programs on this computer
-# share. A second connection would do harm without a word: cflib's connect resets the log blocks of
-# a vehicle that flies for another program, and two streams of setpoints would pull it two ways. The
-# operating system holds the lock and lets it go with the process, however that ends.
+# share. cflib's connect would reset the log blocks of a vehicle that flies for another program, and
+# two streams of setpoints would pull it two ways.
 
 
 def claim_vehicle(uri: str) -> contextlib.ExitStack:

@@ -8,10 +8,8 @@ protocol 12 and later; degrees leave here, radians stay behind (docs/firmware.md
 
 from __future__ import annotations
 
-import contextlib
 import math
 import struct
-from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -81,17 +79,20 @@ _REQUEST = 1
 _ARM, _EMERGENCY_STOP = 1, 3
 
 
-def encode(command: Command) -> tuple[Packet, ...]:
-    """Return a command's packets in the order in which they are sent; none for `Idle`.
+def encode(what: Command | ExternalPosition) -> tuple[Packet, ...]:
+    """Return the packets of a command, or of a position from outside, in the order in which they
+    are sent; none for `Idle`.
 
     Raises InvalidValue for a number that its field cannot hold.
     """
-    with _fitting(command):
-        return _packets(command)
+    try:
+        return _packets(what)
+    except (struct.error, OverflowError) as error:
+        raise InvalidValue(f"{what} does not fit into a packet: {error}") from None
 
 
-def _packets(command: Command) -> tuple[Packet, ...]:
-    match command:
+def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
+    match what:
         case Idle():
             return ()
         case PositionSetpoint(x, y, z, yaw):
@@ -100,50 +101,30 @@ def _packets(command: Command) -> tuple[Packet, ...]:
         case RawThrust(thrust, roll_rad, pitch_rad):
             return (_raw(thrust, roll_rad, pitch_rad),)
         case Land(height, duration):
+            # Without a yaw of its own, which it would turn to on the way: cflib's `yaw=None`.
+            data = struct.pack("<BBff?f", _LAND_2, _ALL_GROUPS, height, 0.0, True, duration)
             # The order first, and three times: the notify alone cuts the motors at once
             # (docs/firmware.md, "Notify alone"), so the order must not be what is lost. With
             # the notify lost, the setpoint watchdog leaves 2 s in which all is repeated.
-            return (_vertical(_LAND_2, height, duration),) * LAND_TIMES + (_NOTIFY,)
+            return (Packet(Port.HIGH_LEVEL, 0, data),) * LAND_TIMES + (_NOTIFY,)
         case StopMotors():
             stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
             return stop, _NOTIFY
         case EmergencyStop():
             return (Packet(Port.SUPERVISOR, _REQUEST, bytes((_EMERGENCY_STOP,))),)
-
-
-def encode_external(place: ExternalPosition) -> Packet:
-    """Return the packet of a position from outside. Raises InvalidValue as `encode`."""
-    with _fitting(place):
-        if place.quaternion is None:
-            data = struct.pack("<fff", *place.position_m)
-            return Packet(Port.LOCALIZATION, _EXTERNAL_POSITION, data)
-        w, x, y, z = place.quaternion
-        data = struct.pack("<Bfffffff", _EXTERNAL_POSE, *place.position_m, x, y, z, w)
-        return Packet(Port.LOCALIZATION, _LOCALISATION, data)
-
-
-@contextlib.contextmanager
-def _fitting(what: Command | ExternalPosition) -> Iterator[None]:
-    try:
-        yield
-    except (struct.error, OverflowError) as error:
-        raise InvalidValue(f"{what} does not fit into a packet: {error}") from None
+        case ExternalPosition(position_m, quaternion):
+            if quaternion is None:
+                data = struct.pack("<fff", *position_m)
+                return (Packet(Port.LOCALIZATION, _EXTERNAL_POSITION, data),)
+            w, x, y, z = quaternion
+            data = struct.pack("<Bfffffff", _EXTERNAL_POSE, *position_m, x, y, z, w)
+            return (Packet(Port.LOCALIZATION, _LOCALISATION, data),)
 
 
 def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
     """Return a raw setpoint without yaw rate; its pitch is negated on its way out."""
     roll_deg, pitch_deg = math.degrees(roll_rad), math.degrees(pitch_rad)
     return Packet(Port.COMMANDER, 0, struct.pack("<fffH", roll_deg, -pitch_deg, 0.0, thrust))
-
-
-def _vertical(kind: int, height_m: float, duration_s: float) -> Packet:
-    """Return a landing that keeps the heading: cflib's `yaw=None`.
-
-    With a yaw of its own, 0 by default, the vehicle turns to it on the way.
-    """
-    yaw_rad, keep_yaw = 0.0, True
-    data = struct.pack("<BBff?f", kind, _ALL_GROUPS, height_m, yaw_rad, keep_yaw, duration_s)
-    return Packet(Port.HIGH_LEVEL, 0, data)
 
 
 _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPOINT_STOP, 0))

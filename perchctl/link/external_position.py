@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,7 +41,6 @@ AGREE_M, AGREE_RAD = 0.05, math.radians(5.0)
 STILL_M = 0.05
 """From the reset until they agree: a vehicle that moves farther is being carried."""
 POLL_S = 0.02
-NEEDED_BY = "positioning from outside"
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
@@ -64,87 +62,78 @@ def start_parameters(start: Placed) -> dict[str, float]:
     return {f"kalman.initial{name}": value for name, value in values.items()}
 
 
-@dataclass
-class Settling:
-    """The start of one vehicle's estimator on the ground, where `feed` places it.
+def settle(
+    cf: Any,
+    uri: str,
+    config: PositioningConfig,
+    feed: PositionFeed | Standing,
+    newest: Callable[[], Telemetry | None],
+    clock: Callable[[], float],
+    wait: Callable[[float], None] = time.sleep,
+) -> None:
+    """Reset the estimator until it agrees with the feed, on the ground. Bounded.
 
-    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass.
+    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass. Raises ConnectionFailed
+    for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
     """
-
-    cf: Any
-    uri: str
-    config: PositioningConfig
-    feed: PositionFeed | Standing
-    newest: Callable[[], Telemetry | None]
-    clock: Callable[[], float]
-    wait: Callable[[float], None] = time.sleep
-
-    def __post_init__(self) -> None:
-        if isinstance(self.feed, Standing):
-            self.wait = self.feed.wait
-
-    def run(self) -> None:
-        """Reset the estimator until it agrees with the feed. Bounded.
-
-        Raises ConnectionFailed for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
-        """
-        end_s = self.clock() + self.config.connect_timeout_s
-        while (status := self.feed.status(self.clock())).problem is not None or not status.sent:
-            if self.clock() >= end_s:
-                raise TimedOut(
-                    f"no position from outside within {self.config.connect_timeout_s:g} s: "
-                    f"{status.problem or 'none was sent'}"
-                )
-            self.wait(POLL_S)
-        found = ""
-        for _ in range(RESETS):
-            if may_fly(self.newest(), self.clock()):
-                raise ConnectionFailed(
-                    f"the vehicle at {self.uri} may be flying: its estimate is set on the ground "
-                    f"only"
-                )
-            start = self.feed.place()
-            assert start is not None  # one was sent
-            self._reset(start)
-            found = self._disagreement(start)
-            if not found:
-                return
-        by_target = self.config.by == "target"
-        where = "the origin, where it stands" if by_target else f"where {self.config.label} sees it"
-        raise TimedOut(
-            f"the estimate of {self.uri} does not come to {where}: {found}; do positions arrive, "
-            f"and of this vehicle?"
-        )
-
-    def _reset(self, start: Placed) -> None:
-        set_parameters(self.cf, self.uri, start_parameters(start), NEEDED_BY)
+    end_s = clock() + config.connect_timeout_s
+    while (status := feed.status(clock())).problem is not None or not status.sent:
+        if clock() >= end_s:
+            raise TimedOut(
+                f"no position from outside within {config.connect_timeout_s:g} s: "
+                f"{status.problem or 'none was sent'}"
+            )
+        wait(POLL_S)
+    for _ in range(RESETS):
+        if may_fly(newest(), clock()):
+            raise ConnectionFailed(
+                f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
+            )
+        start = feed.place()
+        assert start is not None  # one was sent
+        set_parameters(cf, uri, start_parameters(start))
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
         for value in (1, 0):
-            order = {RESET_PARAMETER: value}
-            set_parameters(self.cf, self.uri, order, NEEDED_BY, read_back=False)
-            self.wait(RESET_PULSE_S * value)
+            set_parameters(cf, uri, {RESET_PARAMETER: value}, read_back=False)
+            wait(RESET_PULSE_S * value)
+        if _agree(feed, start, newest, clock, wait):
+            return
+    where = (
+        "the origin, where it stands" if config.by == "target" else f"where {config.label} sees it"
+    )
+    raise TimedOut(
+        f"the estimate of {uri} does not come to {where}: does it stand still, and do positions "
+        f"arrive, and of this vehicle?"
+    )
 
-    def _disagreement(self, start: Placed) -> str:
-        """Return an empty string once feed and estimate have agreed over fresh samples of both for
-        `AGREE_FOR_S`; otherwise what has been in the way."""
-        found = "no fresh telemetry has come"
-        end_s = self.clock() + AGREE_WITHIN_S
-        since_s: float | None = None
-        while (now_s := self.clock()) < end_s:
-            status, placed, sample = self.feed.status(now_s), self.feed.place(), self.newest()
-            if status.problem is not None or placed is None:
-                found, since_s = str(status.problem), None
-            elif sample is None or not knows_its_position(sample, now_s):
-                since_s = None
-            else:
-                found = _difference(placed, sample)
-                if math.dist(placed.position_m, start.position_m) > STILL_M:
-                    found = "it is being moved"
-                since_s = None if found else (now_s if since_s is None else since_s)
-            if since_s is not None and now_s - since_s >= AGREE_FOR_S:
-                return ""
-            self.wait(POLL_S)
-        return found or "it has not stayed there"
+
+def _agree(
+    feed: PositionFeed | Standing,
+    start: Placed,
+    newest: Callable[[], Telemetry | None],
+    clock: Callable[[], float],
+    wait: Callable[[float], None],
+) -> bool:
+    """Return True once feed and estimate have agreed over fresh samples of both for `AGREE_FOR_S`,
+    and the vehicle has stood at `start`."""
+    end_s = clock() + AGREE_WITHIN_S
+    since_s: float | None = None
+    while (now_s := clock()) < end_s:
+        status, placed, sample = feed.status(now_s), feed.place(), newest()
+        agree = (
+            status.problem is None
+            and placed is not None
+            and sample is not None
+            and knows_its_position(sample, now_s)
+            and math.dist(placed.position_m, start.position_m) <= STILL_M
+            and math.dist(placed.position_m, sample.position_m) <= AGREE_M
+            and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= AGREE_RAD
+        )
+        since_s = (now_s if since_s is None else since_s) if agree else None
+        if since_s is not None and now_s - since_s >= AGREE_FOR_S:
+            return True
+        wait(POLL_S)
+    return False
 
 
 class Standing:
@@ -172,12 +161,3 @@ class Standing:
 
     def place(self) -> Placed:
         return Placed(self._clock(), np.array(self._place.position_m), np.eye(3))
-
-
-def _difference(placed: Placed, newest: Telemetry) -> str:
-    """Return in words how far apart they are; empty if they agree."""
-    way_m = math.dist(placed.position_m, newest.position_m)
-    turn_rad = wrap_rad(newest.yaw_rad - yaw_of(placed.R))
-    if way_m <= AGREE_M and abs(turn_rad) <= AGREE_RAD:
-        return ""
-    return f"they are {way_m:.2f} m and {abs(math.degrees(turn_rad)):.0f} deg of heading apart"

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 import queue
-import time
 from collections.abc import Mapping
 from typing import Any
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
-from perchctl.link.telemetry import NEEDED, start_block
-from perchctl.values import replace
-from perchctl.vehicle import MeasuredBy
+from perchctl.link.telemetry import NEEDED
 
 NEEDED_PROTOCOL = 12
 """From firmware 2026.08 on: the supervisor's own port (docs/firmware.md, "Link")."""
@@ -20,17 +17,14 @@ PARAMETER_TIMEOUT_S = 2.0
 
 def check_firmware(cf: Any, uri: str) -> None:
     """Raises ConnectionFailed for an old protocol, NotFound for a missing log variable."""
-    version = cf.platform.get_protocol_version()
+    version, remedy = cf.platform.get_protocol_version(), "update the firmware to 2026.08 or later"
     if version < NEEDED_PROTOCOL:
         raise ConnectionFailed(
-            f"the firmware at {uri} has protocol {version}, perchctl needs "
-            f"{NEEDED_PROTOCOL} or later (release 2026.08): update the firmware"
+            f"the firmware at {uri} has protocol {version}, perchctl needs {NEEDED_PROTOCOL} or "
+            f"later: {remedy}"
         )
     for name in missing_variables(cf):
-        raise NotFound(
-            f"the firmware at {uri} has no log variable {name}, which perchctl "
-            f"needs: update the firmware to release 2026.08 or later"
-        )
+        raise NotFound(f"the firmware at {uri} has no log variable {name}: {remedy}")
 
 
 def is_logged(cf: Any, name: str) -> bool:
@@ -44,25 +38,19 @@ def missing_variables(cf: Any) -> list[str]:
 
 
 def set_parameters(
-    cf: Any,
-    uri: str,
-    parameters: Mapping[str, float],
-    needed_by: str | None = None,
-    *,
-    read_back: bool = True,
+    cf: Any, uri: str, parameters: Mapping[str, float], *, read_back: bool = True
 ) -> None:
     """Set each parameter, read it back from the vehicle where `read_back` is set, and compare.
 
-    `needed_by`: what they are for, where they are not the user's own. Raises NotFound for an
-    unknown name, InvalidValue for a value that the vehicle does not keep, TimedOut without an
-    answer.
+    Raises NotFound for an unknown name, InvalidValue for a value that the vehicle does not keep,
+    TimedOut without an answer.
     """
     for name, wanted in parameters.items():
         if cf.param.toc.get_element_by_complete_name(name) is None:
-            remedy = ": correct link.parameters in the profile"
-            if needed_by is not None:
-                remedy = f", which {needed_by} needs: update the firmware to 2026.08 or later"
-            raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
+            raise NotFound(
+                f"the firmware at {uri} has no parameter {name}: correct link.parameters in the "
+                f"profile, or update the firmware to 2026.08 or later"
+            )
         kept: str | None = str(wanted)
         try:
             cf.param.set_value(name, kept)
@@ -96,16 +84,6 @@ def _read_back(parameters: Any, name: str) -> str | None:
         parameters.remove_update_callback(group, short, on_value)
 
 
-# --- What tells the vehicle where it is, and the value of a single variable ---
-
-
-ANSWER_S = 1.5
-LISTEN_S = 1.0
-"""Positions from outside that come less than once a second are none to fly by."""
-EXTERNAL_POSITION_TICK = "locSrvZ.tick"
-"""When the newest position from outside came, ms (source): steps with each of them."""
-
-
 def read_parameters(cf: Any) -> dict[str, float]:
     """Return all parameters by name, as they were read when the link was opened."""
     return {
@@ -119,36 +97,3 @@ def decks_found(parameters: Mapping[str, float]) -> tuple[str, ...]:
     """Return the decks that were found at boot, by the firmware's names, sorted."""
     names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
     return tuple(sorted(names))
-
-
-def measured_by(cf: Any) -> MeasuredBy:
-    """Return what tells the vehicle where it is; one without a positioning deck is listened to."""
-    by = MeasuredBy(decks_found(read_parameters(cf)))
-    if by.position_decks:
-        return by
-    before = read_variable(cf, EXTERNAL_POSITION_TICK)
-    time.sleep(LISTEN_S)
-    after = read_variable(cf, EXTERNAL_POSITION_TICK)
-    external = None if before is None or after is None else after != before
-    return replace(by, external=external)
-
-
-def read_variable(cf: Any, name: str) -> float | None:
-    """Return a log variable's value; None for one that is missing or does not come."""
-    if not is_logged(cf, name):
-        return None
-    arrived: queue.SimpleQueue[float] = queue.SimpleQueue()
-
-    def on_data(_stamp: int, data: Mapping[str, float], _block: Any) -> None:
-        arrived.put(data[name])
-
-    try:
-        block = start_block(cf.log, "it", "probe", {name: None}, 0.05, on_data)
-        value: float | None = arrived.get(timeout=ANSWER_S)
-    except (NotFound, KeyError, AttributeError):  # cflib's ways to say that the link is gone
-        return None
-    except queue.Empty:
-        value = None
-    block.stop()
-    block.delete()
-    return value

@@ -19,7 +19,7 @@ import numpy as np
 
 from perchctl.calibration import AttitudeSample
 from perchctl.errors import NotFound, TimedOut
-from perchctl.link.cflib_link import SILENCE_S, CflibLink
+from perchctl.link.cflib_link import CflibLink
 from perchctl.link.connection import (
     Connection,
     begin_thread,
@@ -35,7 +35,6 @@ from perchctl.link.firmware import (
     is_logged,
     missing_variables,
     read_parameters,
-    read_variable,
 )
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
@@ -53,10 +52,6 @@ class ListeningLink(CflibLink):
 
     def _may_say_farewell(self) -> bool:
         return False  # neither when connecting fails half-way
-
-    def _prepare(self, connection: Connection) -> None:
-        check_firmware(connection.cf, self._uri)
-        self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
 
 # --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet ---
@@ -86,7 +81,6 @@ class MotionLink(ListeningLink):
         self._timebase = Timebase()
         self._samples: deque[AttitudeSample] = deque(maxlen=MOST_SAMPLES)
         self._heard = threading.Event()
-        self._heard_s = 0.0
         self._motors_run = False
 
     @property
@@ -98,20 +92,8 @@ class MotionLink(ListeningLink):
         """Return the samples that arrived since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
-    def problem(self, now_s: float) -> str | None:
-        if self.connection is not None and self.connection.lost is not None:
-            return self.connection.lost
-        silent_s = now_s - self._heard_s
-        return f"nothing heard for {silent_s:.1f} s" if silent_s > SILENCE_S else None
-
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
-        for name in MOTION_BLOCK:
-            if not is_logged(connection.cf, name):
-                raise NotFound(
-                    f"the firmware at {self._uri} has no log variable {name}, by which the "
-                    f"mounting is measured: update the firmware"
-                )
         log = connection.cf.log
         start_block(log, self._uri, "motion", MOTION_BLOCK, PERIOD_S, self._on_motion)
         if not self._heard.wait(FIRST_SAMPLE_TIMEOUT_S):
@@ -121,8 +103,8 @@ class MotionLink(ListeningLink):
         """Take a packet of `MOTION_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
         pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A sample with a
         value that is no number is dropped: it would spoil what is solved from the others."""
-        self._heard_s = self._clock()
-        t_s = self._timebase.to_loop_s(stamp, self._heard_s)
+        now_s = self._blocks.last_arrival_s = self._clock()
+        t_s = self._timebase.to_loop_s(stamp, now_s)
         self._motors_run = bool(int(values["supervisor.info"]) & FLYING)
         self._heard.set()
         if all(map(math.isfinite, values.values())):
@@ -193,10 +175,6 @@ class ProbeLink(ListeningLink):
     def has_variable(self, name: str) -> bool:
         """True if the firmware logs this variable."""
         return is_logged(self._cf, name)
-
-    def variable(self, name: str) -> float | None:
-        """Return a log variable's value; None for one that is missing or does not come."""
-        return read_variable(self._cf, name)
 
     def echoes(self, duration_s: float) -> list[float]:
         """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time

@@ -14,14 +14,13 @@ from perchctl.link.crtp import (
     UNLOCK_TIMES,
     Packet,
     encode,
-    encode_external,
 )
 from perchctl.link.external_position import (
     RESET_PARAMETER,
     estimator_parameters,
     start_parameters,
 )
-from perchctl.link.firmware import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
+from perchctl.link.firmware import decks_found
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.telemetry import (
     BLOCKS,
@@ -34,8 +33,7 @@ from perchctl.link.telemetry import (
 from perchctl.mission import SentCommand
 from perchctl.positioning import Placed
 from perchctl.profile import PositioningConfig
-from perchctl.values import replace
-from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
+from perchctl.vehicle import FLYING, Command, ExternalPosition, Telemetry
 
 TELEMETRY_DELAY_S = 0.01
 SETTLE_S = 1.0
@@ -125,15 +123,10 @@ class MockLink:
             self._hand_over(UNLOCK_THRUST)
             self.advance_to(self.now_s + UNLOCK_PERIOD_S)
 
-    def measured_by(self) -> MeasuredBy:
+    def decks(self) -> tuple[str, ...]:
         firmware = self.vehicle.firmware
-        told = {n: firmware.get_parameter(n) for n in firmware.PARAMETERS if n.startswith("deck.")}
-        by = MeasuredBy(decks_found(told))
-        if by.position_decks:
-            return by
-        before = firmware.log_value(EXTERNAL_POSITION_TICK)
-        self.advance_to(self.now_s + LISTEN_S)
-        return replace(by, external=firmware.log_value(EXTERNAL_POSITION_TICK) != before)
+        names = (n for n in firmware.PARAMETERS if n.startswith("deck."))
+        return decks_found({name: firmware.get_parameter(name) for name in names})
 
     def telemetry(self) -> list[Telemetry]:
         self._collect()
@@ -148,7 +141,7 @@ class MockLink:
             return
         self._watched_s = self.now_s
         self._collect()
-        command = self._guard.poll(self.now_s, self._newest, self._arrived)
+        command = self._guard(self.now_s, self._newest, self._arrived)
         if command is not None:
             self.send(command)
             self._on_sent(SentCommand(self.now_s, "watchdog", command))
@@ -165,7 +158,7 @@ class MockLink:
         self._hand_over(encode(command))
 
     def external(self, place: ExternalPosition) -> bool:
-        self._hand_over((encode_external(place),))
+        self._hand_over(encode(place))
         return True
 
     def settle(self, config: PositioningConfig, start: Placed) -> None:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import SentCommand
-from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
 SentCallback = Callable[[SentCommand], None]
 """Called with what a link sends in the loop's place; neither waits nor raises."""
@@ -19,17 +19,11 @@ def ignore_sent(sent: SentCommand) -> None:
     return
 
 
-class Guard(Protocol):
-    """Decides what is sent while the flight loop is silent."""
-
-    def poll(
-        self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
-    ) -> Command | None:
-        """Return what the link has to send now in the loop's place, None almost always.
-
-        Called about every 50 ms, in a thread of the link's own where it has one, but not while a
-        command waits that cannot go out; `newest` is the newest telemetry that has arrived,
-        and `waiting` what the loop has not taken in yet, oldest first."""
+Guard = Callable[[float, Telemetry | None, Sequence[Telemetry]], Command | None]
+"""Returns what the link has to send now in the loop's place, None almost always; it gets the time,
+the newest telemetry, and what the loop has not taken in yet, oldest first. Called about every
+50 ms, in a thread of the link's own where it has one, but not while a command waits that cannot go
+out."""
 
 
 class Link(Protocol):
@@ -42,9 +36,8 @@ class Link(Protocol):
     def connect(self) -> None:
         """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
 
-    def measured_by(self) -> MeasuredBy:
-        """Return what tells the connected vehicle, on the ground, where it is. Bounded, but it may
-        take a second."""
+    def decks(self) -> tuple[str, ...]:
+        """Return the decks that the connected vehicle found at boot, by the firmware's names."""
 
     def telemetry(self) -> list[Telemetry]:
         """Return the samples that arrived since the last call, oldest first."""
@@ -70,20 +63,17 @@ class Link(Protocol):
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""
 
 
-# --- The forms of a vehicle's URI, and what to do without rights to the radio ---
+# --- The forms of a vehicle's URI ---
 
 
 USUAL_ADDRESS = "E7E7E7E7E7"
 _USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio's URI that names none
 _CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
-_HOST_AND_PORT = r"[^/:\s]+:0*[1-9]\d{0,4}"
 FORMS = {
     "sim": "",
     "radio": rf"([0-9]+|[0-9A-Fa-f]{{10}})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
     "usb": r"\d+",
-    "udp": _HOST_AND_PORT,
-    "tcp": _HOST_AND_PORT,
-    "serial": ".+",
+    "udp": r"[^/:\s]+:0*[1-9]\d{0,4}",
 }
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
@@ -109,7 +99,7 @@ def check_uri(uri: str) -> str:
     """Return the URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme, _, rest = uri.partition("://")
     fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
-    if not fits or (scheme in ("udp", "tcp") and int(rest.rpartition(":")[2]) > 65535):
+    if not fits or (scheme == "udp" and int(rest.rpartition(":")[2]) > 65535):
         raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
     return scheme
 
@@ -122,6 +112,4 @@ def vehicle_uri(uri: str) -> str:
         given = [part for part in rest.split("/")[1:4] if part]
         channel, rate, address = (*given, *_USUAL[len(given) :])
         return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(USUAL_ADDRESS))}"
-    if scheme != "serial":  # whose place is a file, and its case tells
-        rest = rest.lower().replace("localhost:", "127.0.0.1:")
-    return f"{scheme}/{rest}"
+    return f"{scheme}/{rest.lower().replace('localhost:', '127.0.0.1:')}"

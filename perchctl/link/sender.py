@@ -52,9 +52,7 @@ class Sender:
 
     `hand_over` gives one piece to the library and returns False where there was no room for it:
     it is then offered again. `guard` returns the command to send in the loop's place, None almost
-    always. It is asked every `GUARD_PERIOD_S`, but not while something waits that cannot go out: a
-    guard counts its orders. `on_sent` is called with what the loop did not put in, once it is
-    handed over.
+    always. `on_sent` is called with what the loop did not put in, once it is handed over.
 
     `pieces` divides a command. `tend` is called as often as the guard is, by the same thread,
     with `stuck_s` and whether the library is to blame for it: it has held one piece, or raised

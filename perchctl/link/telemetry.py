@@ -160,14 +160,10 @@ class Assembler:
         self._values.update(values)
         if block == "state":
             self._state_s = t_s
-        if block != "attitude" or self._state_s is None or self.missing():
+        if block != "attitude" or self._state_s is None:
             return None
         behind_s = t_s - self._state_s
         return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
-
-    def missing(self) -> list[str]:
-        """Return the needed variables of which nothing has come yet."""
-        return [name for name in NEEDED if name not in self._values]
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
@@ -233,11 +229,7 @@ class LogBlocks:
                 continue
             self._starting[name] = _starting(log, block)
         if not self._first_sample.wait(FIRST_SAMPLE_TIMEOUT_S):
-            missing = self._assembler.missing()
-            raise TimedOut(
-                f"{uri} is connected but sends no telemetry "
-                f"(missing: {', '.join(missing) or 'none'})"
-            )
+            raise TimedOut(f"{uri} is connected but sends no telemetry")
 
     def take(self) -> list[Telemetry]:
         """Return the samples that arrived since the last call, oldest first."""

@@ -88,11 +88,6 @@ class FeedStatus:
     rate_hz: float = 0.0
     measured: ExternalPosition | None = None
 
-    @property
-    def is_unseen(self) -> bool:
-        """True if none is sent since the target is not in the picture."""
-        return self.problem == UNSEEN
-
 
 class SendingRate:
     """When the next position may be sent, and how many were."""

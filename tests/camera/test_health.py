@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.camera import FrameHealth, NewestSlot
-from perchctl.camera.health import HealthVerdict, content
+from perchctl.camera.health import content
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
 from perchctl.vision import CameraModel, Frame
-from tests.helpers.interlaced import Pass
 
 SHAPE = (480, 640)
 
@@ -89,7 +88,7 @@ def test_sensor_noise_alone_is_not_snow(seed: int, sigma: float, level: float) -
     assert content(noisy(level, sigma, seed)) == "ok"
 
 
-def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[HealthVerdict]:
+def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[str]:
     health = FrameHealth()
     return [health.assess(frame(image, k / 30.0), live) for k, image in enumerate(images)]
 
@@ -97,41 +96,19 @@ def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[HealthVerd
 def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
     a, b = noisy(120, 5.0, 1), noisy(120, 5.0, 2)
     verdicts = judge([a, b] + [b.copy() for _ in range(20)])
-    assert [v.usable for v in verdicts[:2]] == [True, True]
-    assert not any(v.usable for v in verdicts[2:])
-    assert verdicts[2].kind == "repeated"
-    assert verdicts[-1].kind == "frozen"
-    first_frozen = next(k for k, v in enumerate(verdicts) if v.kind == "frozen")
-    assert first_frozen == 1 + 12, "0.4 s at 30 Hz"
+    assert verdicts == ["ok"] * 2 + ["repeated"] * 11 + ["frozen"] * 9, "0.4 s at 30 Hz"
 
     b[240, 320] ^= 1
-    assert [v.kind for v in judge([a] * 30 + [b, a])[29:]] == ["frozen", "ok", "ok"], "one pixel"
+    assert judge([a] * 30 + [b, a])[29:] == ["frozen", "ok", "ok"], "one pixel"
 
 
 def test_recordings_may_repeat_and_what_a_source_calls_repeated_is() -> None:
-    assert all(v.usable for v in judge([noisy(120, 5.0)] * 30, live=False))
+    assert set(judge([noisy(120, 5.0)] * 30, live=False)) == {"ok"}
     repeated = replace(frame(noisy(120, 5.0)), repeated=True)
-    assert FrameHealth().assess(repeated).kind == "repeated"
+    assert FrameHealth().assess(repeated) == "repeated"
 
 
 # --- Pictures that a receiver gives out again ---------------------------------------------
-
-
-def test_over_any_source_equal_bytes_are_a_repetition_and_not_frozen_until_it_is_stuck() -> None:
-    frames = list(Pass(camera_receiver_hz=60.0).frames(60))
-    truth = [False] + [a.index == b.index for a, b in zip(frames[1:], frames, strict=False)]
-    assert 30 < sum(truth) < 40
-    slot, health, taken, kinds = NewestSlot(), FrameHealth(), [], []
-    for k, frame in enumerate(frames + [frames[-1]] * 40):
-        slot.put(frame.image, k / 60, k / 60)
-        taken.append(slot.take())
-        assert taken[-1] is not None
-        kinds.append(health.assess(taken[-1]).kind)
-    assert [each.repeated for each in taken[: len(frames)] if each] == truth
-    assert set(kinds[: len(frames)]) == {"ok", "repeated"}
-    stuck = kinds[len(frames) :]
-    assert (stuck[0], stuck[-1]) == ("repeated", "frozen")
-    assert 20 <= stuck.index("frozen") <= 26, "0.4 s after it was new"
 
 
 def test_a_repetition_takes_no_new_pictures_place() -> None:

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Iterator
-from hashlib import md5
-from pathlib import Path
+from contextlib import closing
 from typing import Any
-from urllib.parse import urlsplit
-from urllib.request import Request
 
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.camera import network, open_camera
-from perchctl.camera.credentials import authorization
 from perchctl.camera.jpeg import grey_pixels
-from perchctl.camera.network import MAX_FAILED_CONNECTIONS, MjpegSource, StreamSource
+from perchctl.camera.network import MjpegSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
@@ -87,22 +82,20 @@ def test_a_picture_of_no_size_or_above_the_largest_is_not_decoded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Nor does it cost the connection."""
-    go, whole, tried = threading.Event(), jpeg(160), list[bytes]()
+    whole, tried = jpeg(160), list[bytes]()
 
     def decode(data: bytes) -> Any:
         tried.append(data)
         return grey_pixels(data)
 
     monkeypatch.setattr(network, "grey_pixels", decode)
-    server.scripts.put([part(resized(jpeg(60), *size_px)), go, part(whole), threading.Event()])
+    server.scripts.put([part(resized(jpeg(60), *size_px)), part(whole), threading.Event()])
     source = stream(server, Clock(), opened)
-    until(lambda: source.damaged == 1)
-    go.set()
     assert level(next_frame(source)) == 160
     assert (tried, source.connections) == ([whole], 1)
 
 
-class Broken(StreamSource):
+class Broken(LiveSource):
     """Its connection raises what nobody has foreseen."""
 
     def __init__(self, error: Exception, attempts: int) -> None:
@@ -122,32 +115,13 @@ class Broken(StreamSource):
 def test_an_unforeseen_error_in_a_stream_is_followed_by_another_connection(
     error: Exception, opened: list[LiveSource]
 ) -> None:
-    opened.append(source := Broken(error, MAX_FAILED_CONNECTIONS - 1))
+    opened.append(source := Broken(error, 4))
     next_frame(source)
     assert source.problem(100.0) is None
-    opened.append(source := Broken(error, MAX_FAILED_CONNECTIONS))
+    opened.append(source := Broken(error, 5))
     until(lambda: source.problem(100.0) is not None)
     assert type(error).__name__ in str(source.problem(100.0))
-
-
-@pytest.mark.parametrize("error", [TypeError("of http://me:secret@camera/x"), None])
-def test_a_thread_that_ends_is_the_camera_s_problem(
-    error: Exception | None, opened: list[LiveSource]
-) -> None:
-    class Ending(LiveSource):
-        def grab(self) -> None:
-            if error is not None:
-                raise error
-
-    source = Ending("camera:7", 0.0, Clock())
-    opened.append(source)
-    source._start(source.grab)
-    assert not source.wait_first(WAIT_S)
-    problem = str(source.problem(100.0))
-    assert problem.startswith("camera:7")
-    assert "thread" in problem
-    assert ("TypeError" in problem) == (error is not None)
-    assert "secret" not in problem
+    assert "secret" not in str(source.problem(100.0))
 
 
 def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
@@ -157,25 +131,14 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     server.scripts.put([part(jpeg(60))])
     server.scripts.put([part(jpeg(160)), gate])
     source = stream(server, Clock(), opened)
-    until(lambda: source._count == 2)
+    until(lambda: source._slot.count == 2)
     frame = next_frame(source)
     assert (level(frame), frame.index, source.connections) == (160, 1, 2)
     assert source.problem(100.0) is None
     gate.set()
-    until(lambda: "gave no picture" in (source.problem(100.0) or ""))
-    assert source.connections == 2 + MAX_FAILED_CONNECTIONS
-    assert "5 attempts: the stream ended" in str(source.problem(100.0))
-
-
-def test_a_server_of_one_picture_a_connection_is_kept_though_they_are_equal(
-    server: MjpegServer, opened: list[LiveSource]
-) -> None:
-    for _ in range(MAX_FAILED_CONNECTIONS + 1):
-        server.scripts.put([part(jpeg(60))])
-    server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = stream(server, Clock(), opened)
-    until(lambda: source._arrived == MAX_FAILED_CONNECTIONS + 2)
-    assert source.problem(100.0) is None
+    until(lambda: source.problem(100.0) is not None)
+    assert source.connections == 2 + source.most_failed
+    assert "gave no picture in 5 attempts: the stream ended" in str(source.problem(100.0))
 
 
 def test_closing_waits_no_longer_than_a_read(server: MjpegServer) -> None:
@@ -183,7 +146,6 @@ def test_closing_waits_no_longer_than_a_read(server: MjpegServer) -> None:
     source = begun(MjpegSource(server.url, 0.0, Clock()))
     next_frame(source)
     source.close()
-    assert source._thread is not None
     assert not source._thread.is_alive()
 
 
@@ -195,39 +157,17 @@ def test_no_first_frame_in_time(server: MjpegServer) -> None:
     quiet.set()
 
 
-# -- certificates, redirects, names and passwords --------------------------------------
+# -- redirects, names and passwords ----------------------------------------------------
 
-DIGEST = ['Basic realm="camera"', 'Digest realm="camera", nonce="n1", qop="auth,auth-int"']
-
-
-def test_a_certificate_that_nobody_vouches_for(
-    server: MjpegServer, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"  # for 127.0.0.1 and 100 years
-    server.encrypt(pem)
-    url = server.url.replace("http://", "https://me:secret@")
-    with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
-        open_camera(url, Clock(), timeout_s=WAIT_S)
-    assert "secret" not in str(caught.value)
-    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
-    server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = begun(MjpegSource(url, 0.0, Clock()), opened)
-    assert level(next_frame(source)) == 60
-
-
-BASIC = "Basic bWU6cEBzcw=="
-BY_DIGEST = 'Digest username="me", realm="camera"'
-SHA_256 = 'Digest realm="camera", nonce="n1", algorithm=SHA-256'
+DIGEST = 'Digest realm="camera", nonce="n1", qop="auth"'
+BASIC = 'Basic realm="camera"'
 
 
 @pytest.mark.parametrize(("challenges", "answered"), [
-    (['Basic realm="camera"'], BASIC),
-    (DIGEST, BY_DIGEST),
-    ([", ".join(DIGEST)], BY_DIGEST),
-    ([SHA_256, *DIGEST], BY_DIGEST),
-    (['digest realm="camera", nonce="n1", opaque="o"'], BY_DIGEST),
+    ([BASIC], "Basic bWU6cEBzcw=="),
+    ([BASIC, DIGEST], 'Digest username="me", realm="camera"'),
 ])  # fmt: skip
-def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
+def test_name_and_password_are_sent_once_they_are_asked_for(
     challenges: list[str], answered: str, server: MjpegServer, opened: list[LiveSource]
 ) -> None:
     server.challenges = challenges
@@ -235,50 +175,36 @@ def test_name_and_password_are_sent_once_they_are_asked_for_digest_first(
     server.scripts.put([part(jpeg(100)), threading.Event()])
     url = server.url.replace("http://", "http://me:p%40ss@")
     source = begun(MjpegSource(url, 0.0, Clock()), opened, reconnect_wait_s=0.0)
-    until(lambda: source._count == 2)
+    until(lambda: source._slot.count == 2)
     assert [str(given)[: len(answered)] for given in server.authorization] == ["None", answered] * 2
     assert "p%40ss" not in source.describe()
 
 
-def test_a_digest_is_that_of_rfc_2617() -> None:
-    asked = (
-        'Digest realm="testrealm@host.com", qop="auth,auth-int", '
-        'nonce="dcd98b7102dd2f0e8b11d0f600bfb0c093", opaque="5ccc069c403ebaf9f0171e9517f40e41"'
-    )
-    url = "http://Mufasa:Circle%20Of%20Life@host/dir/index.html"
-    given = authorization([asked], Request("http://host/dir/index.html"), urlsplit(url))
-    values = dict(re.findall(r'(\w+)="?([^",]*)', str(given)))
-
-    def h(*words: str) -> str:
-        return md5(":".join(words).encode()).hexdigest()
-
-    first = h("Mufasa", "testrealm@host.com", "Circle Of Life")
-    middle = (values["nonce"], values["nc"], values["cnonce"], "auth")
-    assert values["response"] == h(first, *middle, h("GET", "/dir/index.html"))
-    assert values["opaque"] == "5ccc069c403ebaf9f0171e9517f40e41"
+def test_a_redirect_to_another_address_gets_no_password(
+    server: MjpegServer, opened: list[LiveSource]
+) -> None:
+    with closing(MjpegServer()) as other:
+        server.challenges, server.redirect = [BASIC], other.url
+        other.challenges = [BASIC]
+        with pytest.raises(NotFound, match="401"):
+            open_camera(server.url.replace("//", "//me:secret@"), Clock(), timeout_s=WAIT_S)
+        assert server.authorization[0] is None
+        assert str(server.authorization[1]).startswith("Basic")
+        assert set(other.authorization) == {None}
 
 
-@pytest.mark.parametrize(("changes", "who", "requests", "words"), [
-    ({"status": 404}, "", 1, "404"),
-    ({"status": 403}, "me:wrong@", 1, "403"),
-    ({"challenges": DIGEST}, "", 1, "write a name and a password .*, as in http://NAME:PASSWORD"),
-    ({"challenges": DIGEST}, "me:wrong@", 2, "write a name and a password"),
-    *(({"challenges": [*of]}, "me:wrong@", 1, "for basic or digest authentication by MD5")
-      for of in (("Negotiate",), (SHA_256, 'Basic realm="camera"'), ("\xff=",))),
-    *(({"redirect": to}, "me:wrong@", 1, "redirects to .*name that address in camera.source")
-      for to in ("/elsewhere.mjpg", "http://me:wrong@127.0.0.1:1/x", "rtsp://127.0.0.1/live")),
+@pytest.mark.parametrize(("changes", "who", "words"), [
+    ({"status": 404}, "", "404"),
+    ({"status": 403}, "me:wrong@", "403"),
+    ({"challenges": [DIGEST]}, "", "401 .*as in http://NAME:PASSWORD"),
+    ({"challenges": [DIGEST]}, "me:wrong@", "401 .*as in http://NAME:PASSWORD"),
 ])  # fmt: skip
 def test_what_trying_again_would_not_mend_is_said_at_once(
-    changes: dict[str, Any], who: str, requests: int, words: str, server: MjpegServer
+    changes: dict[str, Any], who: str, words: str, server: MjpegServer
 ) -> None:
-    """Nothing follows a redirect: nobody can ask for the password in the camera's place. Nor is a
-    password shown where a digest was asked for that is not known."""
     server.nonce = "none of mine"
     for name, value in changes.items():
         setattr(server, name, value)
     with pytest.raises(NotFound, match=words) as caught:
         open_camera(server.url.replace("http://", f"http://{who}"), Clock(), timeout_s=WAIT_S)
-    assert len(server.authorization) == requests
     assert "wrong" not in str(caught.value)
-    if "redirect" in changes:
-        assert changes["redirect"].rpartition("/")[2] in str(caught.value)

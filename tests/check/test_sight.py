@@ -14,7 +14,7 @@ from perchctl.check.rehearsal import Blur, Looked, Rehearsal, telemetry_for
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
 from perchctl.profile import Profile, load_profile
-from perchctl.vehicle import MeasuredBy, Telemetry
+from perchctl.vehicle import Telemetry
 from perchctl.vision import CameraModel, Frame, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.checks import AT_REST, PROFILE
@@ -89,7 +89,7 @@ def test_a_latency_that_is_written_down_is_doubted() -> None:
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
-    vehicle = Vehicle("radio://0/80/2M", telemetry=away, measured_by=MeasuredBy((), False))
+    vehicle = Vehicle("radio://0/80/2M", telemetry=away)
     rows = {row.name: row for row in ask_all(VEHICLE, vehicle, TARGET)}
     assert rows["positioning"].found == "by the target, see in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED

@@ -27,7 +27,6 @@ from perchctl.vehicle import (
     LOCKED,
     LOW_POWER,
     TUMBLED,
-    MeasuredBy,
 )
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
 from tests.helpers.mission import READY
@@ -139,7 +138,7 @@ GOOD = Vehicle(
     telemetry=AT_REST,
     age_s=0.01,
     samples_hz=100.0,
-    measured_by=MeasuredBy(("bcFlow2",), False),
+    decks=("bcFlow2",),
 )  # fmt: skip
 
 
@@ -172,8 +171,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
             READY | 1 << 12, READY & ~CAN_FLY,
         )
     ),
-    ("positioning", "fail", {"measured_by": MeasuredBy(("bcBuzzer",), None)}),
-    ("positioning", "fail", {"measured_by": MeasuredBy(("bcBuzzer",), False)}),
+    ("positioning", "fail", {"decks": ("bcBuzzer",)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
     ("estimator", "skipped", {"telemetry": said(position_variance_m2=None)}),
@@ -205,13 +203,8 @@ def test_a_fault_alone_makes_its_row_and_no_other(
     assert others == set()
 
 
-def test_a_deck_that_places_nothing_is_not_named_for_what_places_it() -> None:
-    vehicle = replace(GOOD, measured_by=MeasuredBy(("bcAI",), True))
-    assert rows_of(vehicle)["positioning"].found == "by positions from outside"
-
-
 def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
-    vehicle = replace(GOOD, measured_by=MeasuredBy(("labUwb",), None))
+    vehicle = replace(GOOD, decks=("labUwb",))
     known = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
     assert rows_of(vehicle, known)["positioning"].found == "by labUwb"
     before = rows_of(vehicle)["positioning"]

@@ -4,8 +4,6 @@ with a mounting that a hand has measured."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -18,10 +16,11 @@ from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import FaultyFlight
 from perchctl.faults.results import FaultResult
 from perchctl.flight import fly_lockstep
-from perchctl.mission import Event, Outcome, Phase, Tick
+from perchctl.mission import Outcome, Phase, Tick
 from perchctl.sim import CaptureFault, draw_scenario
 from tests.helpers.capture import SWAPPED_XY, Y_UP, Rows
 from tests.helpers.flights import Flown, fly_short
+from tests.helpers.loop_rig import Watcher
 from tests.helpers.sights import TARGET_ONLY
 
 MOCAP = {"positioning.by": "mocap"}
@@ -55,26 +54,6 @@ def test_it_perches(own: dict[str, Any], capture: dict[str, Any], miss_m: float)
     assert it.flight.perched_miss_m is not None
     assert it.flight.perched_miss_m < miss_m
     assert Phase.LANDING.value not in it.way
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("what", "words"),
-    [
-        ({"occluded": True}, "does not see the rigid body 'crazyflie'; it sees wand"),
-        ({"frozen": True}, "is frozen"),
-        ({"gone": True}, "no frame has come"),
-        ({"swapped": True}, "another body is taken for it"),
-        ({"scale": 1000.0}, "jumped by"),
-    ],
-)
-def test_what_lasts_is_landed_and_named(what: dict[str, Any], words: str) -> None:
-    it = flown(**wrong(IN_ALIGN_S, **what))
-    assert it.report.phase is Phase.LANDED, it.report.reason
-    assert it.report.outcome is Outcome.SAFETY
-    assert words in it.report.reason
-    assert not it.flight.fell
-    assert it.farthest_m < 0.5
 
 
 OTHERS = {"others": (("wand", (2.5, -0.9, 0.05)),)}
@@ -123,20 +102,6 @@ ON_IT = tuple(
 )  # fmt: skip
 
 
-@dataclass
-class Looker:
-    """Calls `see` with each tick."""
-
-    see: Callable[[Tick], None]
-    problem: str | None = None
-
-    def tick(self, tick: Tick) -> None:
-        self.see(tick)
-
-    def event(self, event: Event) -> None:
-        return None
-
-
 @pytest.mark.long
 def test_it_perches_by_the_sight_of_the_target_alone() -> None:
     ages_s: dict[Phase, float] = {}
@@ -146,7 +111,7 @@ def test_it_perches_by_the_sight_of_the_target_alone() -> None:
         phase = tick.state.phase
         ages_s[phase] = max(ages_s.get(phase, 0.0), tick.outside.age_s)
 
-    it = fly_lockstep(TARGET_ONLY, 3, watchers=(Looker(see),))
+    it = fly_lockstep(TARGET_ONLY, 3, watchers=(Watcher(see),))
     assert it.report.phase is Phase.PERCHED
     assert it.perched_miss_m is not None
     assert it.perched_miss_m < MISS_M

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,18 @@ from perchctl.calibration import profile_camera
 from perchctl.campaign import FlightResult, campaign_summary, fly_all
 from perchctl.campaign.flights import fly_seed
 from perchctl.commands.fly import EXIT_CODE_OF
-from perchctl.flight import FlyOptions, fly_lockstep
-from perchctl.flight.lockstep import LockstepFlight, _pipeline_of
-from perchctl.mission import Event, EventKind, Operator, Outcome, Phase, Tick
+from perchctl.display.panel import status_rows
+from perchctl.flight import FlyOptions, fly_lockstep, lockstep_source
+from perchctl.flight.lockstep import LockstepFlight
+from perchctl.geometry import invert_T, make_T, rot_z, yaw_of
+from perchctl.link import MockLink
+from perchctl.mission import EventKind, Operator, Outcome, Phase, Tick, planner
+from perchctl.mission.context import Context
 from perchctl.mission.state import SEVEN_PHASES
-from perchctl.profile import load_profile
+from perchctl.profile import Profile, load_profile
 from perchctl.record import FlightLog, read_log
-from perchctl.sim import draw_scenario
+from perchctl.record.fields import tick_record
+from perchctl.sim import Neighbour, Scenario, SimulatedVehicle, draw_scenario
 from perchctl.vision import TargetEstimate
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile
 from tests.helpers.loop_rig import Watcher
@@ -49,21 +55,6 @@ def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "
     assert words in report.reason
     assert flown.z_m < ON_THE_FLOOR_M
     assert not any((flight.hanging, flight.locked, report.locked, flight.fell))
-
-
-class Looker:
-    """A watcher of the ticks."""
-
-    problem: str | None = None
-
-    def __init__(self) -> None:
-        self.ticks: list[Tick] = []
-
-    def tick(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def event(self, event: Event) -> None:
-        return None
 
 
 # --- A flight under good conditions ---------------------------------------------------
@@ -254,11 +245,11 @@ SPREAD = {"sigma_m", "sigma_yaw_rad"}
 @pytest.mark.long
 def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
     def flown(log: Path | None) -> tuple[LockstepFlight, list[Tick]]:
-        looker = Looker()
+        looker = Watcher()
         return fly_lockstep(short_profile({}), SEED, log, watchers=(looker,)), looker.ticks
 
     (bare, unlogged), (whole, logged) = flown(None), flown(tmp_path / "flight.jsonl")
-    assert (bare.miss_m, bare.simulated_s) == (whole.miss_m, whole.simulated_s)
+    assert bare.miss_m == whole.miss_m
     other_spread = 0
     for one, other in zip(unlogged, logged, strict=True):
         assert one.command == other.command
@@ -273,19 +264,98 @@ def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
     assert other_spread > 100
 
 
-# --- Flights of one profile share their pipeline; no other one does -------------------------------
+# --- One error, one home: what steers is what is logged and shown -------------------------------
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"kalman.n_max": 7}, {"camera.mount.rpy_deg": (0.0, 1.0, 0.0)}, {"target.large.side_m": 0.12}],
-    ids=lambda change: next(iter(change)),
-)
-def test_a_profile_or_a_camera_that_differs_has_its_own(change: dict[str, object]) -> None:
-    profile = short_profile()
-    camera, again = profile_camera(profile.camera), profile_camera(profile.camera)
-    shared = _pipeline_of(profile, camera)
-    assert _pipeline_of(short_profile(), again) is shared
-    assert _pipeline_of(short_profile(change), camera) is not shared
-    other = dataclasses.replace(camera, dist=camera.dist + 1e-9)
-    assert _pipeline_of(profile, other).camera is other
+@pytest.mark.long
+def test_the_log_and_the_panel_hold_the_planner_s_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    watcher, contexts, act, seen = Watcher(), list[Context](), planner.act, 0
+
+    def acted(context: Context) -> Any:
+        contexts.append(context)
+        return act(context)
+
+    monkeypatch.setattr(planner, "act", acted)
+    fly_lockstep(short_profile(), SEED, watchers=(watcher,))
+    for tick, context in zip(watcher.ticks, contexts, strict=True):
+        record, shown = tick_record(tick), dict(status_rows(tick))["error"]
+        target = context.obs.target
+        if target is None:
+            assert (record["ex_m"], shown) == (None, "no target seen yet")
+            continue
+        seen += 1
+        assert [record[f"e{axis}_m"] for axis in "xyz"] == target.e_m.tolist()
+        x, y, z = (f"{100 * v:+.1f}" for v in target.e_m)
+        assert shown.startswith(f"x {x}  y {y}  z {z} cm")
+        assert record["eyaw_rad"] == context.error_yaw_rad
+        assert math.hypot(record["ex_m"], record["ey_m"]) == context.error_xy_m
+        assert record["ez_m"] == context.error_z_m
+        assert target.t_s == tick.t_s  # at the present, not at the frame's time
+    assert seen > 0.5 * len(contexts)
+
+
+# --- A camera that mirrors, as the profile says: simulated so, and flown as any other ------------
+
+
+PLAIN, MIRRORED = short_profile(), short_profile({"camera.mirrored": True})
+
+
+def pictures(by: Profile, camera: Profile) -> list[Any]:
+    """Those of a flight by one profile of a vehicle whose camera is as another says."""
+    vehicle = SimulatedVehicle(
+        draw_scenario(camera, SEED), profile_camera(camera.camera), camera.target
+    )
+    source, link, frames = lockstep_source(vehicle, by), MockLink(vehicle), []
+    while link.now_s < 0.3:
+        link.advance_to(link.now_s + 0.02)
+        frames.append(source.poll(link.now_s))
+    return [frame.image for frame in frames if frame is not None]
+
+
+def test_the_simulated_camera_mirrors_and_the_flight_sees_it_turned_right() -> None:
+    plain = pictures(PLAIN, PLAIN)
+    assert len(plain) > 3
+    flipped = [image[:, ::-1] for image in plain]
+    assert np.array_equal(pictures(MIRRORED, MIRRORED), plain)
+    assert np.array_equal(pictures(PLAIN, MIRRORED), flipped), "the camera itself does mirror"
+    assert np.array_equal(pictures(MIRRORED, PLAIN), flipped)
+
+
+@pytest.mark.long
+def test_a_flight_with_a_camera_that_mirrors_perches() -> None:
+    assert_perched(fly_short({"camera.mirrored": True}))
+
+
+# --- Two vehicles in one room, both targets in both cameras' pictures ----------------------------
+
+APART_M = 0.8
+
+
+def pair(profile: Profile, seed: int) -> tuple[Scenario, Scenario]:
+    """The room of that seed: two scenarios of the profile under one ceiling, each in the world of
+    its own vehicle."""
+    rng = np.random.default_rng([seed, 14])
+    bearing_rad, turn_rad = (float(angle) for angle in rng.uniform(-math.pi, math.pi, 2))
+    there_m = APART_M * np.array([math.cos(bearing_rad), math.sin(bearing_rad), 0.0])
+    T_a_b = make_T(rot_z(turn_rad), there_m)  # the second target in the first one's axes
+    a, b = (draw_scenario(profile, 2 * seed + k) for k in (0, 1))
+    b = dataclasses.replace(b, ceiling_z_m=a.ceiling_z_m)
+    sees_b, sees_a = (
+        Neighbour((float(T[0, 3]), float(T[1, 3])), yaw_of(T[:3, :3]))
+        for T in (T_a_b, invert_T(T_a_b))
+    )
+    return dataclasses.replace(a, neighbours=(sees_b,)), dataclasses.replace(
+        b, neighbours=(sees_a,)
+    )
+
+
+@pytest.mark.long
+def test_a_pair_perches_side_by_side_each_on_its_own_target(tmp_path: Path) -> None:
+    for name, scenario in zip("ab", pair(short_profile(), 0), strict=True):
+        flight = fly_lockstep(short_profile(), log=tmp_path / name, scenario=scenario)
+        assert_perched(Flown(flight, 0.0))
+        log = read_log(tmp_path / name)
+        xy = np.stack([log.column("tx_m"), log.column("ty_m")], axis=1)
+        seen = xy[np.isfinite(xy[:, 0])]
+        assert np.linalg.norm(seen - scenario.target_xy_m, axis=1).max() < APART_M / 4
+        assert not any("taken up anew" in (r["lock_note"] or "") for r in log.records)

@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, SafetyAbort, TimedOut
 from perchctl.flight.preflight import still_waiting_for
-from perchctl.mission import FlightReport, Operator, Outcome, Phase, Tick
+from perchctl.mission import EventKind, FlightReport, Operator, Outcome, Phase, Tick
 from perchctl.perception import perception
 from perchctl.vehicle import CRASHED, DECK_FAULT, FLYING, LOCKED, TUMBLED, Land, PositionSetpoint
 from perchctl.vision.types import Detections
@@ -99,13 +99,18 @@ def test_a_lost_link_lands() -> None:
 
 
 @pytest.mark.parametrize("strict", [False, True])
-def test_a_log_that_fails_lands_only_where_the_profile_wants_it(strict: bool) -> None:
+def test_a_log_that_fails_is_said_once_and_landed_for_where_the_profile_wants_it(
+    strict: bool,
+) -> None:
     rig = Rig(profile=changed({"safety.land_on_log_error": strict}))
     rig.operator = land_after(rig, 3.0)
     rig.watcher.problem = "the disk is full"
     report = rig.fly()
     assert report.outcome is (Outcome.SAFETY if strict else Outcome.OPERATOR)
     assert ("the disk is full" in report.reason) is strict
+    said = [e for e in rig.watcher.events if "incomplete" in e.reason]
+    assert [e.kind for e in said] == [EventKind.NOTE]
+    assert "the disk is full" in said[0].reason
 
 
 @pytest.mark.parametrize("is_set", [False, True])
@@ -179,7 +184,7 @@ NO_PICTURE = Camera(lambda frame: None)
         ({"position_variance_m2": math.nan}, "settle"),
         ({"position_variance_m2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
         ({"supervisor": 0x06}, "0x0006"),
-        ({"roll_rad": 0.3}, "stand level .it is tilted by 17 deg, at most 10"),
+        ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
         ({"roll_rad": math.radians(10.2)}, r"by 10\.2 deg, at most 10\.0"),
         ({"pitch_rad": -0.2}, "tilted by 11 deg"),
         ({"acc_z_g": 0.7}, r"stand still .*0\.70 g"),

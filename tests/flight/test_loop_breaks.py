@@ -3,7 +3,6 @@ could not be confirmed is said."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,8 +12,8 @@ import pytest
 
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
-from perchctl.mission import EventKind, Finding, Operator, Outcome, Phase, Tick
-from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S
+from perchctl.mission import EventKind, Operator, Outcome, Phase, Tick
+from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS
 from perchctl.perception import perception
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -135,8 +134,6 @@ def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> 
 
 # --- The rescue -------------------------------------------------------------------------------
 
-AT_CEILING = {"phase": Phase.PERCH, "contact_z_m": 2.0}
-
 
 def rescuing(z_m: float = 0.0, **changes: Any) -> Rig:
     """A vehicle in the air whose telemetry is changed."""
@@ -154,25 +151,6 @@ def test_while_hanging_with_the_motors_off_it_starts_nothing() -> None:
     assert {type(command) for _, command in rig.link.sent} <= {StopMotors}
 
 
-def test_at_the_ceiling_it_peels_off_first() -> None:
-    """The vehicle's own landing would run by its clock and end up there, motors off."""
-    rig = rescuing(2.0)
-    assert rig.rescue(telemetry(0.0, 2.0), **AT_CEILING) == Finding.STANDS.value
-    first = rig.link.sent[0][1]
-    assert isinstance(first, PositionSetpoint)
-    assert first.z_m <= 2.0
-    assert rig.link.said(Land)[0] > rig.link.said(PositionSetpoint)[-1]
-    assert rig.link.z_m == 0.0
-
-
-def test_what_does_not_peel_off_gets_its_weight_put_on_the_magnet() -> None:
-    """A landing ordered to what the magnet holds would drop it when its trajectory ends."""
-    rig = rescuing(2.0, position_m=(0.0, 0.0, 2.0))
-    rig.rescue(telemetry(0.0, 2.0), **AT_CEILING)
-    assert not rig.link.said(Land)
-    assert PEEL_S <= rig.link.said(RawThrust)[0] < PEEL_S + 0.2
-
-
 def test_it_is_bounded() -> None:
     """A vehicle that never says it has landed is not waited for for ever."""
     rig = rescuing(supervisor=AIRBORNE | HL_ACTIVE)
@@ -180,14 +158,6 @@ def test_it_is_bounded() -> None:
     rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
     assert len(rig.link.said(Land)) == LEAST_ORDERS
-
-
-def test_it_orders_again_what_shows_no_effect() -> None:
-    rig = rescuing(0.2, supervisor=AIRBORNE, thrust=HOVER_THRUST)
-    rig.link.motors = False
-    rig.rescue(telemetry(0.0, 0.2))
-    assert np.diff(rig.link.said(Land)).min() > 0.3
-    assert len(rig.link.said(Land)) == MAX_ORDERS
 
 
 def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() -> None:
@@ -207,14 +177,6 @@ def test_without_positions_from_outside_it_comes_down_level() -> None:
     rig.rescue(telemetry(0.0, 1.5), 2.0, started_s=0.0)
     assert rig.link.said(RawThrust)
     assert not orders(rig)
-
-
-def test_it_steers_by_no_number_that_is_none() -> None:
-    rig = rescuing(position_m=(math.nan,) * 3, supervisor=AIRBORNE)
-    rig.rescue(telemetry(0.0, 2.0), **AT_CEILING)
-    places = [c.z_m for _, c in rig.link.sent if isinstance(c, PositionSetpoint)]
-    assert places
-    assert all(z_m <= 2.0 for z_m in places)
 
 
 def test_ctrl_c_twice_stops_it_too() -> None:
@@ -338,18 +300,3 @@ def test_a_landing_that_nobody_saw_is_no_landing(
     assert report.outcome is Outcome.SAFETY
     assert all(each in report.reason for each in words)
     assert "motors off" not in report.reason
-
-
-def test_a_log_that_fails_is_said_once_in_the_flight() -> None:
-    rig = Rig(operator=lambda: Operator.LAND if rig.link.now_s > 3.0 else Operator.NONE)
-
-    def fill(tick: Tick) -> None:
-        if tick.t_s > 2.0:
-            rig.watcher.problem = "no space left"
-
-    rig.watcher.on_tick = fill
-    rig.fly()
-    said = [e for e in rig.watcher.events if "incomplete" in e.reason]
-    assert [e.kind for e in said] == [EventKind.NOTE]
-    assert said[0].t_s == pytest.approx(2.02, abs=0.03)
-    assert "no space left" in said[0].reason

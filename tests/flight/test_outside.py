@@ -21,7 +21,7 @@ from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission import Operator, Outcome
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
-from perchctl.vehicle import ExternalPosition, MeasuredBy, PositionSetpoint
+from perchctl.vehicle import ExternalPosition, PositionSetpoint
 from tests.helpers.capture import TURNS, named_up
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
 from tests.helpers.mission import MOCAP, READY, changed, telemetry
@@ -51,7 +51,7 @@ REACH = changed({"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m":
     (at(0.0, 0.0, 12.0), MOCAP, "millimetres"),
     (at(-1200.0, 0.0, 0.04), MOCAP, "millimetres"),
     (at(0.3, 0.02, 0.4), MOCAP, "at 0.40 m, and the ground .* 0.00 m: swapped axes"),
-    (at(0.3, 0.4, 2.1), MOCAP, "swapped axes, another rigid body or zero"),
+    (at(0.3, 0.4, 2.1), MOCAP, "swapped axes, another rigid body or zero, or millimetres"),
     (at(0.0, 0.0, 0.012, rotation_from_rpy(-1.5708, 0, 0)), MOCAP, "swapped axes: up is -?y"),
     # Two vehicles in one room: the other one stands level, on the ground, two metres aside.
     (at(0.2, -0.5, 0.012), REACH, None),
@@ -99,20 +99,17 @@ def test_the_estimate_has_to_agree(place: ExternalPosition, agrees: bool) -> Non
     assert (apart(place, REST) is None) is agrees
 
 
-@pytest.mark.parametrize(("by", "profile", "words"), [
-    (MeasuredBy(("labUwb",), False), WITH_OWN_DECK, None),
-    (MeasuredBy(("bcLedRing",), False), WITH_OWN_DECK, "if bcLedRing measures it, name"),
-    (MeasuredBy(("bcLedRing", "bcLighthouse4")), PROFILE, None),
-    (MeasuredBy(("bcLoco",), False), PROFILE, None),
-    (MeasuredBy((), True), PROFILE, None),
-    (MeasuredBy(), MOCAP, None),
-    (MeasuredBy(("bcLedRing", "bcZRanger2"), False), PROFILE, "no position comes from outside"),
-    (MeasuredBy(), PROFILE, "not told"),
+@pytest.mark.parametrize(("decks", "profile", "words"), [
+    (("labUwb",), WITH_OWN_DECK, None),
+    (("bcLedRing",), WITH_OWN_DECK, "if bcLedRing measures it, name"),
+    (("bcLedRing", "bcLighthouse4"), PROFILE, None),
+    ((), MOCAP, None),
+    ((), PROFILE, "no positioning deck"),
 ])  # fmt: skip
 def test_something_tells_the_vehicle_where_it_is(
-    by: MeasuredBy, profile: Profile, words: str | None
+    decks: tuple[str, ...], profile: Profile, words: str | None
 ) -> None:
-    problem = GroundCriteria.unmeasured(by, profile)
+    problem = GroundCriteria.unmeasured(decks, profile)
     assert (problem is None) is (words is None)
     assert problem is None or (words is not None and words in problem.sentence)
 
@@ -177,7 +174,7 @@ def test_positions_that_are_none_keep_it_on_the_ground(
 def test_nothing_that_tells_the_position_is_a_refusal() -> None:
     Rig(profile=MOCAP).refused(SafetyAbort, "nothing sends positions")
     it = Rig()
-    it.link.measured_by = lambda: MeasuredBy((), False)  # type: ignore[method-assign]
+    it.link.decks = lambda: ()  # type: ignore[method-assign]
     it.refused(SafetyAbort, "no positioning deck.*set positioning: mocap")
 
 

@@ -47,19 +47,13 @@ def hung() -> tuple[TargetPositioning, list[ExternalPosition]]:
     return sights, sent
 
 
-def test_what_hangs_is_told_where() -> None:
+@pytest.mark.parametrize("touches", [True, False])
+def test_what_hangs_is_told_where_and_what_flies_nothing(touches: bool) -> None:
     sights, sent = hung()
     samples = at_rest()
-    sights.begin(history(samples), samples[-1].t_s, touches=True)
-    assert [place.position_m for place in sent] == [sights.feed.touching(0.0)]
-    assert sights.status(samples[-1].t_s).age_s == 0.0
-
-
-def test_what_flies_is_told_nothing_without_a_sight() -> None:
-    sights, sent = hung()
-    samples = at_rest()
-    sights.begin(history(samples), samples[-1].t_s, touches=False)
-    assert not sent
+    sights.begin(history(samples), samples[-1].t_s, touches=touches)
+    assert [p.position_m for p in sent] == [sights.feed.touching(0.0)] * touches
+    assert not touches or sights.feed.status(samples[-1].t_s).age_s == 0.0
 
 
 @given(felt_g=st.floats(-0.5, 0.7))

@@ -41,7 +41,7 @@ class Rig:
             self.host, self.host, realtime=True, clock=lambda: self.wall_s,
             shared=self.shared,
         )  # type: ignore[arg-type] # fmt: skip
-        self.clock = SimulatedClock(self.shared, CLOCK_MARGIN_S, lambda: self.wall_s, self.let_pass)
+        self.clock = SimulatedClock(self.shared, lambda: self.wall_s, self.let_pass)
 
     def let_pass(self, for_s: float) -> None:
         """On the wall's clock; the simulator does what it would do meanwhile."""

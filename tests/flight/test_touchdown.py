@@ -5,15 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from html import unescape
-from pathlib import Path
 
 import pytest
 
-from perchctl.analysis import FlightAnalysis, show_record, show_text
-from perchctl.analysis.report import ReportedFlight, page_of
 from perchctl.mission import (
-    ContactError,
     EventKind,
     ImuMotion,
     Observation,
@@ -25,9 +20,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
-from perchctl.record import FlightSummary, read_log
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
-from tests.helpers import log
 from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
 from tests.helpers.mission import observation, state_in
 
@@ -157,26 +150,3 @@ def test_the_rescue_says_so() -> None:
         rig.fly()
     note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
     assert note.reason.endswith(f"; it {SENTENCE}")
-
-
-# --- What is told ---------------------------------------------------------------------------------
-
-
-def test_all_that_tell_of_a_flight_tell_touchdown_and_contact(tmp_path: Path) -> None:
-    """The summary, `log show`, `log report` and the live page; a soft touchdown is not told."""
-    soft = FlightSummary("landed", "the operator asked to land", touchdown=Touchdown(0.3, 1.9))
-    assert "touched down" not in soft.text()
-    assert soft.as_record()["touchdown_mps"] == 0.3
-    told = FlightSummary("perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD)
-    end = log.SUMMARY | told.as_record() | {"outcome": "landed", "attempts": 1}
-    flown = read_log(log.write(tmp_path / "f.jsonl", summary=end))
-    flight = FlightAnalysis(flown)
-    for text in (told.text(), show_text(flight)):
-        assert "\ncontact:   1.8 +- 0.6 mm off centre" in text
-        assert f"\nvehicle:   {SENTENCE}" in text
-    for record in (told.as_record(), show_record(flight)):
-        assert (record["contact_aside_m"], record["contact_sigma_m"]) == (1.8e-3, 0.6e-3)
-        assert (record["touchdown_mps"], record["touchdown_g"]) == (0.9, 3.1)
-    whole = ReportedFlight(flight)
-    assert "1.8 +- 0.6 mm off centre" in unescape(page_of([whole])).replace("\xa0", " ")
-    assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]

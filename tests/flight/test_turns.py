@@ -9,8 +9,16 @@ import pytest
 
 from perchctl.analysis.decide import decide
 from perchctl.flight import FlightInputs, fly
-from perchctl.flight.inputs import TurnWatcher
-from perchctl.mission import Observation, Operator, PlannerState, Tick, Turn, step_mission
+from perchctl.flight.inputs import LogKeeper
+from perchctl.mission import (
+    Observation,
+    Operator,
+    PlannerState,
+    SentCommand,
+    Tick,
+    Turn,
+    step_mission,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.hangs import hang_in_the_planner, plan_by
@@ -26,6 +34,9 @@ class Told(LooksOn):
 
     def turn(self, turn: Turn) -> None:
         self.turns.append(turn)
+
+    def sent(self, sent: SentCommand) -> None:
+        return None
 
     @property
     def of_ticks(self) -> list[Turn]:
@@ -94,18 +105,6 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     assert again.difference == ("error", "ZeroDivisionError", None)
 
 
-def test_a_planner_that_fails_on_the_first_turn_fails_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fails(c: object) -> None:
-        raise ValueError("by the test")
-
-    monkeypatch.setattr("perchctl.mission.planner._remember", fails)
-    rig = Rig()
-    (again,) = decide(broken(rig, ValueError).turns, rig.profile)
-    assert (again.turn.role, again.error, again.difference) == ("failed", "ValueError", None)
-
-
 def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
     """The command may have been sent: the turn is told with it, and replays."""
     rig = Rig()
@@ -142,8 +141,8 @@ def test_an_interrupted_planner_did_not_fail_and_no_turn_is_told_twice(
 
 
 def test_all_that_is_taken_in_is_in_the_turns_and_a_watcher_of_ticks_gets_no_others() -> None:
-    assert isinstance(Told(), TurnWatcher)
-    assert not isinstance(LooksOn(), TurnWatcher)
+    assert isinstance(Told(), LogKeeper)
+    assert not isinstance(LooksOn(), LogKeeper)
     assert set(FlightInputs.SENSED) < {f.name for f in fields(Observation)}
     rig, given = Rig(), list[Any]()
     inside = rig.link.telemetry

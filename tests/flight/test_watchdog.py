@@ -268,22 +268,6 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     assert rig.poll(9.5, None) in (None, StopMotors())  # no order spins its motors up again
 
 
-def test_late_telemetry_stops_nothing_that_was_let_go() -> None:
-    rig = in_vain()
-    sent = [rig.poll(1.1 + 0.02 * i, telemetry(T_S + 0.9 + 0.02 * i, CEILING_M, thrust=20000.0))
-            for i in range(300)]  # fmt: skip
-    assert StopMotors() not in sent
-
-
-def test_what_slips_as_it_is_let_go_is_caught() -> None:
-    rig = in_vain()
-    release_in_vain(rig, 1.1, 2.6)
-    rig.z_m = CEILING_M - 0.02
-    caught = rig.after(2.62, **(FALLS | {"velocity_mps": (0.0, 0.0, -0.3)}))
-    assert isinstance(caught, PositionSetpoint)
-    assert caught.z_m > CEILING_M
-
-
 # --- after the flight ---------------------------------------------------------------------------
 
 
@@ -297,7 +281,7 @@ def test_after_the_loop_only_the_operators_stop_cuts_and_at_once(closing: str) -
         rig.dog.end(motors_off=closing == "motors off")
     assert [rig.after(s) for s in (0.01, 0.5, 1.1, 9.0)] == [None] * 4
     rig.operator = Operator.STOP
-    assert rig.after(9.02) == (None if closing == "motors off" else EmergencyStop())
+    assert rig.after(0.06) == (None if closing == "motors off" else EmergencyStop())
 
 
 @pytest.mark.parametrize("by_planner", [True, False])

@@ -12,7 +12,7 @@ import cv2
 
 from perchctl.flight import fly_lockstep
 from perchctl.flight.lockstep import LockstepFlight
-from perchctl.mission import Event, FlightReport, Operator, Phase
+from perchctl.mission import Event, FlightReport, Operator, Phase, Watcher
 from perchctl.profile import Profile, load_profile
 from perchctl.record import LogWatcher
 from perchctl.record.write import Truth
@@ -107,9 +107,29 @@ def short_profile(changes: Mapping[str, Any] | None = None, base: str = SHORT) -
     return Profile.model_validate(values)
 
 
+class OperatorAt(Watcher):
+    """Gives an operator's command as soon as a phase has been reached."""
+
+    def __init__(self, at: Mapping[Phase, Operator]) -> None:
+        self._at = at
+        self._command = Operator.NONE
+
+    def read(self) -> Operator:
+        return self._command
+
+    def tick(self, tick: Tick) -> None:
+        self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
+
+
+def ordered(at: Mapping[Phase, Operator]) -> dict[str, Any]:
+    """What `fly_lockstep` takes for these commands."""
+    operator = OperatorAt(at)
+    return {"watchers": (operator,), "operator": operator.read}
+
+
 def fly_short(
     changes: Mapping[str, Any] | None = None,
-    operator_at: dict[Phase, Operator] | None = None,
+    operator_at: Mapping[Phase, Operator] | None = None,
     *,
     base: str = SHORT,
     seed: int = SEED,
@@ -126,6 +146,6 @@ def fly_short(
     if settings is not None:
         settings = replace(settings, **(capture or {}))
     flight = fly_lockstep(
-        profile, log=heights, scenario=drawn, capture=settings, operator_at=operator_at
+        profile, log=heights, scenario=drawn, capture=settings, **ordered(operator_at or {})
     )
     return Flown(flight, heights.z_m, heights.farthest_m, tuple(heights.slips_m))

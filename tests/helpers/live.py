@@ -8,7 +8,6 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from perchctl.camera.network import StreamSource
 from perchctl.camera.source import LiveSource
 from perchctl.vision import Frame
 from tests.helpers.waiting import until
@@ -16,7 +15,7 @@ from tests.helpers.waiting import until
 WAIT_S = 10.0  # bound of every wait; reached only when a test fails
 
 
-S = TypeVar("S", bound=StreamSource)
+S = TypeVar("S", bound=LiveSource)
 
 
 class Clock:
@@ -28,7 +27,7 @@ class Clock:
 
 
 def begun(source: S, opened: list[LiveSource] | None = None, **timing: float) -> S:
-    """The stream connecting, with other times than its own."""
+    """The source connecting, with other times than its own."""
     for name, seconds in timing.items():
         assert hasattr(source, name)
         setattr(source, name, seconds)

@@ -143,7 +143,7 @@ class Guarded(Vehicle):
             if self.watchdog is not None and self.now_s >= self._asked_s + 0.05 - 1e-9:
                 self._asked_s = self.now_s
                 arrived = [s for s in self._samples if s.t_s <= self.now_s - 0.01]
-                command = self.watchdog.poll(self.now_s, arrived[-1] if arrived else None)
+                command = self.watchdog(self.now_s, arrived[-1] if arrived else None, ())
                 if command is not None:
                     self.own.append((self.now_s, command))
                     self.send(command)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import ssl
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 
 from tests.helpers.live import WAIT_S
@@ -40,11 +38,13 @@ class MjpegServer:
                     self.send_response(401)
                     for challenge in outer.challenges:
                         self.send_header("WWW-Authenticate", challenge)
+                    self.send_header("Content-Length", "0")
                     self.end_headers()
                     return
                 self.send_response(302 if outer.redirect else outer.status)
                 if outer.redirect:
                     self.send_header("Location", outer.redirect)
+                    self.send_header("Content-Length", "0")
                 self.end_headers()
                 script = [] if outer.scripts.empty() else outer.scripts.get()
                 with contextlib.suppress(OSError):
@@ -64,11 +64,6 @@ class MjpegServer:
             target=self._server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True
         )
         self._thread.start()
-
-    def encrypt(self, pem: Path) -> None:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(pem)
-        self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
 
     def close(self) -> None:
         self.closing.set()

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
-from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
 
 class ScriptedLink:
@@ -32,8 +32,8 @@ class ScriptedLink:
         if self._refuse:
             raise ConnectionFailed(self._refuse)
 
-    def measured_by(self) -> MeasuredBy:
-        return MeasuredBy(("bcFlow2",))
+    def decks(self) -> tuple[str, ...]:
+        return ("bcFlow2",)
 
     def telemetry(self) -> list[Telemetry]:
         arrived = []

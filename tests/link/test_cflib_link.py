@@ -19,12 +19,11 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link import CflibLink, MockLink
+from perchctl.link import CflibLink, ProbeLink
 from perchctl.link.cflib_link import LANDING_WAIT_S
-from perchctl.link.listening import ListeningLink
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
-from perchctl.sim import Scenario, SimProcess, SimulatedVehicle
+from perchctl.sim import Scenario, SimProcess
 from perchctl.vehicle import (
     CAN_FLY,
     FLYING,
@@ -113,17 +112,10 @@ def commands_sent(link: CflibLink, sim: SimProcess) -> list[tuple[int, int]]:
     return sent
 
 
-class Nobody:
-    """A guard that has nothing to send."""
-
-    def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> None:
-        return None
-
-
 def told_by(link: CflibLink) -> list[SentCommand]:
     """Collects what the link sends of itself."""
     told: list[SentCommand] = []
-    link.set_guard(Nobody(), told.append)
+    link.set_guard(lambda *_: None, told.append)
     return told
 
 
@@ -189,22 +181,6 @@ def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) ->
         sample = newest(link)
         assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
         assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
-
-
-def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:
-    """By its stamps over the radio; simulated in lockstep, by the firmware's own clock."""
-    with linked(sim) as link:
-        let_pass(sim, 2.0)
-        assert newest(link).start == 0
-        sim.reboot()
-        until(lambda: any(sample.start == 1 for sample in link.telemetry()))
-    vehicle = SimulatedVehicle(LOW_CEILING)
-    mock = MockLink(vehicle)
-    mock.advance_to(0.5)
-    assert mock.telemetry()[-1].start == 0
-    vehicle.firmware.reboot()
-    mock.advance_to(1.0)
-    assert mock.telemetry()[-1].start == 1
 
 
 # --- In the air, and left ---------------------------------------------------------------------
@@ -288,7 +264,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
         with pytest.raises(ConnectionFailed, match="flying already: land it"):
             second.connect()
-        listener = ListeningLink(sim.uri, CONFIG, time.monotonic)
+        listener = ProbeLink(sim.uri, CONFIG, time.monotonic)
         listener.connect()
         sent = commands_sent(listener, sim)
         assert newest(listener).has(FLYING)

@@ -23,15 +23,11 @@ from perchctl.errors import InvalidValue
 from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
 from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
-from perchctl.link.firmware import EXTERNAL_POSITION_TICK
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import execute
-from perchctl.sim.firmware.controller import MODE_POSITION, MODE_RAW, Setpoint
-from perchctl.sim.firmware.planner import Planner
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
-    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -165,23 +161,6 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
     assert in_lockstep(command) == firmware.made
 
 
-@pytest.mark.parametrize(("command", "calls"), [
-    (Idle(), []),
-    (PositionSetpoint(0.25, -0.5, 1.5, math.pi / 2),
-     [("low_level", (Setpoint(MODE_POSITION, 0.25, -0.5, 1.5, yaw_deg=90.0),))]),
-    (PositionSetpoint(math.nan, 0.0, 1.0, 0.0), []),
-    (RawThrust(40000), [("low_level", (Setpoint(MODE_RAW, thrust=40000.0),))]),
-    (RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
-     [("low_level", (Setpoint(MODE_RAW, roll_deg=22.5, pitch_deg=45.0, thrust=40000.0),))]),
-    (Land(-0.25, 3.0), [*[("high_level", (Planner.land, -0.25, 3.0, None))] * LAND_TIMES,
-                        ("notify_setpoint_stop", ())]),
-    (EmergencyStop(), [("emergency_stop", ())]),
-])  # fmt: skip
-def test_the_lockstep_vehicle_flies_the_command(command: Command, calls: list[Any]) -> None:
-    """Values that a float of four bytes holds exactly; what is no number it does not fly."""
-    assert in_lockstep(command) == calls
-
-
 class LosesTheFirst(Radio):
     """So many of the packets sent up are lost at the beginning."""
 
@@ -204,15 +183,3 @@ def test_a_lost_packet_does_not_leave_the_thrust_locked(lost: int) -> None:
         link.send(RawThrust(15000))
         link.advance_to(link.now_s + 0.02)
     assert link.telemetry()[-1].thrust == pytest.approx(15000, abs=1500)
-
-
-def test_positions_count_while_they_come_by_the_firmware_s_name() -> None:
-    # crtp_localization_service.c: the group locSrv has no tick.
-    assert EXTERNAL_POSITION_TICK == "locSrvZ.tick"
-    link = MockLink(SimulatedVehicle(Scenario(extra={"external_position": 1.0})))
-    assert link.measured_by().external is False
-    link.external(ExternalPosition((0.0, 0.0, 0.0)))
-    link.advance_to(link.now_s + 0.1)
-    assert link.measured_by().external is False  # those that have ended are none
-    link.each(0.01, lambda now_s: link.external(ExternalPosition((0.0, 0.0, 0.0))))
-    assert link.measured_by().external is True

@@ -26,7 +26,7 @@ from perchctl.link.crtp import encode
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario
-from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
+from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint
 from tests.helpers.radio import FORGETS_LOGS_S, URI, Air, plug_in
 
 OTHER_URI = "radio://0/81/2M/E7E7E7E7E7"
@@ -137,16 +137,16 @@ def flown(connected: Flown) -> Iterator[Flown]:
     yield connected
     connected.air.unplugged.clear()
     connected.air.silent.clear()
-    connected.link.set_guard(Operator())
+    connected.link.set_guard(Operator().guard)
 
 
 class Operator:
-    """A guard that sends the operator's stop once it was pressed."""
+    """Sends the operator's stop as the link's guard once it was pressed."""
 
     def __init__(self) -> None:
         self.pressed = False
 
-    def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> Command | None:
+    def guard(self, *_: object) -> Command | None:
         return EmergencyStop() if self.pressed else None
 
 
@@ -173,7 +173,7 @@ def test_after_silence_a_landing_and_a_stop_go_out_again(flown: Flown, silent_s:
 
 def test_the_operators_stop_goes_out_after_silence_though_the_loop_hangs(flown: Flown) -> None:
     operator = Operator()
-    flown.link.set_guard(operator)
+    flown.link.set_guard(operator.guard)
     flown.air.silent.set()
     flown.stream(0.2)  # and then nothing of the loop's
     PAUSE.wait(CFLIB_WAITS_S)
@@ -281,7 +281,7 @@ def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(
 
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
     told: list[SentCommand] = []
-    flown.link.set_guard(Operator(), told.append)
+    flown.link.set_guard(Operator().guard, told.append)
     began_s = time.monotonic()
     flown.link.send(LAND)
     flown.heard_after_s(LAND, began_s)

@@ -194,42 +194,6 @@ def test_a_library_that_never_returns_holds_up_no_order(library: Library) -> Non
     library.takes(LAND, StopMotors())
 
 
-def test_the_order_with_which_the_library_hung_is_handed_over_again(library: Library) -> None:
-    sender = library.sender()
-    library.hang_with(LAND)
-    library.called.clear()
-    library.now_s += HANGS_S + 0.01
-    assert library.called.wait(LIMIT_S)
-    assert library.offered == 2
-    library.free.set()
-    assert sender.drain(LIMIT_S)
-
-
-def test_a_thread_that_cannot_be_started_is_tried_again(
-    library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    start, hung = threading.Thread.start, library.free
-    refused: list[threading.Thread] = []
-
-    def start_later(thread: threading.Thread) -> None:
-        if not refused:
-            refused.append(thread)
-            raise RuntimeError("can't start new thread")
-        start(thread)
-
-    sender = library.sender()
-    library.hang_with(LAND)
-    library.free = threading.Event()
-    library.free.set()
-    monkeypatch.setattr(threading.Thread, "start", start_later)
-    library.now_s += HANGS_S + 0.01
-    library.takes(LAND)
-    sender.put(STOP)
-    library.takes(STOP)
-    assert refused
-    hung.set()
-
-
 def test_a_call_that_the_computer_slept_through_is_no_hang(library: Library) -> None:
     blamed: list[bool] = []
 

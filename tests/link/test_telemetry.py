@@ -4,18 +4,13 @@ of a vehicle that is moved by hand."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.errors import TimedOut
-from perchctl.link import MotionLink, listening
-from perchctl.link.cflib_link import SILENCE_S
+from perchctl.link import MotionLink
 from perchctl.link.listening import MOTION_BLOCK
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
@@ -29,13 +24,8 @@ from perchctl.link.telemetry import (
     Timebase,
     telemetry_from,
 )
-from perchctl.mission import Observation, Phase, PlannerState
-from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
-from perchctl.mission.context import Context
-from perchctl.mission.state import Condition
-from perchctl.profile import LinkConfig, Profile
+from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
-from tests.helpers.mission import READY, telemetry
 
 SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
 
@@ -102,7 +92,6 @@ STILL = {name: dict.fromkeys(variables, 0.0) for name, variables in BLOCKS.items
 def test_nothing_without_both_fast_blocks() -> None:
     assembler = Assembler()
     assert assembler.accept("attitude", STILL["attitude"], 0.0) is None
-    assert "stateEstimate.x" in assembler.missing()
     assert assembler.accept("state", STILL["state"], 0.01) is None
     assert assembler.accept("attitude", STILL["attitude"], 0.01) is not None
 
@@ -127,28 +116,6 @@ def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
     sample = assembler.accept("attitude", STILL["attitude"], 2.02, 1)
     assert sample is not None
     assert (sample.start, sample.behind_s) == (1, pytest.approx(0.01))
-
-
-HANGS = telemetry(1.0, 2.0, thrust=0.0, supervisor=READY)
-HANGING = PlannerState(
-    phase=Phase.COMPLETE, released_s=0.0, contact_z_m=2.0, hover_thrust=50000.0,
-    ground_m=(0.0, 0.0, 0.0),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("behind_s", [0.0, 0.15, 2.0])
-def test_a_frozen_position_proves_no_place(behind_s: float) -> None:
-    """A position block that alone stops arriving looks like a vehicle at rest. What rests on
-    acceleration, thrust and the supervisor's word, which are fresh, is proven all the same."""
-    obs = Observation(1.0, replace(HANGS, behind_s=behind_s))
-    proven = PROOFS & conditions_since(Context(HANGING, obs, Profile())).keys()
-    assert not (proven & BY_PLACE and behind_s > 0.0)
-    assert Condition.WEIGHT_HANGS in proven
-    old = replace(HANGS, t_s=1.0 - 0.15)
-    assert (
-        not PROOFS
-        & conditions_since(Context(HANGING, replace(obs, telemetry=old), Profile())).keys()
-    )
 
 
 # --- A vehicle that is moved by hand: the link itself is tested by the command that uses it, in
@@ -202,24 +169,3 @@ def test_a_turn_that_is_no_number_is_dropped_alone(name: str, number: float) -> 
     taken = link.samples()
     assert len(taken) == 2
     assert np.isfinite([[a.roll_rad, a.pitch_rad, a.yaw_rad, *a.gyro_radps] for a in taken]).all()
-
-
-def test_nothing_begins_before_the_block_came_and_its_silence_is_a_problem(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """What is unknown is not still."""
-    monkeypatch.setattr(listening, "start_block", lambda *_: None)
-    monkeypatch.setattr(listening, "check_firmware", lambda *_: None)
-    monkeypatch.setattr(listening, "is_logged", lambda *_: True)
-    monkeypatch.setattr(listening, "FIRST_SAMPLE_TIMEOUT_S", 0.0)
-    connection: Any = SimpleNamespace(cf=SimpleNamespace(log=None))
-    link = Listened()
-    with pytest.raises(TimedOut, match="sends no telemetry"):
-        link._prepare(connection)
-    link.hear()
-    link._prepare(connection)
-    assert link.problem(link.now_s + SILENCE_S) is None
-    assert "nothing heard" in str(link.problem(link.now_s + SILENCE_S + 0.1))
-    link.now_s += SILENCE_S + 0.1
-    link.hear()
-    assert link.problem(link.now_s) is None

@@ -6,7 +6,6 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.link import check_uri, listening, vehicle_uri
-from perchctl.link.protocol import UDEV_HELP
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
 
@@ -20,7 +19,8 @@ def test_good_uris(uri: str) -> None:
 
 
 @pytest.mark.parametrize("uri", [
-    "", "radio:/0", "udp://host", "http://host:80", "sim", "sim://1", "udp://host:0", "tcp://host:65536",
+    "", "radio:/0", "udp://host", "http://host:80", "sim", "sim://1", "udp://host:0",
+    "udp://host:65536", "tcp://host:80",
     "radio://0/200/2M", "radio://0/126", "radio://0/", "radio://0/x/2M",
     "radio://0/80/3M/E7E7E7E7E7", "radio://0/80/2M/E7E7E7E7EG", "radio://0/80/2M/E7E7E7E7E7E",
 ])  # fmt: skip
@@ -38,9 +38,7 @@ def test_a_wrong_uri_is_refused_with_what_is_allowed(uri: str) -> None:
     (RADIO, "radio://0/80/1M/E7E7E7E701", False),
     (RADIO, "radio://0/80/2M/E7E7E7E702", False),
     ("udp://LocalHost:19850", "UDP://127.0.0.1:19850", True),
-    ("tcp://Bench:5000", "tcp://bench:5000", True),
     ("Radio://0/80/2m/E7E7E7E701", RADIO, True),
-    ("serial:///dev/ttyA", "serial:///dev/ttya", False),
     ("udp://127.0.0.1:19851", "udp://127.0.0.1:19850", False),
     ("usb://0", "usb://1", False),
 ])  # fmt: skip
@@ -62,9 +60,3 @@ def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> No
     found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100")[0]
     assert found == ["radio://0/80/2M", "radio://0/80/2M/1"]
     assert list(map(check_uri, found)) == ["radio", "radio"]
-
-
-def test_udev_lines_name_all_three_devices() -> None:
-    """Conventions: radio, bootloader, Crazyflie over USB."""
-    for ids in (("1915", "7777"), ("1915", "0101"), ("0483", "5740")):
-        assert any(all(i in line for i in ids) for line in UDEV_HELP.splitlines())

@@ -124,7 +124,7 @@ def test_a_password_is_in_the_source_alone(tmp_path: Path) -> None:
 
 WRONG: dict[str, tuple[str, str]] = {
     "link.uri": ("bogus", "radio://0/80/2M"),
-    "camera.source": ("webcam", "camera:N"),
+    "camera.source": ("webcam:0", "camera:N"),
     "camera.calibration": ("none.yaml", "give a path"),
     "camera.latency_s": ("80", "allowed are 0 to 1"),
     "front": ("up", "top, right, bottom, left"),

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.camera import VERDICT_TEXTS
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.perception import Perception
 from perchctl.profile import Profile
@@ -51,11 +52,11 @@ class PoseReader:
     def look(self, frame: Frame) -> list[SeenPose]:
         """Return the target's poses in a frame: one, or one in each of its two fields."""
         judged = self._perception.health.assess(frame, self._live)
-        if judged.kind == "repeated":
+        if judged == "repeated":
             return []
         self.outlines = ()
-        self.trouble = "" if judged.usable else judged.text
-        if judged.kind in ("frozen", "snow"):
+        self.trouble = "" if judged == "ok" else VERDICT_TEXTS[judged]
+        if judged in ("frozen", "snow"):
             return []
         seen = []
         for picture, output in self._perception.look(frame):

@@ -46,7 +46,7 @@ from perchctl.record.recorded import recorded_frames  # noqa: E402
 from perchctl.record.recorder import Recorder  # noqa: E402
 from perchctl.record.write import recording_path  # noqa: E402
 from perchctl.vision import Frame  # noqa: E402
-from tests.helpers.flights import short_profile  # noqa: E402
+from tests.helpers.flights import ordered, short_profile  # noqa: E402
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 
 KINDS = (b"header", b"turn", b"sent", b"event", b"summary")
@@ -59,8 +59,13 @@ SMALL = {"link.telemetry_period_s": 0.02, "link.loop_hz": 25}
 """Half the turns, and half the samples."""
 
 
-def _fly(log: Path, changes: Mapping[str, Any] | None = None, **more: Any) -> None:
-    fly_lockstep(short_profile({**SMALL, **(changes or {})}), 3, log, **more)
+def _fly(
+    log: Path,
+    changes: Mapping[str, Any] | None = None,
+    operator_at: Mapping[Phase, Operator] | None = None,
+) -> None:
+    profile = short_profile({**SMALL, **(changes or {})})
+    fly_lockstep(profile, 3, log, **ordered(operator_at or {}))
 
 
 def _seen(log: Path) -> None:
@@ -73,7 +78,7 @@ def _seen(log: Path) -> None:
     }
     profile = short_profile(SMALL | changes)
     watcher = LogWatcher.lockstep(log, profile, 4, record=True)
-    flight = fly_lockstep(profile, 4, watcher, operator_at={Phase.PERCH: Operator.STOP})
+    flight = fly_lockstep(profile, 4, watcher, **ordered({Phase.PERCH: Operator.STOP}))
     watcher.close(flight.report, flight.perched_miss_m, flight.fell)
 
 
