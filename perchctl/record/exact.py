@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
+_GONE = {"blow", "last_moment"}  # in logs of before
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
@@ -139,6 +140,8 @@ def _dataclass_from(kind: Any, data: Any) -> Any:
         raise ValueError(f"{kind.__name__} is needed, found {data!r:.60}")
     hints, values = _hints(kind), {}
     for name, part in data.items():
+        if name in _GONE:
+            continue
         if name not in hints:
             raise ValueError(f"{kind.__name__} has no field {name}")
         try:
