@@ -3,10 +3,10 @@
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
 What lands by itself, has its weight on the magnet or is stopped goes on with that, whatever is
-known. What still comes down follows `DESCENTS` (the table of docs/mission.md), by the `Evidence`
-that is fresh and by whether the vehicle may be where the magnet holds it.
+known. What still comes down does it by what is known and fresh, and by whether the vehicle may be
+where the magnet holds it (the table of docs/mission.md).
 
-Two proofs go before the table: what falls off the magnet is caught, and what stands on the floor is
+Two proofs go before that: what falls off the magnet is caught, and what stands on the floor is
 stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
 wherever it is by then: it is ordered only where a position that does not rest on pictures shows the
 vehicle away from the ceiling, and in flight.
@@ -59,38 +59,6 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
 )
-
-
-class Evidence(Enum):
-    """The best of what is known and fresh."""
-
-    POSITION = "position"  # measured by decks or motion capture
-    SIGHT = "position by the target"
-    HEIGHT = "height"  # and vertical speed; the heading is lost
-    IMU = "attitude and acceleration"
-    ONBOARD = "the vehicle's own"  # it has a position; telemetry, link or loop cannot be relied on
-    NOTHING = "nothing"
-
-
-class Manoeuvre(Enum):
-    """How the lander brings a vehicle down."""
-
-    SETPOINTS = "position setpoints, then its own landing"
-    SETPOINTS_LEVEL = "position setpoints, then level"
-    PEEL = "a setpoint below, then the weight on the magnet"
-    LEVEL = "level, by thrust"
-    OWN_LANDING = "its own landing"
-
-
-DESCENTS: dict[Evidence, tuple[Manoeuvre, Manoeuvre]] = {
-    Evidence.POSITION: (Manoeuvre.SETPOINTS, Manoeuvre.PEEL),
-    Evidence.SIGHT: (Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL),
-    Evidence.ONBOARD: (Manoeuvre.OWN_LANDING, Manoeuvre.PEEL),
-    Evidence.HEIGHT: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
-    Evidence.IMU: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
-    Evidence.NOTHING: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
-}
-"""Evidence -> manoeuvre of what comes down free, and within the magnet's reach."""
 
 
 class Finding(Enum):
@@ -209,20 +177,13 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
 # --- What is known ----------------------------------------------------
 
 
-def evidence_of(c: Context) -> Evidence:
-    """The best that is fresh in this tick."""
+def _knows_its_place(c: Context) -> bool:
+    """True if a position and a heading are left to come down by."""
+    if c.state.astray or c.state.blind_s is not None or (c.by_sight and not _is_sighted(c)):
+        return False
+    # Without a vertical speed raw thrust would be blind, and the vehicle's own landing is left.
     heard = c.attitude_age_s <= c.safety.telemetry_hold_s
-    unplaced = c.state.astray or c.state.blind_s is not None
-    if not heard and (c.by_sight or unplaced):
-        return Evidence.NOTHING
-    if unplaced or (c.by_sight and not _is_sighted(c)):
-        return Evidence.IMU
-    if c.by_sight:
-        return Evidence.HEIGHT if c.state.heading_lost else Evidence.SIGHT
-    if heard and c.state.heading_lost:
-        fresh = c.telemetry_age_s <= c.safety.telemetry_hold_s
-        return Evidence.HEIGHT if fresh and c.placed else Evidence.IMU
-    return Evidence.ONBOARD if _is_doubtful(c) else Evidence.POSITION
+    return not (c.state.heading_lost and (c.by_sight or heard))
 
 
 def _is_doubtful(c: Context) -> bool:
@@ -518,7 +479,7 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
 
 
 def act(c: Context) -> Acted:
-    """The command of one tick: by the two proofs, then by the table."""
+    """The command of one tick: by the two proofs, then by what is known."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
@@ -536,13 +497,29 @@ def act(c: Context) -> Acted:
 
 
 def _descend(c: Context) -> Acted:
-    manoeuvre = DESCENTS[evidence_of(c)][is_in_reach(c)]
-    if manoeuvre in BY_SETPOINTS and (c.by_sight or manoeuvre is not Manoeuvre.PEEL):
+    """Come down level, by thrust, unless the place is known. In the magnet's reach a setpoint below
+    takes the thrust to its least, and what that does not move is given to the magnet. Else sink by
+    setpoints to the hand-over, and from there by the vehicle's own landing: at once where height,
+    stream or loop are doubtful. By the target it would follow an estimate that rests on pictures,
+    to an unmeasured floor: then it is level from there."""
+    if not _knows_its_place(c):
+        return _level(c)
+    landing, in_reach, doubtful = c.planner.landing, is_in_reach(c), _is_doubtful(c)
+    if c.by_sight or not (in_reach or doubtful):
         state, away = leave_press(c)
         if away is not None:
             return state, away
         c = c.with_state(state)
-    return ACTIONS[manoeuvre](c)
+    low = c.height_m <= landing.handover_m
+    if in_reach:
+        # Without fresh telemetry nobody can watch what the weight does.
+        gives_up = c.in_phase_s > PEEL_S and (c.imu_proves or not doubtful)
+        return release_by_thrust(c) if gives_up else _by_setpoints(c)
+    if c.by_sight:
+        return _level(c) if c.state.level_thrust or low else _by_setpoints(c)
+    # When the landing's time is over nothing is sent: by then it must be landing by itself.
+    overdue = c.in_phase_s > landing.overdue_s
+    return _own_landing(c) if doubtful or overdue or low else _by_setpoints(c)
 
 
 def _falls_free(c: Context) -> bool:
@@ -596,32 +573,6 @@ def _catch(c: Context) -> Acted | None:
     """A catch by position; None without a heading, or astray, where position control would lead
     away and the raw thrust of the level descent brakes the fall."""
     return None if c.state.heading_lost or c.state.astray else catch(c)
-
-
-def _setpoints(c: Context) -> Acted:
-    """Sink by setpoints to the hand-over, and by the vehicle's own landing from there."""
-    # When the landing's time is over nothing is sent: by then it must be landing by itself.
-    overdue = c.in_phase_s > c.planner.landing.overdue_s
-    if overdue or c.height_m <= c.planner.landing.handover_m:
-        return _own_landing(c)
-    return _by_setpoints(c)
-
-
-def _setpoints_level(c: Context) -> Acted:
-    """Sink by setpoints to the hand-over, and level from there: the vehicle's own landing would
-    follow an estimate that rests on pictures, to an unmeasured floor."""
-    if c.state.level_thrust or c.height_m <= c.planner.landing.handover_m:
-        return _level(c)
-    return _by_setpoints(c)
-
-
-def _peel(c: Context) -> Acted:
-    """Send a setpoint below, which takes the thrust to its least. What that does not move is given
-    to the magnet; without fresh telemetry the setpoint goes on down to the floor."""
-    watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
-    if c.in_phase_s > PEEL_S and watched:
-        return release_by_thrust(c)
-    return _by_setpoints(c)
 
 
 def _by_setpoints(c: Context) -> Acted:
@@ -836,13 +787,3 @@ def _weight_on_magnet(c: Context) -> Acted:
         return release_by_thrust(c)
     thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))
     return replace(c.state, released_s=c.t_s), RawThrust(thrust)
-
-
-ACTIONS = {
-    Manoeuvre.SETPOINTS: _setpoints,
-    Manoeuvre.SETPOINTS_LEVEL: _setpoints_level,
-    Manoeuvre.PEEL: _peel,
-    Manoeuvre.LEVEL: _level,
-    Manoeuvre.OWN_LANDING: _own_landing,
-}
-BY_SETPOINTS = (Manoeuvre.SETPOINTS, Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL)
