@@ -33,6 +33,7 @@ PRESSING_PART, PRESSING_RATIO = 0.95, 1.05
 UNPRESSED_MPS, UNPRESSED_M, FALLING_MPS = 0.05, 0.08, -0.3
 UNWIND_M, UNWIND_AWAY_M, UNPRESS_LIMIT_S = 1.0, 0.25, 4.0
 LIFTED_M = 0.1  # below it a vehicle may still stand, and its height is not to be corrected
+WARY_MPS = 0.25  # sideways, while nothing confirms the camera's mounting
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 SINK_MPS, LOWEST_M = 0.2, 0.3
 STILL_THRUST = 1000  # raw: the motors stand still and the stream lives (5000 and less)
@@ -67,22 +68,23 @@ def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
 
 
 def walk(
-    old: PositionSetpoint,
-    goal: PositionSetpoint,
-    dt_s: float,
-    *,
-    xy_mps: float,
-    up_mps: float,
-    down_mps: float,
-    yaw_rate_radps: float,
+    c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> PositionSetpoint:
-    """The setpoint one tick later: towards the goal, at limited speeds."""
+    """The setpoint one tick later: towards the goal, at limited speeds; wary of a mounting that
+    nothing confirms. What comes down does not turn. Only a search, an ascent, a take-off and the
+    press pass an `up_mps`; a catch climbs in another way."""
+    old, dt_s, align = c.state.setpoint or hold_here(c), c.t_s - c.state.t_s, c.planner.align
+    xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
+    if c.state.phase is Phase.LANDING:
+        yaw_radps = 0.0
+    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
+        xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
     part = 1.0 if distance <= xy_mps * dt_s else xy_mps * dt_s / distance
     dz = max(-down_mps * dt_s, min(up_mps * dt_s, goal.z_m - old.z_m))
     dyaw = wrap_rad(goal.yaw_rad - old.yaw_rad)
-    dyaw = max(-yaw_rate_radps * dt_s, min(yaw_rate_radps * dt_s, dyaw))
+    dyaw = max(-yaw_radps * dt_s, min(yaw_radps * dt_s, dyaw))
     return PositionSetpoint(
         old.x_m + part * dx, old.y_m + part * dy, old.z_m + dz, wrap_rad(old.yaw_rad + dyaw)
     )

@@ -318,13 +318,11 @@ def observe(c: Context) -> Context:
 
 def note_order(state: PlannerState, command: Command) -> PlannerState:
     """The state with the commanded raw thrust, which the telemetry's thrust has to follow."""
-    match command:
-        case RawThrust(thrust):
-            return replace(state, raw_order=thrust)
-        case Idle():
-            return state
-        case _:
-            return replace(state, raw_order=None, unanswered_s=None)
+    if isinstance(command, RawThrust):
+        return replace(state, raw_order=command.thrust)
+    if isinstance(command, Idle):
+        return state
+    return replace(state, raw_order=None, unanswered_s=None)
 
 
 def _answered(c: Context) -> Context:
@@ -584,15 +582,7 @@ def _by_setpoints(c: Context) -> Acted:
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
     goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
-    setpoint = walk(
-        start,
-        goal,
-        c.t_s - state.t_s,
-        xy_mps=c.planner.align.speed_mps,
-        up_mps=0.0,
-        down_mps=landing.speed_mps,
-        yaw_rate_radps=0.0,
-    )
+    setpoint = walk(c.evolve(setpoint=start), goal, down_mps=landing.speed_mps)
     # The setpoint does not run away from a vehicle that does not follow, beyond what takes the
     # thrust down to its least.
     if c.telemetry_age_s <= c.safety.telemetry_hold_s:

@@ -52,11 +52,11 @@ from perchctl.mission.mounting import MountWatch, sight_of, update_watch
 from perchctl.mission.state import (
     Condition,
     ContactError,
-    MotorStop,
     Observation,
     Outcome,
     Phase,
     PlannerState,
+    Severity,
 )
 from perchctl.mission.table import (
     IN_THE_OPEN,
@@ -67,12 +67,12 @@ from perchctl.mission.table import (
 )
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Command, EmergencyStop, Idle, PositionSetpoint, RawThrust, StopMotors
+from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
 
 HOVER_WITHIN = 0.2
 AWAY_M = 0.05  # below the contact by so much, or by half of the descent, it has left the ceiling
 BLOCKED_ROOM_M = 0.1  # how far a search keeps from what it was once pressed against
-WARY_MPS, WARY_M = 0.25, 0.2  # sideways, while nothing confirms the camera's mounting
+WARY_M = 0.2  # sideways, while nothing confirms the camera's mounting
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
 
@@ -160,10 +160,10 @@ def _enter(c: Context, row: Transition) -> Context:
         reason=row.explain(c),
         row=row.name,
         severity=state.severity.then(row.severity),
-        motor_stop=row.motor_stop,
+        stop=row.stop,
         outcome=_outcome(state, row),
         since=lasting_conditions(state.since),
-        attempts=state.attempts + int(row.counts_attempt),
+        attempts=state.attempts + int(row.severity is Severity.BACK_OFF),
         entry_m=c.telemetry.position_m,
         entry_yaw_rad=c.telemetry.yaw_rad,
         search_step_s=c.t_s,
@@ -257,36 +257,12 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
     return replace(c.state, setpoint=reference), limited(c, corrected(c, reference, lift=lift))
 
 
-def _walk_to(
-    c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
-) -> Acted:
-    """Walk the setpoint towards the goal. Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the
-    press and a catch climb in other ways."""
-    return _fly_to(c, _walked(c, goal, up_mps, down_mps))
-
-
-def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) -> PositionSetpoint:
-    align = c.planner.align
-    xy_mps = align.speed_mps
-    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
-        xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
-    return walk(
-        c.state.setpoint or hold_here(c),
-        goal,
-        c.t_s - c.state.t_s,
-        xy_mps=xy_mps,
-        up_mps=up_mps,
-        down_mps=down_mps,
-        yaw_rate_radps=math.radians(align.yaw_rate_dps),
-    )
-
-
 def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
     """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
     trim = integrated(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = c.evolve(integral_m=trim)
-    return _walk_to(c, goal, up_mps=up_mps)
+    return _fly_to(c, walk(c, goal, up_mps=up_mps))
 
 
 def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
@@ -306,8 +282,7 @@ def _approach(c: Context) -> Acted:
     if planner.approach_xy_m is not None and c.height_m > 0.7 * planner.takeoff_height_m:
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
-    c = c.with_state(replace(state, setpoint=start))
-    setpoint = _walked(c, goal, planner.takeoff_speed_mps, 0.4)
+    setpoint = walk(c.evolve(setpoint=start), goal, up_mps=planner.takeoff_speed_mps)
     return _fly_to(c, setpoint, lift=c.height_m > LIFTED_M)
 
 
@@ -331,8 +306,8 @@ def _search(c: Context) -> Acted:
             top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
         height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
-    up_mps = c.planner.ascend.speed_mps
-    return _walk_to(c, PositionSetpoint(x, y, height, yaw), up_mps=up_mps)
+    goal = PositionSetpoint(x, y, height, yaw)
+    return _fly_to(c, walk(c, goal, up_mps=c.planner.ascend.speed_mps))
 
 
 def _not_far(start: tuple[float, float], goal: tuple[float, float]) -> tuple[float, float]:
@@ -372,7 +347,7 @@ def _perch(c: Context) -> Acted:
     if c.target_m is None:
         return _fly_to(c, c.state.setpoint or hold_here(c), lift=False)
     goal = _target_goal(c, c.contact_goal_z_m + perch.press_m)
-    return _fly_to(c, _walked(c, goal, perch.climb_mps, 0.0), lift=False)
+    return _fly_to(c, walk(c, goal, up_mps=perch.climb_mps, down_mps=0.0), lift=False)
 
 
 def _complete(c: Context) -> Acted:
@@ -406,7 +381,7 @@ def _recover(c: Context) -> Acted:
     else:
         goal = replace(setpoint, z_m=z)
     c = c.with_state(replace(state, setpoint=setpoint))
-    return _walk_to(c, goal, up_mps=0.0, down_mps=FREE_SPEED_MPS)
+    return _fly_to(c, walk(c, goal, down_mps=FREE_SPEED_MPS))
 
 
 def _terminal(c: Context) -> Acted:
@@ -418,14 +393,8 @@ def _aborted(c: Context) -> Acted:
     locked 2 s after the stream's end: it gets the pair that prevents that."""
     if c.state.orders:
         return c.state, Idle()
-    state = replace(c.state, orders=1, ordered_s=c.t_s)
-    match state.motor_stop:
-        case MotorStop.EMERGENCY:
-            return state, EmergencyStop()
-        case MotorStop.PLAIN:
-            return state, StopMotors()
-        case MotorStop.NONE:
-            return state, StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
+    ends = StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
+    return replace(c.state, orders=1, ordered_s=c.t_s), c.state.stop or ends
 
 
 ACTIONS: dict[Phase, Callable[[Context], Acted]] = {

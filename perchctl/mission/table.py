@@ -35,13 +35,12 @@ from perchctl.mission.state import (
     BEFORE_CONTACT,
     FLYING_PHASES,
     Condition,
-    MotorStop,
     Operator,
     Outcome,
     Phase,
     Severity,
 )
-from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
+from perchctl.vehicle import CRASHED, LOCKED, TUMBLED, EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
 Reason = str | Callable[[Context], str]
@@ -51,8 +50,7 @@ Reason = str | Callable[[Context], str]
 class Transition:
     """A row of the table: from any of `phases`, when `when` holds, to the phase `to`.
 
-    `reason` is shown to the user; `motor_stop` is what a transition into ABORTED does to the
-    motors.
+    `reason` is shown to the user; `stop` is what a transition into ABORTED sends at once.
     """
 
     name: str
@@ -62,8 +60,7 @@ class Transition:
     reason: Reason
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
-    counts_attempt: bool = False
-    motor_stop: MotorStop = MotorStop.NONE
+    stop: EmergencyStop | StopMotors | None = None
 
     def explain(self, c: Context) -> str:
         """The reason as a sentence without its end."""
@@ -342,14 +339,21 @@ def why_no_picture(c: Context) -> str:
     return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
 
 
-# --- The three ways out of the mission --------------------------------
+# --- The ways out of the mission --------------------------------
 
 
-def stops(
-    name: str, when: Predicate, reason: str, motor_stop: MotorStop, outcome: Outcome = O.SAFETY
-) -> Transition:
-    """The motors are stopped, wherever in the air it is."""
-    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, motor_stop=motor_stop)
+def cuts(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
+    """The motors are cut and locked, wherever in the air it is."""
+    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, stop=EmergencyStop())
+
+
+def ends(name: str, bit: int, reason: str) -> Transition:
+    """The supervisor has ended the flight: the motors are stopped."""
+
+    def when(c: Context) -> bool:
+        return c.telemetry.has(bit)
+
+    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, O.SAFETY, stop=StopMotors())
 
 
 def lands(
@@ -361,17 +365,21 @@ def lands(
 
 def backs_off(name: str, phases: Set[Phase], when: Predicate, reason: Reason) -> Transition:
     """The attempt has failed: down a little, and another one."""
-    return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF, counts_attempt=True)
+    return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF)
+
+
+def gives_up(name: str, when: Predicate, reason: str) -> Transition:
+    """The landing has ended, and not as it should."""
+    return Transition(name, {P.LANDING}, when, P.ABORTED, reason, S.LAND, O.SAFETY)
 
 
 # --- The safety rows, gravest first -----------------------------------
 
 SAFETY: tuple[Transition, ...] = (
-    stops(
+    cuts(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
         "second Ctrl-C: emergency stop",
-        MotorStop.EMERGENCY,
         O.EMERGENCY,
     ),
     Transition(
@@ -382,29 +390,13 @@ SAFETY: tuple[Transition, ...] = (
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=O.PERCHED,
     ),
-    stops(
-        "locked",
-        lambda c: c.telemetry.has(LOCKED),
-        "the supervisor has locked the vehicle: inspect and restart it",
-        MotorStop.PLAIN,
-    ),
-    stops(
-        "tumbled",
-        lambda c: c.telemetry.has(TUMBLED),
-        "the vehicle has tumbled: inspect and restart it",
-        MotorStop.PLAIN,
-    ),
-    stops(
-        "crashed",
-        lambda c: c.telemetry.has(CRASHED),
-        "the supervisor reports a crash: inspect and restart the vehicle",
-        MotorStop.PLAIN,
-    ),
-    stops(
+    ends("locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"),
+    ends("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
+    ends("crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"),
+    cuts(
         "tilted",
         lambda c: c.held(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
         "tilted beyond the limit: motors cut",
-        MotorStop.EMERGENCY,
     ),
     lands(
         "operator-land",
@@ -727,43 +719,30 @@ TABLE: tuple[Transition, ...] = (
             + ("" if c.state.blind_s is None else "; it was felt to come down to the floor")
         ),
     ),
-    Transition(
+    gives_up(
         "held-elsewhere",
-        {P.LANDING},
         is_off_as(Finding.HELD),
-        P.ABORTED,
         "motors off; something holds it where its estimate has no target: look before you touch it",
-        S.LAND,
-        O.SAFETY,
     ),
-    Transition(
+    gives_up(
         "hangs-or-stands",
-        {P.LANDING},
         lambda c: c.held(C.DOWN) >= LOOKED_S,
-        P.ABORTED,
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it",
-        S.LAND,
-        O.SAFETY,
     ),
-    Transition(
+    gives_up(
         "landing-timeout",
-        {P.LANDING},
         lambda c: c.in_phase_s > c.planner.landing.timeout_s,
-        P.ABORTED,
         "the landing was not confirmed in time",
-        S.LAND,
-        O.SAFETY,
     ),
 )
-_ROWS_OF = {phase: tuple(row for row in TABLE if phase in row.phases) for phase in Phase}
 
 
 def first_match(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
     """The first transition that applies, or None to stay. Whatever the table says, one that would
     lead from a landing to a flying phase is passed over."""
     landing = c.state.severity >= Severity.LAND
-    for row in _ROWS_OF[c.state.phase] if table is TABLE else table:
+    for row in table:
         undoes = landing and row.to in FLYING_PHASES
         if not undoes and c.state.phase in row.phases and row.when(c):
             return row
