@@ -2,7 +2,7 @@
 
 No current is measured on a Crazyflie. Known are the resting voltage on the ground, the voltage
 under load, and the thrust that the load follows. Assumed are a lithium polymer cell's resting
-voltage by its charge (`CURVE`) and the current at full thrust (`FULL_A`), for a battery of
+voltage by its charge (`VOLTS`) and the current at full thrust (`FULL_A`), for a battery of
 `vehicle.battery_mah`. Fitted from the voltages are the sag under full thrust and `hunger`: how much
 faster this battery empties than assumed, both by least squares around usual values, with old
 readings fading.
@@ -25,22 +25,9 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, is_battery_reading
 
-CURVE: tuple[tuple[float, float], ...] = (
-    (0.0, 3.0),
-    (0.02, 3.4),
-    (0.05, 3.64),
-    (0.1, 3.76),
-    (0.2, 3.82),
-    (0.3, 3.86),
-    (0.4, 3.885),
-    (0.5, 3.915),
-    (0.6, 3.955),
-    (0.7, 3.995),
-    (0.8, 4.04),
-    (0.9, 4.1),
-    (1.0, 4.2),
-)
-"""Share of the charge, and the resting voltage: a little below the firmware's own table."""
+SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+VOLTS = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
+"""Of the charge, and of the resting cell with it: a little below the firmware's own table."""
 FULL_A = 4.4  # four motors at full thrust; proportional to the thrust below
 LOW_POWER_V = 3.2  # the firmware reports low power after 5 s, unless `pm.lowVoltage` differs
 USUAL_SAG_V, SAG_WITHIN_V, LEAST_SAG_V = 0.63, 0.3, 0.2
@@ -55,8 +42,6 @@ UNKNOWN_S = 5.0  # without a reading for longer, the remaining charge is unknown
 SETTLING_S, TOUCHING_S, LANDING_S = 3.0, 1.0, 3.0  # as measured in simulated flights
 PRESS_DIP_V = 0.3  # below `safety.min_load_v`, for a press shorter than the debounce
 BACK_OFF_S = 3.0  # from a failed attempt until it is steady and sees the target again
-
-_SHARES, _VOLTS = zip(*CURVE, strict=True)
 
 
 # --- The battery's state, fitted reading by reading -------------------
@@ -120,12 +105,12 @@ def fit_battery(state: EnergyState) -> tuple[float, float]:
 
 def charge_at(rest_v: float) -> float:
     """The share of its charge, 0..1, that a cell with that resting voltage has."""
-    return min(1.0, max(0.0, _along(_VOLTS, _SHARES, rest_v)))
+    return min(1.0, max(0.0, _along(VOLTS, SHARES, rest_v)))
 
 
 def resting_v(share: float) -> float:
     """The resting voltage at a share of the charge."""
-    return _along(_SHARES, _VOLTS, share)
+    return _along(SHARES, VOLTS, share)
 
 
 def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
