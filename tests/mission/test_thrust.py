@@ -27,13 +27,12 @@ from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
     CEILING_M,
     PROFILE,
-    READY,
     changed,
     observation,
     state_in,
     target_at,
 )
-from tests.mission.rig import BEGIN_S, Motors, at, fly, is_setpoint, times
+from tests.mission.rig import BEGIN_S, Motors, at, fly, times
 
 CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 
@@ -218,12 +217,6 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     it = Follows(1.0, target=below)
     fly(state_in(phase), it, 8.0)
     assert min(it.sent_m) >= FLOOR_M
-
-
-def test_a_take_off_begins_on_the_ground() -> None:
-    begin = PlannerState.on_ground(observation(BEGIN_S, 0.0))
-    flight = fly(begin, at(0.0, thrust=0.0, supervisor=READY))
-    assert is_setpoint(flight.command, below_m=FLOOR_M)
 
 
 @pytest.mark.parametrize("handover_m", [0.1, 0.3])
