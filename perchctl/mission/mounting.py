@@ -145,14 +145,11 @@ def _judged(watch: MountWatch, against: int) -> MountWatch:
 
 
 def describe_turn(turn_rad: float) -> str:
-    """A sentence on the turn, to the nearest quarter if it is about one, else to 10 degrees."""
-    turn_deg = math.degrees(turn_rad)
-    quarter = 90.0 * round(turn_deg / 90.0)
-    near = abs(turn_deg - quarter) <= 35.0 and quarter != 0.0
-    shown = quarter if near else 10.0 * round(turn_deg / 10.0)
-    shown = 180.0 if shown == -180.0 else shown
+    """A sentence on the turn, to 10 degrees."""
+    turn_deg = 10 * round(math.degrees(turn_rad) / 10.0)
+    shown = 180 if turn_deg == -180 else turn_deg
     return (
-        f"camera seems turned by about {shown:.0f} deg from what the profile says: the target "
-        f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
-        f"{shown:.0f} to the last of camera.mount.rpy_deg"
+        f"camera seems turned by about {shown} deg from what the profile says: the target moves "
+        f"with the vehicle; measure it with `perchctl calibrate mount`, or add {shown} to the last "
+        f"of camera.mount.rpy_deg"
     )
