@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
-_GONE = {"blow", "last_moment"}  # in logs of before
+_GONE = {"blow", "last_moment", "timing"}  # in logs of before
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
