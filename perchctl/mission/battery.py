@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
 
 from perchctl.mission.conditions import press_thrust
 from perchctl.mission.context import Context
@@ -152,15 +151,6 @@ def _towards(value: float, goal: float, part: float) -> float:
 # --- What that is enough for ------------------------------------------
 
 
-@dataclass(frozen=True)
-class Needs:
-    """The seconds of flight that the attempt at hand, each further one and the landing take."""
-
-    attempt_s: float
-    again_s: float
-    landing_s: float
-
-
 def outlook(c: Context) -> BatteryOutlook:
     """The outlook of the battery: what it has left, and for how many attempts that is enough.
 
@@ -173,14 +163,14 @@ def outlook(c: Context) -> BatteryOutlook:
     seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
     if c.target_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    enough_s, needs = seconds, needs_of(c)
+    enough_s, (attempt_s, again_s, landing_s) = seconds, needs_s(c)
     if enough_s is None:
         enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
-    spare_s = enough_s - c.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
+    spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
     left = c.planner.attempts - c.state.attempts
     attempts = 0  # also where the figures are no numbers
     if spare_s >= 0.0:
-        attempts = 1 + math.floor(min(spare_s / needs.again_s, max(0, left)))
+        attempts = 1 + math.floor(min(spare_s / again_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
@@ -205,8 +195,9 @@ def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
     return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah))
 
 
-def needs_of(c: Context) -> Needs:
-    """The seconds that attempts and landing take, by the height of a target that was seen."""
+def needs_s(c: Context) -> tuple[float, float, float]:
+    """The seconds that the attempt at hand, each further one and the landing take, by the height of
+    a target that was seen."""
     planner = c.planner
     up_m = max(0.0, c.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
@@ -215,11 +206,9 @@ def needs_of(c: Context) -> Needs:
     if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
         aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
     again_m = planner.recover.descend_m + planner.ascend.standoff_m
-    return Needs(
-        aligned_s + _climb_s(c.profile, up_m) + touch_s,
-        2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s,
-        max(0.0, c.height_m + up_m) / planner.landing.speed_mps + LANDING_S,
-    )
+    attempt_s = aligned_s + _climb_s(c.profile, up_m) + touch_s
+    again_s = 2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s
+    return attempt_s, again_s, max(0.0, c.height_m + up_m) / planner.landing.speed_mps + LANDING_S
 
 
 def is_short_of_charge(c: Context) -> bool:
@@ -231,14 +220,12 @@ def is_short_of_charge(c: Context) -> bool:
 
 def why_short(c: Context) -> str:
     """The shortfall with its figures, as a sentence."""
-    seconds, needs = c.state.battery.left_s, needs_of(c)
-    has = (
-        "what the battery has left is not known"
-        if seconds is None
-        else (f"the battery has {seconds:.0f} s left")
-    )
+    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, needs_s(c)
+    has = "what the battery has left is not known"
+    if seconds is not None:
+        has = f"the battery has {seconds:.0f} s left"
     return (
-        f"{has}; an attempt takes {needs.attempt_s:.0f} s, the landing {needs.landing_s:.0f} s, "
+        f"{has}; an attempt takes {attempt_s:.0f} s, the landing {landing_s:.0f} s, "
         f"the reserve is {c.safety.energy_reserve_s:g} s"
     )
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from perchctl.geometry import Array
 from perchctl.mission.state import Condition, Mismatch, Observation, PlannerState
-from perchctl.profile import PlannerConfig, Profile, SafetyConfig
+from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Telemetry
 
 FAR_BELOW_M = 0.5
 PUT_RIGHT_S = 0.5  # when external positions come again, the estimate is drawn back for so long
@@ -20,13 +18,37 @@ ANSWER_S = 0.2  # within it the telemetry shows an ordered raw thrust
 HANGING_S = 1.0  # a thrust below the weight must be enough for so long to prove the magnet
 
 
-@dataclass(frozen=True, eq=False)
 class Context:
-    """The argument of the table's predicates and the phases' actions: one tick, whole."""
+    """The argument of the table's predicates and the phases' actions: one tick, whole.
 
-    state: PlannerState
-    obs: Observation
-    profile: Profile
+    Attributes:
+        t_s: time of the tick on the loop's clock.
+        telemetry: the newest sample.
+        planner, safety: the profile's sections of those names.
+        by_sight: the target itself is the positioning system.
+        mismatch: what would bring the target to rest; zero while it rests.
+        in_phase_s: seconds since the phase was entered.
+        height_m: above the ground that the flight started from, in the estimate's world.
+        attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
+            together; `imu_proves`: new enough to prove anything, whatever the position's age.
+        telemetry_age_s: age of the telemetry's oldest part: position and velocity come in a packet
+            of their own, and a frozen reading is as old as its first one; `proves`: new enough.
+    """
+
+    def __init__(self, state: PlannerState, obs: Observation, profile: Profile) -> None:
+        tel, imu = obs.telemetry, obs.imu
+        self.state, self.obs, self.profile = state, obs, profile
+        self.t_s, self.telemetry = obs.t_s, tel
+        self.planner, self.safety = profile.planner, profile.safety
+        self.by_sight = profile.positioning.by == "target"
+        self.mismatch = obs.mismatch or Mismatch()
+        self.in_phase_s = obs.t_s - state.entered_s
+        self.height_m = tel.position_m[2] - state.ground_z_m
+        self.attitude_age_s = obs.t_s - tel.t_s
+        self.imu_proves = self.attitude_age_s <= profile.safety.proof_age_s
+        oldest_s = max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
+        self.telemetry_age_s = obs.t_s - tel.t_s + oldest_s
+        self.proves = self.telemetry_age_s <= profile.safety.proof_age_s
 
     def with_state(self, state: PlannerState) -> Context:
         """The same tick with another state."""
@@ -35,36 +57,6 @@ class Context:
     def evolve(self, **changes: Any) -> Context:
         """The same tick with changes of its state."""
         return self.with_state(replace(self.state, **changes))
-
-    @property
-    def t_s(self) -> float:
-        """Time of the tick on the loop's clock."""
-        return self.obs.t_s
-
-    @property
-    def telemetry(self) -> Telemetry:
-        """The newest sample."""
-        return self.obs.telemetry
-
-    @property
-    def planner(self) -> PlannerConfig:
-        """The profile's section of that name."""
-        return self.profile.planner
-
-    @property
-    def safety(self) -> SafetyConfig:
-        """The profile's section of that name."""
-        return self.profile.safety
-
-    @property
-    def mismatch(self) -> Mismatch:
-        """What would bring the target to rest; zero while it rests."""
-        return self.obs.mismatch or Mismatch()
-
-    @property
-    def in_phase_s(self) -> float:
-        """Seconds since the phase was entered."""
-        return self.t_s - self.state.entered_s
 
     def held(self, condition: Condition) -> float:
         """Seconds for which the condition has been true; -1 when it is not."""
@@ -79,23 +71,6 @@ class Context:
         return math.sqrt(sum(v * v for v in self.telemetry.velocity_mps))
 
     @property
-    def height_m(self) -> float:
-        """Height above the ground that the flight started from, in the estimate's world."""
-        return self.telemetry.position_m[2] - self.state.ground_z_m
-
-    @property
-    def telemetry_age_s(self) -> float:
-        """Age of the telemetry's oldest part: position and velocity come in a packet of their own,
-        and a frozen reading is as old as its first one."""
-        tel, imu = self.telemetry, self.obs.imu
-        return self.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
-
-    @property
-    def attitude_age_s(self) -> float:
-        """Age of attitude, acceleration, thrust and supervisor bits, which come together."""
-        return self.t_s - self.telemetry.t_s
-
-    @property
     def position_age_s(self) -> float:
         """Age of the newest external position that was sent to the vehicle; with decks, of the
         newest correction of its estimate."""
@@ -108,17 +83,6 @@ class Context:
     def position_is_stale(self) -> bool:
         """True while no external position is fresh (fault 10)."""
         return self.position_age_s > self.profile.positioning.hold_s
-
-    @property
-    def proves(self) -> bool:
-        """True if all of the telemetry is new enough to prove anything."""
-        return self.telemetry_age_s <= self.safety.proof_age_s
-
-    @property
-    def imu_proves(self) -> bool:
-        """True if attitude, acceleration, thrust and supervisor bits are new enough to prove
-        anything, whatever the age of the position."""
-        return self.attitude_age_s <= self.safety.proof_age_s
 
     @property
     def thrust_is_known(self) -> bool:
@@ -161,11 +125,6 @@ class Context:
         if blind and reckoning.imu is not None:
             return reckoning.velocity_mps[2]
         return self.telemetry.velocity_mps[2]
-
-    @property
-    def by_sight(self) -> bool:
-        """True if the target itself is the positioning system."""
-        return self.profile.positioning.by == "target"
 
     def sinks(self, mps: float) -> bool:
         """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts

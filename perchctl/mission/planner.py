@@ -129,12 +129,11 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 def _mount_watched(c: Context) -> MountWatch:
     """The mounting's watch with this tick's frame, if that measured the target over fresh
     telemetry."""
-    mount, target = c.state.mount, c.obs.target
-    if c.state.phase not in IN_THE_OPEN or c.state.hold or not (c.obs.new_frame and c.proves):
-        return mount
-    if target is None or not target.measured or target.world_m is None:
-        return mount
-    return update_watch(mount, sight_of(c.t_s, c.telemetry, target.world_m))
+    state = c.state
+    measured = c.obs.new_frame and state.confirmed > 0 and c.proves and not state.hold
+    if state.target_m is None or not measured or state.phase not in IN_THE_OPEN:
+        return state.mount
+    return update_watch(state.mount, sight_of(c.t_s, c.telemetry, state.target_m))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
