@@ -31,12 +31,24 @@ class Context:
         height_m: above the ground that the flight started from, in the estimate's world.
         attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
             together; `imu_proves`: new enough to prove anything, whatever the position's age.
+        reads_one_g: so does the accelerometer, as of what something carries.
         telemetry_age_s: age of the telemetry's oldest part: position and velocity come in a packet
             of their own, and a frozen reading is as old as its first one; `proves`: new enough.
+        target_m, target_yaw_rad: the target in the world of the state estimate, (3,), and its
+            heading; None while none was seen.
+        error_xy_m, error_z_m, error_yaw_rad: from the gear to the target's axis, up to the target,
+            and to its heading; infinite while none was seen.
+        target_age_s: since the exposure of the last frame in which the target was measured.
+        tracked: the target is seen, or coasts within the filter's n_max frames; `fresh`: and was
+            measured as lately as the latency allows; `small_is_fresh`: so was the small marker.
+        far_below_target: the camera sees that nothing holds the vehicle where it is, whatever
+            height a frozen positioning system reports.
+        is_near_standoff: the gear is at the height at which an ascent settles.
+        cone_m: how far aside of the target an ascent may be at the present height.
     """
 
     def __init__(self, state: PlannerState, obs: Observation, profile: Profile) -> None:
-        tel, imu = obs.telemetry, obs.imu
+        tel, imu, ascend = obs.telemetry, obs.imu, profile.planner.ascend
         self.state, self.obs, self.profile = state, obs, profile
         self.t_s, self.telemetry = obs.t_s, tel
         self.planner, self.safety = profile.planner, profile.safety
@@ -46,9 +58,28 @@ class Context:
         self.height_m = tel.position_m[2] - state.ground_z_m
         self.attitude_age_s = obs.t_s - tel.t_s
         self.imu_proves = self.attitude_age_s <= profile.safety.proof_age_s
+        self.reads_one_g = abs(tel.acc_z_g - 1.0) <= profile.planner.perch.contact_acc_g
         oldest_s = max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
         self.telemetry_age_s = obs.t_s - tel.t_s + oldest_s
         self.proves = self.telemetry_age_s <= profile.safety.proof_age_s
+        self.target_m: Array | None = None
+        self.target_yaw_rad: float | None = None
+        self.error_xy_m = self.error_z_m = self.error_yaw_rad = self.target_age_s = math.inf
+        self.tracked = self.fresh = self.small_is_fresh = False
+        if (target := obs.target) is not None:
+            self.target_m, self.target_yaw_rad = target.world_m, target.world_yaw_rad
+            self.error_xy_m = math.hypot(target.e_m[0], target.e_m[1])
+            self.error_z_m, self.error_yaw_rad = float(target.e_m[2]), target.e_yaw_rad
+            self.target_age_s = obs.t_s - target.measured_s
+            self.tracked = target.tracked
+            # On its arrival a frame is as old as the camera's latency.
+            latency_s = profile.camera.start_latency_s + obs.delay_s
+            limit_s = ascend.fresh_s + latency_s
+            self.fresh = target.tracked and self.target_age_s <= limit_s
+            self.small_is_fresh = obs.t_s - target.small_measured_s <= limit_s
+        self.far_below_target = self.target_m is not None and self.error_z_m > FAR_BELOW_M
+        self.is_near_standoff = self.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+        self.cone_m = ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)
 
     def with_state(self, state: PlannerState) -> Context:
         """The same tick with another state."""
@@ -141,12 +172,6 @@ class Context:
         return math.inf if math.isnan(variance) else variance
 
     @property
-    def reads_one_g(self) -> bool:
-        """True if the accelerometer reads one g, as of what something carries."""
-        acc_g = self.planner.perch.contact_acc_g
-        return abs(self.telemetry.acc_z_g - 1.0) <= acc_g
-
-    @property
     def tilt_rad(self) -> float:
         """Angle between the vehicle's upward axis and the vertical."""
         tel = self.telemetry
@@ -155,84 +180,8 @@ class Context:
     # --- the target ------------------------------------------------------
 
     @property
-    def target_m(self) -> Array | None:
-        """The target in the world of the state estimate, (3,); None while none was seen."""
-        return None if self.obs.target is None else self.obs.target.world_m
-
-    @property
-    def target_yaw_rad(self) -> float | None:
-        """The target's heading in the world of the state estimate; None while none was seen."""
-        return None if self.obs.target is None else self.obs.target.world_yaw_rad
-
-    @property
-    def error_xy_m(self) -> float:
-        """Horizontal distance of the gear from the target's axis; infinite without a target."""
-        target = self.obs.target
-        return math.inf if target is None else math.hypot(target.e_m[0], target.e_m[1])
-
-    @property
-    def error_z_m(self) -> float:
-        """Height of the target above the gear; infinite without a target."""
-        target = self.obs.target
-        return math.inf if target is None else float(target.e_m[2])
-
-    @property
-    def error_yaw_rad(self) -> float:
-        """Heading of the target relative to the vehicle's; infinite without a target."""
-        target = self.obs.target
-        return math.inf if target is None else target.e_yaw_rad
-
-    @property
-    def target_age_s(self) -> float:
-        """Seconds since the exposure of the last frame in which the target was measured."""
-        target = self.obs.target
-        return math.inf if target is None else self.t_s - target.measured_s
-
-    @property
-    def tracked(self) -> bool:
-        """True if the target is seen, or coasts within the filter's n_max frames."""
-        return self.obs.target is not None and self.obs.target.tracked
-
-    @property
-    def fresh(self) -> bool:
-        """True if the target is tracked, and was measured as lately as the latency allows."""
-        return self.tracked and self.target_age_s <= self._fresh_limit_s
-
-    @property
-    def small_is_fresh(self) -> bool:
-        """True if the small marker was measured as lately as the latency allows."""
-        target = self.obs.target
-        if target is None:
-            return False
-        return self.t_s - target.small_measured_s <= self._fresh_limit_s
-
-    @property
-    def _fresh_limit_s(self) -> float:
-        # On its arrival a frame is as old as the camera's latency.
-        latency_s = self.profile.camera.start_latency_s + self.obs.delay_s
-        return self.planner.ascend.fresh_s + latency_s
-
-    @property
     def contact_goal_z_m(self) -> float:
         """Height of the body at which the gear touches the target."""
         if self.target_m is None:
             return math.inf
         return float(self.target_m[2]) - self.profile.vehicle.gear_body_m[2]
-
-    @property
-    def far_below_target(self) -> bool:
-        """True if the camera sees that nothing holds the vehicle where it is, whatever height a
-        frozen positioning system reports."""
-        return self.target_m is not None and self.error_z_m > FAR_BELOW_M
-
-    @property
-    def is_near_standoff(self) -> bool:
-        """True once the gear is at the height at which an ascent settles."""
-        ascend = self.planner.ascend
-        return self.error_z_m <= ascend.standoff_m + ascend.settle_z_m
-
-    @property
-    def cone_m(self) -> float:
-        """How far aside of the target an ascent may be at the present height."""
-        ascend = self.planner.ascend
-        return ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)
