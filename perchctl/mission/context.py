@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Any
 
 from perchctl.geometry import Array
@@ -31,13 +30,27 @@ class Context:
         height_m: above the ground that the flight started from, in the estimate's world.
         attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
             together; `imu_proves`: new enough to prove anything, whatever the position's age.
+        speed_mps: length of the estimated velocity; `tilt_rad`: angle between the vehicle's upward
+            axis and the vertical.
+        variance_m2: of the position; 0 if the firmware reports none, infinite if it is no number.
+        thrust_is_known: the thrust that is read follows what is ordered.
         reads_one_g: so does the accelerometer, as of what something carries.
         telemetry_age_s: age of the telemetry's oldest part: position and velocity come in a packet
             of their own, and a frozen reading is as old as its first one; `proves`: new enough.
+        position_age_s: of the newest external position that was sent to the vehicle; with decks, of
+            the newest correction of its estimate; `position_is_stale`: none is fresh (fault 10).
+        located: the estimated position and speed are believed: positions come, not only just again,
+            and pictures that give them fit the accelerometer; `placed`: and can prove anything,
+            since they are fresh.
+        is_blown: after a blow or gust that only the accelerometer has measured, until a sight
+            corrects the estimate: the firmware's estimator ignores sideways forces.
+        climb_mps: vertical speed, by the estimate where that is believed and fresh, else by the
+            accelerometer.
         target_m, target_yaw_rad: the target in the world of the state estimate, (3,), and its
             heading; None while none was seen.
         error_xy_m, error_z_m, error_yaw_rad: from the gear to the target's axis, up to the target,
             and to its heading; infinite while none was seen.
+        contact_goal_z_m: height of the body at which the gear touches the target.
         target_age_s: since the exposure of the last frame in which the target was measured.
         tracked: the target is seen, or coasts within the filter's n_max frames; `fresh`: and was
             measured as lately as the latency allows; `small_is_fresh`: so was the small marker.
@@ -59,9 +72,31 @@ class Context:
         self.attitude_age_s = obs.t_s - tel.t_s
         self.imu_proves = self.attitude_age_s <= profile.safety.proof_age_s
         self.reads_one_g = abs(tel.acc_z_g - 1.0) <= profile.planner.perch.contact_acc_g
+        self.speed_mps = math.sqrt(sum(v * v for v in tel.velocity_mps))
+        up = math.cos(tel.roll_rad) * math.cos(tel.pitch_rad)
+        self.tilt_rad = math.acos(max(-1.0, min(1.0, up)))
+        variance = tel.position_variance_m2 or 0.0
+        self.variance_m2 = math.inf if math.isnan(variance) else variance
+        unanswered_s = state.unanswered_s
+        self.thrust_is_known = unanswered_s is None or obs.t_s - unanswered_s <= ANSWER_S
         oldest_s = max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
         self.telemetry_age_s = obs.t_s - tel.t_s + oldest_s
         self.proves = self.telemetry_age_s <= profile.safety.proof_age_s
+        self.position_age_s = obs.position_age_s
+        if profile.positioning.by == "deck":
+            self.position_age_s = max(obs.position_age_s, imu.corrections.age_s(obs.t_s))
+        self.position_is_stale = self.position_age_s > profile.positioning.hold_s
+        doubted = state.astray or (self.by_sight and obs.mismatch is not None)
+        just_again = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
+        self.located = not (doubted or self.position_is_stale or just_again)
+        self.placed = self.located and self.proves
+        reckoning, (x_mps, y_mps, climb_mps) = state.reckoning, tel.velocity_mps
+        is_reckoned, (rx_mps, ry_mps, _) = reckoning.imu is not None, reckoning.velocity_mps
+        uncorrected = self.by_sight and is_reckoned and self.position_age_s > CORRECTED_S
+        self.is_blown = uncorrected and math.hypot(rx_mps - x_mps, ry_mps - y_mps) > BLOWN_MPS
+        by_imu = is_reckoned and (state.blind_s is not None or not self.placed)
+        self.climb_mps = reckoning.velocity_mps[2] if by_imu else climb_mps
+        self.contact_goal_z_m = math.inf
         self.target_m: Array | None = None
         self.target_yaw_rad: float | None = None
         self.error_xy_m = self.error_z_m = self.error_yaw_rad = self.target_age_s = math.inf
@@ -72,6 +107,9 @@ class Context:
             self.error_z_m, self.error_yaw_rad = float(target.e_m[2]), target.e_yaw_rad
             self.target_age_s = obs.t_s - target.measured_s
             self.tracked = target.tracked
+            if target.world_m is not None:
+                gear_z_m = profile.vehicle.gear_body_m[2]
+                self.contact_goal_z_m = float(target.world_m[2]) - gear_z_m
             # On its arrival a frame is as old as the camera's latency.
             latency_s = profile.camera.start_latency_s + obs.delay_s
             limit_s = ascend.fresh_s + latency_s
@@ -94,69 +132,6 @@ class Context:
         since = self.state.since.get(condition)
         return -1.0 if since is None else self.t_s - since
 
-    # --- the vehicle -----------------------------------------------------
-
-    @cached_property
-    def speed_mps(self) -> float:
-        """Length of the estimated velocity."""
-        return math.sqrt(sum(v * v for v in self.telemetry.velocity_mps))
-
-    @property
-    def position_age_s(self) -> float:
-        """Age of the newest external position that was sent to the vehicle; with decks, of the
-        newest correction of its estimate."""
-        age_s = self.obs.position_age_s
-        if self.profile.positioning.by == "deck":
-            age_s = max(age_s, self.obs.imu.corrections.age_s(self.t_s))
-        return age_s
-
-    @property
-    def position_is_stale(self) -> bool:
-        """True while no external position is fresh (fault 10)."""
-        return self.position_age_s > self.profile.positioning.hold_s
-
-    @property
-    def thrust_is_known(self) -> bool:
-        """True if the thrust that is read follows what is ordered."""
-        unanswered_s = self.state.unanswered_s
-        return unanswered_s is None or self.t_s - unanswered_s <= ANSWER_S
-
-    @property
-    def located(self) -> bool:
-        """True if the estimated position and speed are believed: positions come, not only just
-        again, and pictures that give them fit the accelerometer."""
-        if self.by_sight and self.obs.mismatch is not None:
-            return False
-        if self.state.astray or self.position_is_stale:
-            return False
-        stale_s = self.state.stale_s
-        return stale_s is None or self.t_s - stale_s > PUT_RIGHT_S
-
-    @property
-    def placed(self) -> bool:
-        """True if the estimated position and speed can prove anything: believed, and fresh."""
-        return self.located and self.proves
-
-    @property
-    def is_blown(self) -> bool:
-        """True after a blow or gust that only the accelerometer has measured, until a sight
-        corrects the estimate: the firmware's estimator ignores sideways forces."""
-        reckoning = self.state.reckoning
-        if not self.by_sight or reckoning.imu is None or self.position_age_s <= CORRECTED_S:
-            return False
-        (x, y, _), (ex, ey, _) = reckoning.velocity_mps, self.telemetry.velocity_mps
-        return math.hypot(x - ex, y - ey) > BLOWN_MPS
-
-    @property
-    def climb_mps(self) -> float:
-        """Vertical speed, by the estimate where that is believed and fresh, else by the
-        accelerometer."""
-        blind = self.state.blind_s is not None or not self.placed
-        reckoning = self.state.reckoning
-        if blind and reckoning.imu is not None:
-            return reckoning.velocity_mps[2]
-        return self.telemetry.velocity_mps[2]
-
     def sinks(self, mps: float) -> bool:
         """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts
         only while the accelerometer reads less than the weight, too."""
@@ -164,24 +139,3 @@ class Context:
         if self.climb_mps >= -mps:
             return False
         return self.placed or tel.acc_z_g < 1.0 - self.planner.perch.contact_acc_g
-
-    @property
-    def variance_m2(self) -> float:
-        """Variance of the position; 0 if the firmware reports none, infinite if it is no number."""
-        variance = self.telemetry.position_variance_m2 or 0.0
-        return math.inf if math.isnan(variance) else variance
-
-    @property
-    def tilt_rad(self) -> float:
-        """Angle between the vehicle's upward axis and the vertical."""
-        tel = self.telemetry
-        return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
-
-    # --- the target ------------------------------------------------------
-
-    @property
-    def contact_goal_z_m(self) -> float:
-        """Height of the body at which the gear touches the target."""
-        if self.target_m is None:
-            return math.inf
-        return float(self.target_m[2]) - self.profile.vehicle.gear_body_m[2]
