@@ -63,13 +63,14 @@ def _contact(c: Context) -> bool:
     perch, tel = c.planner.perch, c.telemetry
     steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and c.placed
     felt_s = c.t_s - c.obs.imu.steady_s
+    wanted = perch.contact_thrust_ratio * c.state.hover_thrust  # as far as there is more
     return (
         abs(c.error_z_m) <= perch.contact_z_m + (CARRIED_ON_MPS * unseen_s(c) if c.by_sight else 0)
         and (steady or felt_s >= perch.contact_dwell_s)
         and c.reads_one_g
         and c.state.hover_thrust > 0
         and c.thrust_is_known
-        and tel.thrust >= contact_thrust(c)
+        and tel.thrust >= min(wanted, PROVABLE * press_thrust(c.profile))
     )
 
 
@@ -127,12 +128,6 @@ def press_thrust(profile: Profile) -> float:
     return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
 
 
-def contact_thrust(c: Context) -> float:
-    """The thrust that proves a contact: more than hovering takes, as far as there is more."""
-    wanted = c.planner.perch.contact_thrust_ratio * c.state.hover_thrust
-    return min(wanted, PROVABLE * press_thrust(c.profile))
-
-
 def hovers(c: Context) -> bool:
     """True if the thrust is what hovering takes: the vehicle is neither carried nor pressed, not
     at its thrust's limit, and hardly accelerated."""
@@ -148,11 +143,6 @@ def hovers(c: Context) -> bool:
         and abs(tel.acc_z_g - 1.0) < 0.1
         and not stuck
     )
-
-
-def _magnet_holds(c: Context) -> bool:
-    """True if the vehicle stays up on a thrust that could not carry it."""
-    return _is_carried(c) and not _magnet_slips(c) and (c.placed or _still(c))
 
 
 def _is_carried(c: Context) -> bool:
@@ -288,7 +278,9 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.NEAR_STANDOFF: lambda c: c.tracked and c.is_near_standoff,
     Condition.SETTLED: _settled,
     Condition.CONTACT: _contact,
-    Condition.MAGNET_HOLDS: _magnet_holds,
+    Condition.MAGNET_HOLDS: lambda c: (  # it stays up on a thrust that could not carry it
+        _is_carried(c) and not _magnet_slips(c) and (c.placed or _still(c))
+    ),
     Condition.SLIPPING: _magnet_slips,
     Condition.HANGING: _hanging,
     Condition.STEADY: lambda c: c.speed_mps <= c.planner.recover.steady_mps,

@@ -44,7 +44,6 @@ CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
 """Motors that stand still need all the thrust there is. Those that turn with most of it would carry
 the vehicle back to the ceiling, beside the target's centre."""
 CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
-CARRIED_RATIO = 0.85  # of the hover thrust: what still has so much sinks slowly by itself
 MOST_BRAKED_MPS = 1.0  # no blow that the vehicle survives leaves more
 POSITION_GAIN_PER_S = 2.0  # the firmware's `posCtlPid.xKp` and `yKp`
 CAUGHT_MPS = -0.1  # by then the thrust is above the weight, and rises on
@@ -290,11 +289,6 @@ def catch_above_m(hover_thrust: float, thrust: float) -> float:
     """Height of the setpoint that stops a fall, above the vehicle."""
     turning = thrust > 0.5 * hover_thrust
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
-
-
-def is_carried(hover_thrust: float, thrust: float) -> bool:
-    """True if what slips hardly falls, since the motors carry most of the weight."""
-    return thrust >= CARRIED_RATIO * hover_thrust
 
 
 def catch(c: Context) -> Acted | None:

@@ -361,8 +361,14 @@ def advance_reckoning(
             old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated, beside_mps=(0.0, 0.0)
         )
         if old.imu is not None and imu.silent_s > old.imu.t_s:
-            flew = _may_have_flown(old.imu, imu)
-            nearest_m = old.nearest_m - _most_climb_m(old, imu.t_s, flew=flew)
+            # Not with motors that were off around the silence, nor started anew.
+            off = old.imu.off_s <= old.imu.t_s and imu.off_s <= imu.t_s
+            flew = not (off or imu.started_s > old.imu.t_s)
+            climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
+            climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
+            if flew:
+                climb_m = MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
+            nearest_m = old.nearest_m - climb_m
             near = nearest_m < REACH_M
             unknown = replace(
                 unknown,
@@ -416,20 +422,6 @@ def discount_wrong_positions(old: Reckoning) -> Reckoning:
     of which hardly any was learned in so short a time."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
-
-
-def _may_have_flown(before: ImuMotion, after: ImuMotion) -> bool:
-    """True unless the motors were off around a silence, or the vehicle started anew."""
-    off = before.off_s <= before.t_s and after.off_s <= after.t_s
-    return not (off or after.started_s > before.t_s)
-
-
-def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
-    """The highest climb in a silence; without thrust, by the speed before it."""
-    if flew:
-        return MOST_CLIMB_MPS * (now_s - (old.imu.t_s if old.imu else now_s))
-    climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
-    return climb_mps**2 / (2.0 * GRAVITY_MPS2)
 
 
 def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:

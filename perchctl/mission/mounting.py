@@ -79,12 +79,6 @@ class MountWatch:
         return self.against >= SIGHTS_IN_A_ROW
 
     @property
-    def last_from(self) -> tuple[float, float] | None:
-        """The vehicle's place, x and y, at the last sight."""
-        place = self.sights[-1].vehicle if self.sights else None
-        return None if place is None else (place.real, place.imag)
-
-    @property
     def open(self) -> bool:
         """True while nothing confirms the mounting."""
         return not (self.fits or self.still)

@@ -34,7 +34,6 @@ from perchctl.mission.guidance import (
     corrected,
     hold_here,
     integrated,
-    is_carried,
     is_still,
     leave_press,
     left_contact,
@@ -70,6 +69,7 @@ from perchctl.values import replace
 from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
 
 HOVER_WITHIN = 0.2
+CARRIED_RATIO = 0.85  # of the hover thrust: what still has so much sinks slowly by itself
 AWAY_M = 0.05  # below the contact by so much, or by half of the descent, it has left the ceiling
 BLOCKED_ROOM_M = 0.1  # how far a search keeps from what it was once pressed against
 WARY_M = 0.2  # sideways, while nothing confirms the camera's mounting
@@ -199,7 +199,8 @@ def _started_phase(new: Context, c: Context) -> Context:
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
-                caught=row != "slipped" or is_carried(old.hover_thrust, c.telemetry.thrust),
+                # What the motors carry most of hardly falls.
+                caught=row != "slipped" or c.telemetry.thrust >= CARRIED_RATIO * old.hover_thrust,
                 catch_above_m=catch_above_m(old.hover_thrust, c.telemetry.thrust),
                 blocked_z_m=z_m if row == "blocked" else old.blocked_z_m,
             )
@@ -297,7 +298,7 @@ def _search(c: Context) -> Acted:
     x, y, z = state.entry_m
     if c.target_m is not None:
         there = under_target_xy(c, state.entry_yaw_rad)
-        x, y = _not_far(state.mount.last_from or (x, y), there) if state.mount.open else there
+        x, y = _not_far(state.mount, (x, y), there) if state.mount.open else there
         height = min(z, c.contact_goal_z_m - c.planner.ascend.near_m)
     else:
         top = max(z, ground_m[2] + search.max_height_m)
@@ -309,20 +310,15 @@ def _search(c: Context) -> Acted:
     return _fly_to(c, walk(c, goal, up_mps=c.planner.ascend.speed_mps))
 
 
-def _not_far(start: tuple[float, float], goal: tuple[float, float]) -> tuple[float, float]:
-    """The goal, or as far towards it as a wrong mounting may lead."""
+def _not_far(
+    mount: MountWatch, start: tuple[float, float], goal: tuple[float, float]
+) -> tuple[float, float]:
+    """The goal, or as far towards it from the last sight as a wrong mounting may lead."""
+    if mount.sights:
+        start = (mount.sights[-1].vehicle.real, mount.sights[-1].vehicle.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]
     part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
-
-
-def _estimate(c: Context) -> Acted:
-    return _fly_to(c, c.state.setpoint or hold_here(c))
-
-
-def _align(c: Context) -> Acted:
-    setpoint = c.state.setpoint or hold_here(c)
-    return _under_target(c, setpoint.z_m)
 
 
 def _ascend(c: Context) -> Acted:
@@ -383,10 +379,6 @@ def _recover(c: Context) -> Acted:
     return _fly_to(c, walk(c, goal, down_mps=FREE_SPEED_MPS))
 
 
-def _terminal(c: Context) -> Acted:
-    return c.state, Idle()
-
-
 def _aborted(c: Context) -> Acted:
     """The motor stop, once, as the transition wants it. What hangs with its motors still would be
     locked 2 s after the stream's end: it gets the pair that prevents that."""
@@ -399,14 +391,14 @@ def _aborted(c: Context) -> Acted:
 ACTIONS: dict[Phase, Callable[[Context], Acted]] = {
     Phase.APPROACH: _approach,
     Phase.SEARCH: _search,
-    Phase.ESTIMATE: _estimate,
-    Phase.ALIGN: _align,
+    Phase.ESTIMATE: lambda c: _fly_to(c, c.state.setpoint or hold_here(c)),
+    Phase.ALIGN: lambda c: _under_target(c, (c.state.setpoint or hold_here(c)).z_m),
     Phase.ASCEND: _ascend,
     Phase.PERCH: _perch,
     Phase.COMPLETE: _complete,
     Phase.RECOVER: _recover,
     Phase.LANDING: lander.act,
-    Phase.PERCHED: _terminal,
-    Phase.LANDED: _terminal,
+    Phase.PERCHED: lambda c: (c.state, Idle()),
+    Phase.LANDED: lambda c: (c.state, Idle()),
     Phase.ABORTED: _aborted,
 }

@@ -233,11 +233,6 @@ def is_held_elsewhere(c: Context) -> bool:
     return c.held(C.HANGING) >= HELD_S and (beside or not at_its_height)
 
 
-def why_hangs_at_contact(c: Context) -> str:
-    error = touched_error(c) or contact_error(c)
-    return f"it hangs at the target's height, {error.text}: that may be its magnet"
-
-
 def is_blocked(c: Context) -> bool:
     """True if it has been pressed against something for long enough."""
     return c.held(C.BLOCKED) >= c.safety.blocked_s
@@ -264,10 +259,6 @@ def too_weak(c: Context) -> bool:
 # --- Attempts, the press and the release ------------------------------
 
 
-def attempts_used(c: Context) -> bool:
-    return c.state.attempts >= c.planner.attempts
-
-
 def is_aligned(c: Context) -> bool:
     return c.held(C.ALIGNED) >= c.planner.align.dwell_s
 
@@ -282,7 +273,7 @@ def has_recovered(c: Context) -> bool:
 def too_little_left(c: Context) -> bool:
     """True if an attempt would begin, or begin anew, and the battery has not enough for it."""
     begins = is_aligned(c) if c.state.phase is P.ALIGN else has_recovered(c)
-    return begins and not attempts_used(c) and is_short_of_charge(c)
+    return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
 
 
 def is_in_contact(c: Context) -> bool:
@@ -373,9 +364,8 @@ def gives_up(name: str, when: Predicate, reason: str) -> Transition:
     return Transition(name, {P.LANDING}, when, P.ABORTED, reason, S.LAND, O.SAFETY)
 
 
-# --- The safety rows, gravest first -----------------------------------
-
-SAFETY: tuple[Transition, ...] = (
+TABLE: tuple[Transition, ...] = (
+    # --- the safety rows, gravest first ------------------------------------------
     cuts(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
@@ -498,12 +488,6 @@ SAFETY: tuple[Transition, ...] = (
         "the perching time is over",
         O.ATTEMPTS_USED_UP,
     ),
-)
-
-# --- The whole table --------------------------------------------------
-
-TABLE: tuple[Transition, ...] = (
-    *SAFETY,
     # --- the magnet may catch early ---------------------------------------------
     Transition("caught", BEFORE_COMPLETION, is_caught, P.COMPLETE, "hanging on the magnet already"),
     lands(HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"),
@@ -511,7 +495,10 @@ TABLE: tuple[Transition, ...] = (
         "hangs-at-contact",
         BEFORE_COMPLETION,
         lambda c: c.held(C.HANGING) >= HELD_S,
-        why_hangs_at_contact,
+        lambda c: (
+            f"it hangs at the target's height, {(touched_error(c) or contact_error(c)).text}: "
+            f"that may be its magnet"
+        ),
     ),
     # --- something is in the way -----------------------------------------------
     lands(
@@ -684,7 +671,7 @@ TABLE: tuple[Transition, ...] = (
     lands(
         "attempts-used",
         {P.RECOVER},
-        lambda c: attempts_used(c) and c.in_phase_s > 0.5,
+        lambda c: c.state.attempts >= c.planner.attempts and c.in_phase_s > 0.5,
         "all perching attempts are used up",
         O.ATTEMPTS_USED_UP,
     ),
