@@ -304,21 +304,10 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
 C = Condition
 LASTING = frozenset({C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE})
 """The vehicle's own, whatever the phase, and however it is held."""
-PROOFS = frozenset(
-    {
-        C.HANGING,
-        C.CONTACT,
-        C.MAGNET_HOLDS,
-        C.WEIGHT_HANGS,
-        C.DOWN,
-        C.ON_FLOOR,
-        C.CARRIED,
-        C.SATURATED,
-    }
-)
-"""What may stop the motors or end a flight: these count over fresh telemetry only."""
 BY_PLACE = frozenset({C.HANGING, C.CONTACT, C.ON_FLOOR})
 """Proofs that rest on the position: these count only while it is measured."""
+PROOFS = BY_PLACE | {C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.CARRIED, C.SATURATED}
+"""What may stop the motors or end a flight: these count over fresh telemetry only."""
 
 
 def conditions_since(c: Context) -> dict[Condition, float]:

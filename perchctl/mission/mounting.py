@@ -136,14 +136,3 @@ def _judged(watch: MountWatch, against: int) -> MountWatch:
     ):
         return replace(watch, against=against + 1, turn_rad=-cmath.phase(turn))
     return watch
-
-
-def describe_turn(turn_rad: float) -> str:
-    """A sentence on the turn, to 10 degrees."""
-    turn_deg = 10 * round(math.degrees(turn_rad) / 10.0)
-    shown = 180 if turn_deg == -180 else turn_deg
-    return (
-        f"camera seems turned by about {shown} deg from what the profile says: the target moves "
-        f"with the vehicle; measure it with `perchctl calibrate mount`, or add {shown} to the last "
-        f"of camera.mount.rpy_deg"
-    )

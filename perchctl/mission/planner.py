@@ -156,7 +156,7 @@ def _enter(c: Context, row: Transition) -> Context:
     new = c.evolve(
         phase=row.to,
         entered_s=c.t_s,
-        reason=row.explain(c),
+        reason=row.reason if isinstance(row.reason, str) else row.reason(c),
         row=row.name,
         severity=state.severity.then(row.severity),
         stop=row.stop,

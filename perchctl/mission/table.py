@@ -30,7 +30,6 @@ from perchctl.mission.lander import (
     hangs_where_it_did,
     rest_finding,
 )
-from perchctl.mission.mounting import describe_turn
 from perchctl.mission.state import (
     BEFORE_CONTACT,
     FLYING_PHASES,
@@ -61,10 +60,6 @@ class Transition:
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
     stop: EmergencyStop | StopMotors | None = None
-
-    def explain(self, c: Context) -> str:
-        """The reason as a sentence without its end."""
-        return self.reason if isinstance(self.reason, str) else self.reason(c)
 
 
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
@@ -195,7 +190,13 @@ def mounted_wrong(c: Context) -> bool:
 def why_mounted_wrong(c: Context) -> str:
     turn_rad = c.mismatch.turn_rad
     if turn_rad or c.state.mount.wrong:
-        text = describe_turn(turn_rad or c.state.mount.turn_rad)
+        turn_deg = 10 * round(math.degrees(turn_rad or c.state.mount.turn_rad) / 10.0)
+        turn_deg = 180 if turn_deg == -180 else turn_deg
+        text = (
+            f"camera seems turned by about {turn_deg} deg from what the profile says: the target "
+            f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
+            f"{turn_deg} to the last of camera.mount.rpy_deg"
+        )
         capture = not turn_rad and c.profile.positioning.by == "mocap"
         return f"{text}; or swapped axes in the motion capture" if capture else text
     return (
