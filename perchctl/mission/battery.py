@@ -1,15 +1,11 @@
 """How much the battery has left, and whether it is enough for an attempt and a landing.
 
-No current is measured on a Crazyflie. Known are the resting voltage on the ground, the voltage
-under load, and the thrust that the load follows. Assumed are a lithium polymer cell's resting
-voltage by its charge (`VOLTS`) and the current at full thrust (`FULL_A`), for a battery of
-`vehicle.battery_mah`. Fitted from the voltages are the sag under full thrust and `hunger`: how much
-faster this battery empties than assumed, both by least squares around usual values, with old
-readings fading.
+No current is measured on a Crazyflie. Assumed are a cell's resting voltage by its charge (`VOLTS`)
+and the current at full thrust (`FULL_A`). Fitted are the sag under full thrust and `hunger`: how
+much faster this battery empties than assumed, by least squares, with old readings fading.
 
-Before each attempt, what is left is compared with what the way up, the press and the way down take
-at the profile's speeds, with a reserve. The charge ends where `battery-low` would fire; what is
-below that is for a landing that nobody planned.
+Before each attempt, what is left until `battery-low` would fire is compared with what the way up,
+the press and the way down take at the profile's speeds, with a reserve.
 """
 
 from __future__ import annotations
@@ -28,19 +24,19 @@ SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 VOLTS = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
 """Of the charge, and of the resting cell with it: a little below the firmware's own table."""
 FULL_A = 4.4  # four motors at full thrust; proportional to the thrust below
-LOW_POWER_V = 3.2  # the firmware reports low power after 5 s, unless `pm.lowVoltage` differs
+LOW_POWER_V = 3.2  # the firmware's, unless `pm.lowVoltage` differs
 USUAL_SAG_V, SAG_WITHIN_V, LEAST_SAG_V = 0.63, 0.3, 0.2
 USUAL_HUNGER, HUNGER_WITHIN, LEAST_HUNGER, MOST_HUNGER = 1.1, 0.3, 1.0, 3.0
 READING_V, FADES_S = 0.02, 40.0  # error of a second of readings, and how long it counts
 SMOOTH_S, LAG_S = 1.0, 0.3  # of the resting voltage; of a reading behind its thrust
-STEADY_LOAD = 0.06  # a thrust that changed by more does not belong to the present reading
+STEADY_LOAD = 0.06  # a changed thrust does not belong to the reading
 COUNTED_SHARE = 0.05  # below this charge the voltage alone tells what is spent
-LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0  # an estimate needs so much thrust for so long
-FRESH_S = 1.0  # in flight a reading changes all the time: an older one counts as none
-UNKNOWN_S = 5.0  # without a reading for longer, the remaining charge is unknown
+LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0  # what an estimate needs
+FRESH_S = 1.0  # an older reading counts as none
+UNKNOWN_S = 5.0  # without a reading for longer it is unknown
 SETTLING_S, TOUCHING_S, LANDING_S = 3.0, 1.0, 3.0  # as measured in simulated flights
 PRESS_DIP_V = 0.3  # below `safety.min_load_v`, for a press shorter than the debounce
-BACK_OFF_S = 3.0  # from a failed attempt until it is steady and sees the target again
+BACK_OFF_S = 3.0  # until it is steady and sees the target again
 
 
 # --- The battery's state, fitted reading by reading -------------------
@@ -122,8 +118,7 @@ def _summed(
 ) -> tuple[float, float, float, float, float]:
     """`EnergyState.fit` with one more reading, as deviations from the usual values."""
     assert state.ground_v is not None
-    # A battery larger than assumed goes on where the count has come to the curve's steep end:
-    # counted on, a sag would make up for it. A voltage above the curve counts as nothing spent.
+    # A battery larger than assumed goes on where the count has come to the curve's steep end.
     begun = charge_at(state.ground_v)
     counted = max(min(begun, COUNTED_SHARE), begun - state.used)
     spent_v = resting_v(begun) - resting_v(counted)
@@ -152,10 +147,8 @@ def _towards(value: float, goal: float, part: float) -> float:
 
 
 def outlook(c: Context) -> BatteryOutlook:
-    """The outlook of the battery: what it has left, and for how many attempts that is enough.
-
-    An unknown charge counts as what the last reading left, less what was used since, and at most
-    as the grace of a vehicle without a reading (fault 7)."""
+    """What the battery has left, and for how many attempts that is enough. An unknown charge counts
+    at most as the grace of a vehicle without a reading (fault 7)."""
     energy = c.state.energy
     used_mah = energy.used * c.profile.vehicle.battery_mah
     load = (c.state.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
@@ -176,10 +169,7 @@ def outlook(c: Context) -> BatteryOutlook:
 
 def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
     """Seconds for which hovering on a share of the full thrust keeps the voltage above that at
-    which `battery-low` fires; None if that is unknown.
-
-    It fires by the firmware's limit under a long load, by the profile's under one that outlasts
-    `safety.battery_debounce_s`, which a press seldom does."""
+    which `battery-low` fires; None if that is unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     safety, perch = profile.safety, profile.planner.perch
@@ -212,8 +202,7 @@ def needs_s(c: Context) -> tuple[float, float, float]:
 
 
 def is_short_of_charge(c: Context) -> bool:
-    """True if the attempt that would begin now has not enough. Without a remembered target none
-    begins: a search comes first, and the question after it."""
+    """True if the attempt that would begin now has not enough; without a target none begins."""
     gated = c.safety.energy_gate and c.target_m is not None
     return gated and not c.state.battery.attempts
 

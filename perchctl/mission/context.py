@@ -11,32 +11,26 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 
 FAR_BELOW_M = 0.5
-PUT_RIGHT_S = 0.5  # when external positions come again, the estimate is drawn back for so long
-CORRECTED_S, BLOWN_MPS = 0.2, 0.2  # of a newest sight, and 0.06 m/s in flights without a fault
+PUT_RIGHT_S = 0.5  # the estimate is drawn back to new positions for so long
+CORRECTED_S, BLOWN_MPS = 0.2, 0.2  # 0.06 m/s in flights without a fault
 ANSWER_S = 0.2  # within it the telemetry shows an ordered raw thrust
-HANGING_S = 1.0  # a thrust below the weight must be enough for so long to prove the magnet
+HANGING_S = 1.0  # to prove the magnet
 
 
 class Context:
     """The argument of the table's predicates and the phases' actions: one tick, whole.
 
     Attributes:
-        t_s: time of the tick on the loop's clock.
-        telemetry: the newest sample.
-        planner, safety: the profile's sections of those names.
         by_sight: the target itself is the positioning system.
         mismatch: what would bring the target to rest; zero while it rests.
-        in_phase_s: seconds since the phase was entered.
-        height_m: above the ground that the flight started from, in the estimate's world.
-        attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
-            together; `imu_proves`: new enough to prove anything, whatever the position's age.
-        speed_mps: length of the estimated velocity; `tilt_rad`: angle between the vehicle's upward
-            axis and the vertical.
-        variance_m2: of the position; 0 if the firmware reports none, infinite if it is no number.
+        height_m: above the ground that the flight started from.
+        attitude_age_s: of attitude, acceleration, thrust and supervisor bits, which come
+            together; `imu_proves`: new enough to prove anything.
+        variance_m2: of the position; 0 if the firmware reports none, infinite for a NaN.
         thrust_is_known: the thrust that is read follows what is ordered.
         reads_one_g: so does the accelerometer, as of what something carries.
-        telemetry_age_s: age of the telemetry's oldest part: position and velocity come in a packet
-            of their own, and a frozen reading is as old as its first one; `proves`: new enough.
+        telemetry_age_s: of its oldest part; a frozen reading is as old as its first one; `proves`:
+            new enough.
         position_age_s: of the newest external position that was sent to the vehicle; with decks, of
             the newest correction of its estimate; `position_is_stale`: none is fresh (fault 10).
         located: the estimated position and speed are believed: positions come, not only just again,
@@ -48,23 +42,26 @@ class Context:
             accelerometer.
         target_m, target_yaw_rad: the target in the world of the state estimate, (3,), and its
             heading; None while none was seen.
-        error_xy_m, error_z_m, error_yaw_rad: from the gear to the target's axis, up to the target,
-            and to its heading; infinite while none was seen.
+        error_xy_m, error_z_m, error_yaw_rad: from the gear to the target; infinite while none was
+            seen.
         contact_goal_z_m: height of the body at which the gear touches the target.
         target_age_s: since the exposure of the last frame in which the target was measured.
         tracked: the target is seen, or coasts within the filter's n_max frames; `fresh`: and was
             measured as lately as the latency allows; `small_is_fresh`: so was the small marker.
-        far_below_target: the camera sees that nothing holds the vehicle where it is, whatever
-            height a frozen positioning system reports.
+        far_below_target: the camera sees that nothing holds the vehicle where it is.
         is_near_standoff: the gear is at the height at which an ascent settles.
-        cone_m: how far aside of the target an ascent may be at the present height.
+        cone_m: how far aside an ascent may be at the present height.
     """
 
     def __init__(self, state: PlannerState, obs: Observation, profile: Profile) -> None:
         tel, imu, ascend = obs.telemetry, obs.imu, profile.planner.ascend
-        self.state, self.obs, self.profile = state, obs, profile
-        self.t_s, self.telemetry = obs.t_s, tel
-        self.planner, self.safety = profile.planner, profile.safety
+        self.state = state
+        self.obs = obs
+        self.profile = profile
+        self.t_s = obs.t_s
+        self.telemetry = tel
+        self.planner = profile.planner
+        self.safety = profile.safety
         self.by_sight = profile.positioning.by == "target"
         self.mismatch = obs.mismatch or Mismatch()
         self.in_phase_s = obs.t_s - state.entered_s

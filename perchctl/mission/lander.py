@@ -4,16 +4,10 @@ Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
 What lands by itself, has its weight on the magnet or is stopped goes on with that, whatever is
 known. What still comes down does it by what is known and fresh, and by whether the vehicle may be
-where the magnet holds it (the table of docs/mission.md).
+where the magnet holds it (the table of docs/mission.md). Nothing here climbs but a catch.
 
-Two proofs go before that: what falls off the magnet is caught, and what stands on the floor is
-stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
-wherever it is by then: it is ordered only where a position that does not rest on pictures shows the
-vehicle away from the ceiling, and in flight.
-
-Before each command: if it is the last packet, a position setpoint or a raw thrust ends in the
-firmware's level-out after 0.5 s and its cut after 2 s, an own landing goes on by itself
-(docs/firmware.md, "When setpoints stop"). Nothing here climbs but a catch.
+The vehicle's own landing follows a trajectory by its clock and then stops the motors, wherever it
+is by then: it is ordered only where a position shows the vehicle away from the ceiling.
 """
 
 from __future__ import annotations
@@ -71,45 +65,41 @@ class Finding(Enum):
     UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"  # they may turn
 
 
-LOOKED_S = 2.0  # a target that is seen far above has so long to show where the vehicle is
+LOOKED_S = 2.0  # a target far above has so long to show
 HUNG_WITHIN_M = 0.3
-CARRIED_WITHIN_M = 0.3  # what carries or presses a vehicle so near below the target is the target
+CARRIED_WITHIN_M = 0.3  # what carries it so near below the target is the target
 REPEAT_ORDER_S, LEAST_ORDERS, MAX_ORDERS = 0.3, 3, 6
-"""No telemetry shows a lost notify, without which an order is not flown and the vehicle is cut 2 s
-later (docs/firmware.md, "Order without notify"): so the pair is sent three times, and more often
-while nothing shows."""
-PLANNED_MPS, SETTLING_S = 0.35, 1.8  # of the own landing's quintic: largest speed; time to begin
-PEAK_OF_MEAN = 1.875  # of a quintic from rest to rest: its largest speed over its mean
+"""Without its notify an order is not flown (docs/firmware.md, "Order without notify")."""
+PLANNED_MPS, SETTLING_S = 0.35, 1.8  # of the own landing's quintic
+PEAK_OF_MEAN = 1.875  # a quintic's largest speed over its mean
 MOST_DRIFT_M = 1.0
 PEELED_M = 0.1  # below the contact by so much, the magnet has let go
 PEEL_BELOW_M, PEEL_S = 0.35, 4.0
 DROPPING_MPS = -0.35
-FALLING_G, FALLEN_MPS = 0.5, 1.0  # a landing that ends 5 cm above the floor drops it no faster
-FALLEN_BELOW_M = 0.4  # by a position: such an end from higher up is a cut in the air
+FALLING_G, FALLEN_MPS = 0.5, 1.0  # from 5 cm above the floor it drops no faster
+FALLEN_BELOW_M = 0.4  # from higher up it is a cut in the air
 HIGH_M, LOW_M, STAYED_M = 0.45, 0.3, 0.15
-HELD = "held"  # the transition of a landing that began since something held the vehicle
+HELD = "held"  # the row of a landing since something held it
 SINK_MPS, LOW_SINK_MPS, SLOW_BELOW_M = 0.7, 0.4, 0.6
-"""Level it comes down fast from high up: by the gyroscope's offset it goes sideways with the third
-power of the time, 2 m in 4 s."""
+"""By the gyroscope's offset it goes 2 m sideways in 4 s."""
 MOST_GAIN_S_PER_M, LEAST_GAIN_S_PER_M, GAIN_AGE_S2_PER_M = 0.5, 0.2, 0.06
 """Part of the hover thrust for each m/s; an older speed wants less, or it swings."""
 HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
 LATEST_S, UNHEARD_PART, OWN_ESTIMATE_S = 1.0, 0.98, 1.5
 """Later telemetry no longer tells the speed; then a little less thrust lets it come down."""
-ON_THE_SPOT_S = 0.6  # so long by setpoints at one place, and no speed of before is left
+ON_THE_SPOT_S = 0.6  # by setpoints at one place; no speed is left then
 RAMP_PER_S, STILL_MPS = 0.25, 0.05  # what does not sink gets less and less thrust
 LEAST_PART, MOST_RAW = 0.4, 60000.0
-BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22  # by 1/e in 0.4 s; takes 2.5 % of the thrust
+BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22  # takes 2.5 % of the thrust
 BRAKED_AGE_S = 0.2  # an older speed is braked less, or it swings
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
-"""Left of the reckoned speed: an attitude error of 0.01 rad adds 0.1 m/s to it each second."""
-LEVEL_FELT_S = 6.0  # an attitude error that pictures measured is not the present one for longer
+"""An attitude error of 0.01 rad adds 0.1 m/s each second."""
+LEVEL_FELT_S = 6.0  # an attitude error of before is not the present one
 STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
-UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther before an order is answered
+UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther
 CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
 TOUCH_PART, TOUCH_S, TOUCH_BELOW_M = 0.5, 0.25, 0.7
-"""A blow from below so near the floor is the floor: half of the hover thrust proves it, since in
-the air the vehicle falls with it."""
+"""A blow from below so near the floor is the floor."""
 LEVEL_SPARE_S, UNHEARD_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.8, 0.35
 AT_REST_S = 0.3
 
@@ -218,11 +208,8 @@ def is_driven(c: Context) -> bool:
 
 
 def rest_finding(c: Context) -> Finding:
-    """Where the vehicle is, once its motors are off.
-
-    What was within the magnet's reach and has not fallen since hangs, unless a silence of the
-    telemetry could hide a fall. Else a position decides, or the picture of a target far above.
-    """
+    """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
+    above, or by the falls that were felt since it came into the magnet's reach."""
     tel, state = c.telemetry, c.state
     if _is_held_elsewhere(c):
         return Finding.HELD
@@ -238,8 +225,7 @@ def rest_finding(c: Context) -> Finding:
 
 
 def _is_held_elsewhere(c: Context) -> bool:
-    """True if it is up, and not on the target's magnet: held as the landing began and not fallen
-    since, or below the target by a position."""
+    """True if it is up, and not on the target's magnet."""
     state = c.state
     if state.phase is not Phase.LANDING:
         return False
@@ -254,7 +240,7 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 def _by_fall(c: Context, since_s: float | None) -> Finding:
     """Where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the falls
-    that the accelerometer felt since, and the silences that could hide one."""
+    since, and the silences that could hide one."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
     unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt
@@ -265,8 +251,7 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
 
 
 def hangs_where_it_did(c: Context) -> bool:
-    """True if it is at its contact by a position, or has hung all the time by the accelerometer.
-    A silence as long as a fall leaves it unknown."""
+    """True if it is at its contact by a position, or has hung all the time by the accelerometer."""
     contact_z_m, tel = c.state.contact_z_m, c.telemetry
     if not c.by_sight and c.placed and contact_z_m is not None:
         # A slip ends the contact at once, and the estimate of what hangs drifts less.
@@ -288,8 +273,7 @@ def hangs_stopped(c: Context) -> bool:
 
 
 def observe(c: Context) -> Context:
-    """The tick with what is remembered of its observation. Hangs of the loop, jumps of the estimate
-    and lost positions are noticed here, for all who fly a way down."""
+    """The tick with what is remembered of its observation, for all who fly a way down."""
     state, obs = c.state, c.obs
     if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
         # After a hang of the loop everything from before is stale; dwell times begin anew.
@@ -326,8 +310,7 @@ def note_order(state: PlannerState, command: Command) -> PlannerState:
 
 
 def _answered(c: Context) -> Context:
-    """The tick with the time since which the thrust that is read differs from the order: a reading
-    that stands still under a changed order leaves the thrust unknown."""
+    """The tick with the time since which the thrust that is read differs from the order."""
     order = c.state.raw_order
     if order is None:
         return c
@@ -339,8 +322,7 @@ def _answered(c: Context) -> Context:
 
 
 def lose_position(c: Context) -> Context:
-    """The tick once accelerometer and attitude are all that is left, for good: each change of the
-    mode costs height, so no sight is believed again on this way down."""
+    """The tick once accelerometer and attitude are all that is left, for good."""
     hover = _hover_thrust(c.state, c.obs)
     return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
 
@@ -465,9 +447,7 @@ def _moved(place: Vector, by_m: Vector) -> Vector:
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """The hover thrust as learned; else the present thrust for each g that is measured, since in a
-    climb, or sinking, the thrust differs from the weight. Nothing hovers on the least of position
-    mode."""
+    """The hover thrust as learned; else the present thrust for each g that is measured."""
     tel = obs.telemetry
     measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
     return state.hover_thrust or obs.imu.hover_thrust or measured
@@ -521,8 +501,7 @@ def _descend(c: Context) -> Acted:
 
 
 def _falls_free(c: Context) -> bool:
-    """True if it has come off the magnet: released or stopped up there, or peeled with too little
-    thrust left to go down slowly."""
+    """True if it has come off the magnet with too little thrust left to go down slowly."""
     if not c.imu_proves:
         return False
     if not is_driven(c):
@@ -568,8 +547,7 @@ def _caught_again(c: Context) -> Acted:
 
 
 def _catch(c: Context) -> Acted | None:
-    """A catch by position; None without a heading, or astray, where position control would lead
-    away and the raw thrust of the level descent brakes the fall."""
+    """A catch by position; None without a heading, or astray."""
     return None if c.state.heading_lost or c.state.astray else catch(c)
 
 
@@ -594,9 +572,8 @@ def _by_setpoints(c: Context) -> Acted:
 def own_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
     """The order for the vehicle's own landing from `z_m`, a quintic from rest to rest.
 
-    It aims below the ground, and the lower the longer the estimate has had to drift: at the
-    trajectory's end the motors stop, and over a lower floor they would drop it. It never aims above
-    the vehicle, whose estimate may be far below the ground by now.
+    It aims below the ground, and the lower the longer the estimate has had to drift, and never
+    above the vehicle: at the trajectory's end the motors stop.
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
@@ -624,10 +601,8 @@ def _own_landing(c: Context) -> Acted:
 
 
 def _level(c: Context) -> Acted:
-    """Sink level by raw thrust, on the vertical speed of the accelerometer and, where it is
-    believed, the estimate; tilted against the sideways speed. What does not sink gets less and less
-    thrust: it begins to sink, the ceiling lets go or proves that it holds, and the floor proves
-    itself."""
+    """Sink level by raw thrust on the vertical speed, tilted against the sideways speed. What does
+    not sink gets less and less thrust: it sinks, the magnet lets go, or the floor proves itself."""
     state, tel = c.state, c.telemetry
     dt_s = max(0.0, min(0.1, c.t_s - state.t_s))
     age_s = max(1e-3, dt_s, c.attitude_age_s)
@@ -687,8 +662,8 @@ def _level(c: Context) -> Acted:
 
 
 def is_spent(c: Context) -> bool:
-    """True if a way down is over: a level one has come to its least thrust, on which nothing flies
-    for long, or the setpoint to the floor. Without a stop the firmware would lock it 2 s later."""
+    """True if a way down is over: a level one has come to its least thrust, or the setpoint to the
+    floor. Without a stop the firmware would lock the vehicle."""
     setpoint, ground_m = c.state.setpoint, c.state.ground_m
     if setpoint is not None and ground_m is not None:
         landing = c.planner.landing
@@ -713,8 +688,7 @@ def left_level(c: Context) -> Context:
 
 
 def _learned_hover(c: Context, dt_s: float) -> float:
-    """The hover thrust, drawn to the thrust for each g in free flight: what was learned in a climb,
-    or not at all, is several per cent off."""
+    """The hover thrust, drawn to the thrust for each g in free flight."""
     state, tel = c.state, c.telemetry
     first = state.level_hover or state.hover_thrust
     within = state.level_within
@@ -729,8 +703,7 @@ def _learned_hover(c: Context, dt_s: float) -> float:
 
 
 def _is_overdue(c: Context) -> bool:
-    """True if it was blind for so long that it has come down, or hangs, or its reckoned speed has
-    drifted away."""
+    """True if it was blind for so long that it has come down, or hangs."""
     if c.state.blind_s is None and not c.state.astray:
         return False
     way_m = max(0.0, c.state.entry_m[2] - c.state.ground_z_m)

@@ -1,10 +1,8 @@
 """Checks that the camera is mounted as the profile says: the target stands still in the world.
 
-Where `camera.mount` is turned by an angle a about the vehicle's upward axis, the target is
-placed T = p + M (t - p), with the true target t, M the turn by -a, and p the place where that
-axis meets the target's plane: it moves with the vehicle and with each of its tilts, by
-(1 - M) of the motion of p. In the plane a turn is a complex number of length 1, so one least
-squares over a decimetre of that motion gives s = 1 - M (docs/mission.md, "The mounting").
+Where `camera.mount` is turned about the vehicle's upward axis, the target moves by (1 - M) of the
+motion of the place where that axis meets the target's plane, M being the turn as a complex number:
+one least squares over a decimetre gives it (docs/mission.md, "The mounting").
 """
 
 from __future__ import annotations
@@ -17,22 +15,19 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-WINDOW_S = 3.0  # older sights are left out: a drifting estimate moves vehicle and target together
+WINDOW_S = 3.0  # older sights are left out: the estimate drifts
 LEAST_SIGHTS = 10
 JUDGED_M, PROVEN_M = 0.12, 0.3
-"""Motion of the vehicle's upward axis at the target's height from which on the mounting is judged,
-and beyond which a target that has stood still ends the watch."""
+"""Motion of the axis from which on the mounting is judged, and beyond which it is proven."""
 STANDS_STILL, MOVES_ALONG = 0.35, 0.6
-"""Share of the vehicle's motion: below the first the target stands still, above the second it moves
-along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
+"""Of the vehicle's motion. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
 LEAST_SPREAD_M = 0.05
-MOST_UNEXPLAINED = 0.45  # of the target's spread: more, and no turn explains its motion
-LEAST_TURN = 0.5  # length of M; about 0 is a world that drifts under both, and no turn
-LEAST_TURN_RAD = math.radians(65.0)  # a lesser turn leads to the target all the same, in a bow
+MOST_UNEXPLAINED = 0.45  # of the target's spread
+LEAST_TURN = 0.5  # length of M; about 0 is a world that drifts
+LEAST_TURN_RAD = math.radians(65.0)  # a lesser one leads to the target in a bow
 SIGHTS_IN_A_ROW = 4
 JUMPS, SETTLES_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
-"""Metres, seconds: a target that moves so much farther than twice the vehicle so quickly has
-been moved, or is another one; then sights count again after `SETTLES_S`."""
+"""Metres, seconds: a target that moves so much farther than twice the vehicle has been moved."""
 ESTIMATE_JUMP_M, FASTEST_MPS = 0.05, 1.5  # farther between two sights is a new world
 _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 

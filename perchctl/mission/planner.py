@@ -1,8 +1,7 @@
 """The perching planner: `step_mission(state, observation, profile) -> (state, command)`.
 
-Pure: no clock, no input but its arguments, so a log replays to the same commands
-(`perchctl.analysis.decide`, and `tests/replay/test_corpus.py` demands it). One tick: remember what
-was observed, look up the table, act for the phase.
+Pure: no clock, no input but its arguments, so a log replays to the same commands. One tick:
+remember what was observed, look up the table, act for the phase.
 
 Before each command ask: what if it is the last packet? A position setpoint left alone levels out
 after 0.5 s and is cut after 2 s (docs/firmware.md, "When setpoints stop").
@@ -69,9 +68,9 @@ from perchctl.values import replace
 from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
 
 HOVER_WITHIN = 0.2
-CARRIED_RATIO = 0.85  # of the hover thrust: what still has so much sinks slowly by itself
-AWAY_M = 0.05  # below the contact by so much, or by half of the descent, it has left the ceiling
-BLOCKED_ROOM_M = 0.1  # how far a search keeps from what it was once pressed against
+CARRIED_RATIO = 0.85  # of the hover thrust: with so much it sinks slowly
+AWAY_M = 0.05  # below the contact, or half of the descent: it has left
+BLOCKED_ROOM_M = 0.1  # a search keeps away from what blocked it
 WARY_M = 0.2  # sideways, while nothing confirms the camera's mounting
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
@@ -175,8 +174,7 @@ def _enter(c: Context, row: Transition) -> Context:
 
 
 def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
-    """The flight's outcome. What is found hanging on its way down keeps the outcome of what led to
-    the landing: nobody has seen whether it hangs on the target."""
+    """The flight's outcome. What is found hanging on its way down keeps that of the landing."""
     if state.phase is Phase.LANDING and row.outcome is Outcome.PERCHED and state.outcome:
         return state.outcome
     if row.name == "hung" and state.outcome is Outcome.TARGET_NOT_FOUND:
@@ -226,8 +224,7 @@ def _started_phase(new: Context, c: Context) -> Context:
 
 
 def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
-    """How far aside of the target the gear touched something at the target's height, for what
-    backs off from there; None if nothing was touched."""
+    """How far aside of the target the gear touched something; None if nothing was touched."""
     if row == "not-released":  # the contact was proven, and nothing has come off
         return old.contact
     if old.phase is Phase.RECOVER:  # pressed again before it had left
@@ -273,8 +270,7 @@ def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
 
 
 def _approach(c: Context) -> Acted:
-    """Rise from the ground on position setpoints: if they stop at any moment, the firmware levels
-    out and cuts, and the vehicle never hovers on its own."""
+    """Rise from the ground on position setpoints, without which the firmware levels out."""
     planner, state = c.planner, c.state
     assert state.ground_m is not None
     x, y, z = state.ground_m
@@ -288,8 +284,7 @@ def _approach(c: Context) -> Acted:
 
 def _search(c: Context) -> Acted:
     """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
-    before is looked for from under it; while nothing confirms the camera's mounting, only a little
-    nearer than where it was seen last."""
+    before is looked for from under it."""
     search, state, ground_m = c.planner.search, c.state, c.state.ground_m
     assert ground_m is not None
     if c.t_s - state.search_step_s > search.wait_s:
@@ -354,8 +349,7 @@ def _complete(c: Context) -> Acted:
 
 
 def _recover(c: Context) -> Acted:
-    """Hold in the air `descend_m` below where the attempt ended, in position mode all along, so
-    that no controller is reset."""
+    """Hold in the air `descend_m` below where the attempt ended, in position mode all along."""
     if (caught := catch(c)) is not None:
         return caught
     recover = c.planner.recover
@@ -380,8 +374,7 @@ def _recover(c: Context) -> Acted:
 
 
 def _aborted(c: Context) -> Acted:
-    """The motor stop, once, as the transition wants it. What hangs with its motors still would be
-    locked 2 s after the stream's end: it gets the pair that prevents that."""
+    """The motor stop, once; what hangs with its motors still would be locked without one."""
     if c.state.orders:
         return c.state, Idle()
     ends = StopMotors() if is_still(c) or lander.is_spent(c) else Idle()

@@ -73,14 +73,12 @@ BEFORE_COMPLETION = BY_CAMERA | {P.PERCH}
 KNOCKED_S = 0.04  # more than one sample of telemetry
 LIFTED_M, SIDEWAYS_M = 0.05, 0.12
 LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
-"""While only a climb was ordered, a vehicle stays within a few centimetres (7 in simulated
-flights); later a setpoint is walked ahead of it, and a gust may carry it half a metre."""
 ABOVE_START_M = 0.1
 OTHERWISE_S, BELOW_S, WEAK_S, UNSTOPPED_S = 0.1, 0.3, 2.0, 10.0
-SWINGS_MPS = 0.5  # what hovers or walks up sinks so fast only if position control swings it
+SWINGS_MPS = 0.5  # only swings of position control sink so fast
 BLIND_PRESS_S = 1.25
-HELD_S = 2.0  # by then a hold at the magnet has been told from any other
-BLIND_VARIANCE_M2 = 0.02  # about 3 s after the last sight (docs/firmware.md, "Target as position")
+HELD_S = 2.0  # by then the magnet has been told from others
+BLIND_VARIANCE_M2 = 0.02  # about 3 s after the last sight
 UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 
 
@@ -89,12 +87,8 @@ UNCORRECTED = "the estimate's variance only grows; is the positioning system gon
 
 def is_astray(c: Context) -> bool:
     """True if position control leads away from its setpoint, by external positions in other axes
-    than the vehicle's, which a vehicle at rest does not show (fault 11).
-
-    That is a step sideways at take-off, where only a climb was ordered; later a way farther than
-    any draught carries it; in a landing that began for another reason, too, which would speed up
-    until it tilts over. A motion capture that is late swings what is walked, until it sinks fast.
-    """
+    than the vehicle's, which a vehicle at rest does not show (fault 11): farther than any draught
+    carries it, or in swings."""
     setpoint, phase = c.state.setpoint, c.state.phase
     if c.profile.positioning.by == "deck" or not c.placed:
         return False
@@ -146,8 +140,7 @@ def why_astray(c: Context) -> str:
 
 
 def is_lost(c: Context) -> bool:
-    """True if no position has come for so long that none is waited for any more; by the target
-    alone, by the estimate's own variance, too."""
+    """True if no position has come for so long that none is waited for any more."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
@@ -215,8 +208,7 @@ def why_not_found(c: Context) -> str:
 
 
 def is_caught(c: Context) -> bool:
-    """True if the target's magnet holds it already: it hangs at the target, or where it met the
-    target's height, within the magnet's radius as far as its place there was known."""
+    """True if the target's magnet holds it already."""
     if c.held(C.HANGING) < HANGING_S:
         return False
     touched, radius_m = touched_error(c), c.planner.perch.contact_xy_m
@@ -225,8 +217,7 @@ def is_caught(c: Context) -> bool:
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """True if something else than the target's magnet holds it: at another height than the
-    target's, or surely beside the magnet (two standard deviations)."""
+    """True if something else than the target's magnet holds it: at another height, or beside."""
     touched = touched_error(c)
     error = touched or contact_error(c)
     at_its_height = touched is not None or abs(c.error_z_m) <= contact_within_m(c)
@@ -240,15 +231,13 @@ def is_blocked(c: Context) -> bool:
 
 
 def is_blocked_off_target(c: Context) -> bool:
-    """True if it is blocked, and in the press so far from the target's height that no contact can
-    be proven."""
+    """True if it is blocked, and in the press too far from the target to prove a contact."""
     pressing = c.state.phase is P.PERCH
     return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_within_m(c))
 
 
 def too_weak(c: Context) -> bool:
-    """True if no thrust is left to press with: seen at full thrust, or known before the press. A
-    press that it backs off from explains full thrust."""
+    """True if no thrust is left to press with: seen at full thrust, or known before the press."""
     if c.state.pressed:
         return False
     if c.held(C.SATURATED) >= WEAK_S:
