@@ -118,7 +118,6 @@ def _summed(
 ) -> tuple[float, float, float, float, float]:
     """`EnergyState.fit` with one more reading, as deviations from the usual values."""
     assert state.ground_v is not None
-    # A battery larger than assumed goes on where the count has come to the curve's steep end.
     begun = charge_at(state.ground_v)
     counted = max(min(begun, COUNTED_SHARE), begun - state.used)
     spent_v = resting_v(begun) - resting_v(counted)

@@ -108,7 +108,7 @@ def contact_within_m(c: Context) -> float:
 
 
 def is_at_target(c: Context) -> bool:
-    """True if the gear is surely at the target's height and within the magnet's radius."""
+    """True if the gear is surely in the magnet's reach."""
     near = contact_error(c).is_within(c.planner.perch.contact_xy_m)
     return near and abs(c.error_z_m) <= contact_within_m(c)
 
@@ -231,13 +231,13 @@ def _carried(c: Context) -> bool:
 
 
 def _saturated(c: Context) -> bool:
-    """True at full thrust on which the vehicle does not rise (nor is it just being caught)."""
+    """True at full thrust on which the vehicle does not rise."""
     full = c.telemetry.thrust >= SATURATED * FULL_THRUST
     return full and -0.15 < c.climb_mps < 0.05
 
 
 def _battery_is_low(c: Context) -> bool:
-    """True if the firmware reports low power, or the voltage is low and was measured at all."""
+    """True if the firmware reports low power, or a measured voltage is low."""
     tel = c.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
     low = known and tel.battery_v < c.safety.min_load_v
@@ -262,15 +262,13 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.NEAR_STANDOFF: lambda c: c.tracked and c.is_near_standoff,
     Condition.SETTLED: _settled,
     Condition.CONTACT: _contact,
-    Condition.MAGNET_HOLDS: lambda c: (  # it stays up on a thrust that could not carry it
+    Condition.MAGNET_HOLDS: lambda c: (
         _is_carried(c) and not _magnet_slips(c) and (c.placed or _still(c))
     ),
     Condition.SLIPPING: _magnet_slips,
     Condition.HANGING: _hanging,
     Condition.STEADY: lambda c: c.speed_mps <= c.planner.recover.steady_mps,
-    Condition.TILTED: lambda c: (  # by a fresh attitude, however old the position is
-        c.imu_proves and c.tilt_rad > math.radians(c.safety.max_tilt_deg)
-    ),
+    Condition.TILTED: lambda c: c.imu_proves and c.tilt_rad > math.radians(c.safety.max_tilt_deg),
     Condition.DOWN: _down,
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
@@ -295,7 +293,7 @@ PROOFS = BY_PLACE | {C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.CARRIED, C.SATURA
 
 
 def conditions_since(c: Context) -> dict[Condition, float]:
-    """`PlannerState.since` of this tick, without the conditions that are void in it."""
+    """`PlannerState.since` of this tick, without what is void in it."""
     old, now_s, void = c.state.since, c.t_s, _void(c)
     return {
         name: old.get(name, now_s)
@@ -305,12 +303,12 @@ def conditions_since(c: Context) -> dict[Condition, float]:
 
 
 def lasting_conditions(since: dict[Condition, float]) -> dict[Condition, float]:
-    """The entries of `PlannerState.since` that last when the phase changes, or while held."""
+    """The entries that last when the phase changes, or while held."""
     return {name: s for name, s in since.items() if name in LASTING}
 
 
 def _void(c: Context) -> frozenset[Condition]:
-    """The conditions that do not count in this tick, since what they rest on is not fresh."""
+    """The conditions that rest on what is not fresh in this tick."""
     void: frozenset[Condition] = frozenset()
     if not c.imu_proves:
         void = PROOFS

@@ -120,7 +120,7 @@ def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> 
 
 
 def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Position and velocity feedback on top of the onboard loop, near the target only."""
+    """Feedback on top of the onboard loop, near the target only."""
     near = (STIFF_BELOW_M - c.error_z_m) / STIFF_RANGE_M
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
@@ -205,7 +205,6 @@ def lower_thrust(c: Context) -> Acted:
     if perch.mode == "raw":
         if not c.imu_proves:
             return hold_by_position(c)
-        # The lowest step stays below what could carry the vehicle, above the idle cut.
         lowest = 0.9 * complete.hold_ratio * state.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
@@ -244,7 +243,7 @@ def hold_by_position(c: Context) -> Acted:
     """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught."""
     state, tel = c.state, c.telemetry
     x, y, z_m = tel.position_m
-    if state.contact_z_m is not None and c.placed:  # else the estimate has slid away from it
+    if state.contact_z_m is not None and c.placed:
         z_m = state.contact_z_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)

@@ -61,7 +61,7 @@ class Corrections:
 
     variance_m2ps2: float | None = None  # the newest
     changed_s: float = -math.inf  # when that came
-    none_since_s: float = math.inf  # since when it has grown without a break as uncorrected
+    none_since_s: float = math.inf  # since when it only grows
 
     def age_s(self, now_s: float) -> float:
         """Age of the last correction, if it is certain that none comes any more; else 0."""
@@ -69,7 +69,7 @@ class Corrections:
         return now_s - self.none_since_s if certain else 0.0
 
     def updated(self, sample: Telemetry) -> Corrections:
-        """The corrections with one more sample. An unchanged variance means that no packet came."""
+        """The corrections with one more sample."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -85,10 +85,10 @@ class ImuMotion:
     `-inf` for what never happened."""
 
     t_s: float = -math.inf  # of the newest sample
-    velocity_mps: Vector = ZERO  # integral since the first sample, world axes; it drifts
+    velocity_mps: Vector = ZERO  # since the first sample, world axes
     offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
     fell_s: float = -math.inf  # when it last fell, or came down and met the floor
-    silent_s: float = -math.inf  # end of the newest silence, or of a frozen accelerometer
+    silent_s: float = -math.inf  # end of the newest silence
     gap_s: float = -math.inf  # of the newest that may hide a fall
     started_s: float = -math.inf  # first heard again after it had started anew
     sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
@@ -104,7 +104,7 @@ class ImuMotion:
     frozen_s: float = 0.0  # for how long the accelerometer has read the very same
     attitude_frozen_s: float = -math.inf  # the same of the attitude; -inf before a change
     place_frozen_s: float = -math.inf  # the same of position and velocity
-    hover_thrust: float = 0.0  # thrust for each measured g in flight, 0..65535; 0 before it
+    hover_thrust: float = 0.0  # for each measured g in flight
     aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes
     pushed_s: float = -math.inf  # when something last pushed it sideways
     misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
@@ -255,7 +255,7 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
 def _misled(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The angles by which corrections have turned roll and pitch, and the vehicle's own rates."""
+    """How far corrections have turned roll and pitch, and the own rates."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S
@@ -283,7 +283,7 @@ def _frozen_s(
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    """The hover thrust with one more sample, which counts if it neither rests nor presses."""
+    """The hover thrust with one more sample of free flight."""
     flies = sample.has(FLYING) and sample.thrust < SATURATED * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
@@ -314,7 +314,7 @@ class Reckoning:
     aside_m: tuple[float, float] = (0.0, 0.0)  # from the gear to the target's axis
     aside_sigma_m: float = math.inf  # standard deviation of that; inf if unknown
     sight_s: float = -math.inf  # exposure of the sight that it is carried on from
-    stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate beyond its speed since
+    stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate since
     stepped_s: float = -math.inf  # the newest of them
 
 
@@ -330,11 +330,9 @@ def advance_reckoning(
         if astray:
             vx, vy, vz = old.velocity_mps
             if old.imu is not None and imu.silent_s <= old.imu.t_s:
-                # Only the attitude stands still.
                 vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
             velocity_mps = (vx, vy, vz)
         elif not believed and old.imu is not None:
-            # No position corrects the estimate in a silence: its change was measured on board.
             vx, vy, vz = (
                 v + e - o
                 for v, e, o in zip(old.velocity_mps, estimated, old.estimated_mps, strict=True)
@@ -401,7 +399,7 @@ def advance_reckoning(
 
 
 def discount_wrong_positions(old: Reckoning) -> Reckoning:
-    """The reckoning once the positions are found to be wrong: they have turned the attitude."""
+    """The reckoning once wrong positions have turned the attitude."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
@@ -425,7 +423,7 @@ def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
 
 
 def _position_s(sample: Telemetry) -> float:
-    """Time of the position, whose older packet is carried on by at most `CARRIED_S`."""
+    """Time of the position, carried on by at most `CARRIED_S`."""
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 

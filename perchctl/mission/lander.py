@@ -139,7 +139,7 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
     tel, stopped_s = c.telemetry, old.stopped_s
     heard = c.t_s - tel.t_s <= c.safety.proof_age_s
     ordered = heard and tel.has(HL_ACTIVE) and not c.by_sight
-    if ordered and not c.state.astray:  # else it would follow the wrong positions to its end
+    if ordered and not c.state.astray:
         c = c.evolve(orders=LEAST_ORDERS, ordered_s=c.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
         # The motors were stopped, or never turned: nothing spins them up again.
@@ -254,7 +254,6 @@ def hangs_where_it_did(c: Context) -> bool:
     """True if it is at its contact by a position, or has hung all the time by the accelerometer."""
     contact_z_m, tel = c.state.contact_z_m, c.telemetry
     if not c.by_sight and c.placed and contact_z_m is not None:
-        # A slip ends the contact at once, and the estimate of what hangs drifts less.
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
             return True
@@ -276,7 +275,6 @@ def observe(c: Context) -> Context:
     """The tick with what is remembered of its observation, for all who fly a way down."""
     state, obs = c.state, c.obs
     if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
-        # After a hang of the loop everything from before is stale; dwell times begin anew.
         kept = lasting_conditions(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
         if Condition.DOWN in state.since and math.isfinite(off_s):
@@ -301,7 +299,7 @@ def observe(c: Context) -> Context:
 
 
 def note_order(state: PlannerState, command: Command) -> PlannerState:
-    """The state with the commanded raw thrust, which the telemetry's thrust has to follow."""
+    """The state with the commanded raw thrust."""
     if isinstance(command, RawThrust):
         return replace(state, raw_order=command.thrust)
     if isinstance(command, Idle):
@@ -310,7 +308,7 @@ def note_order(state: PlannerState, command: Command) -> PlannerState:
 
 
 def _answered(c: Context) -> Context:
-    """The tick with the time since which the thrust that is read differs from the order."""
+    """The tick with since when the thrust differs from the order."""
     order = c.state.raw_order
     if order is None:
         return c
@@ -328,7 +326,7 @@ def lose_position(c: Context) -> Context:
 
 
 def _reckon(c: Context) -> PlannerState:
-    """The state with its dead reckoning one tick later, and whether the magnet is within reach."""
+    """The state with its dead reckoning one tick later."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     # By the target no sight is sent on the way down: the estimate's change is its own.
@@ -363,14 +361,13 @@ def _reckon(c: Context) -> PlannerState:
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
-            # An estimate without a position since then was moved when that came back.
             if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
             new = add_sight(new, target.measured_s, aside_m, float(ez), sigma_m)
             if seen and target.measured_s > new.stepped_s:
                 new = replace(new, stepped_m=(0.0, 0.0))
     held_s = c.held(Condition.CARRIED)
-    flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
+    flies = state.phase is not Phase.LANDING
     near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
     if near and held_s >= c.planner.perch.contact_dwell_s:
         # It is at the target; late pictures show it lower.
@@ -395,7 +392,6 @@ def _reckon(c: Context) -> PlannerState:
         last, tel = state.last, obs.telemetry
         heard_again = obs.imu.silent_s > state.reckoning.imu.t_s and c.proves and not obs.jumped
         if heard_again and last is not None and tel.start == last.start:
-            # No position corrected the estimate in the silence: its change was measured on board.
             down_m = tel.position_m[2] - last.position_m[2]
     return replace(
         state, reckoning=new, reach_s=reach_s, blind_height_m=state.blind_height_m + down_m
@@ -419,7 +415,6 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
         moved_m = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
-        # Its own landing goes on along a line in the old world: it dives, or climbs.
         state = replace(
             state,
             entered_s=obs.t_s,
@@ -447,7 +442,7 @@ def _moved(place: Vector, by_m: Vector) -> Vector:
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """The hover thrust as learned; else the present thrust for each g that is measured."""
+    """The hover thrust as learned, or as measured now."""
     tel = obs.telemetry
     measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
     return state.hover_thrust or obs.imu.hover_thrust or measured
@@ -501,7 +496,7 @@ def _descend(c: Context) -> Acted:
 
 
 def _falls_free(c: Context) -> bool:
-    """True if it has come off the magnet with too little thrust left to go down slowly."""
+    """True if it has come off the magnet, and falls."""
     if not c.imu_proves:
         return False
     if not is_driven(c):
@@ -522,7 +517,7 @@ def _stands(c: Context) -> bool:
 
 
 def _caught_again(c: Context) -> Acted:
-    """The landing, begun anew below: the vehicle is free of the magnet, and falls."""
+    """The landing, begun anew below, with a catch."""
     tel = c.telemetry
     state = replace(
         c.state,
@@ -561,8 +556,6 @@ def _by_setpoints(c: Context) -> Acted:
     x, y, _ = state.entry_m
     goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
     setpoint = walk(c.evolve(setpoint=start), goal, down_mps=landing.speed_mps)
-    # The setpoint does not run away from a vehicle that does not follow, beyond what takes the
-    # thrust down to its least.
     if c.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
@@ -586,7 +579,6 @@ def _own_landing(c: Context) -> Acted:
     state, away = leave_press(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
         return state, away
-    # Ordered often enough, a short fall near the floor, or at an unknown height, is its end.
     ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
@@ -609,8 +601,7 @@ def _level(c: Context) -> Acted:
     unheard = age_s > LATEST_S
     unlearned = state.level_thrust == 0.0 and state.level_within == UNLEARNED_WITHIN
     if unheard and unlearned and c.in_phase_s < OWN_ESTIMATE_S:
-        return _by_setpoints(c)  # the vehicle's own estimate is nearer than an unknown thrust
-    # Without telemetry since before, it was held by setpoints until now: it hardly moves.
+        return _by_setpoints(c)
     held = tel.t_s < state.entered_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else c.climb_mps) + state.under_way_mps
     hover = _learned_hover(c, dt_s)
@@ -712,7 +703,7 @@ def _is_overdue(c: Context) -> bool:
     heard = c.attitude_age_s <= LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
     if not heard and c.state.level_within == UNLEARNED_WITHIN:
-        spare_s += OWN_ESTIMATE_S  # in which its own estimate has flown it on the spot
+        spare_s += OWN_ESTIMATE_S
     return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
 

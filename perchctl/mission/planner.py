@@ -96,7 +96,7 @@ def _remember(c: Context) -> Context:
     c = lander.observe(c.with_state(_with_target(c.state, c.obs)))
     hold, since, hover = hold_reason(c), conditions_since(c), c.state.hover_thrust
     if hold:
-        since = lasting_conditions(since)  # a held vehicle proves nothing: dwell times begin anew
+        since = lasting_conditions(since)  # a held vehicle proves nothing
     # Near the target an ascent may press against a ceiling that is lower than thought.
     away = c.state.phase is not Phase.ASCEND or c.error_z_m > c.planner.ascend.near_m
     if away and c.state.phase in _LEARNING and hovers(c):
@@ -174,7 +174,7 @@ def _enter(c: Context, row: Transition) -> Context:
 
 
 def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
-    """The flight's outcome. What is found hanging on its way down keeps that of the landing."""
+    """The outcome; what hangs on its way down keeps the landing's."""
     if state.phase is Phase.LANDING and row.outcome is Outcome.PERCHED and state.outcome:
         return state.outcome
     if row.name == "hung" and state.outcome is Outcome.TARGET_NOT_FOUND:
@@ -224,7 +224,7 @@ def _started_phase(new: Context, c: Context) -> Context:
 
 
 def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
-    """How far aside of the target the gear touched something; None if nothing was touched."""
+    """Where the gear touched something; None if nothing was touched."""
     if row == "not-released":  # the contact was proven, and nothing has come off
         return old.contact
     if old.phase is Phase.RECOVER:  # pressed again before it had left
