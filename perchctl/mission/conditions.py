@@ -179,7 +179,6 @@ def _hanging(c: Context) -> bool:
         and abs(tel.position_m[2] - c.state.contact_z_m) <= complete.slip_m
     )
     at_target = c.obs.target is not None and abs(c.error_z_m) <= 0.15
-    # A landing that does not come down is held, wherever the target was thought to be.
     stayed = c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M and not c.far_below_target
     return held and (at_contact or at_target or stayed)
 

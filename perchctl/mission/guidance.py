@@ -209,7 +209,6 @@ def lower_thrust(c: Context) -> Acted:
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
     assert state.contact_z_m is not None
-    # Without a position the estimate slides, and the vehicle does not: the setpoint goes with it.
     slid_m = 0.0 if c.placed else c.telemetry.position_m[2] - state.contact_z_m
     top = state.entry_m[2] + perch.press_m + slid_m
     low = state.contact_z_m - complete.release_drop_m + slid_m

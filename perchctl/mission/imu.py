@@ -166,7 +166,6 @@ class ImuMotion:
         steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
         if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
             steady_aside_s = new.t_s
-        # The mean sideways force with one more sample.
         keeps = math.exp(-dt_s / PUSH_MEMORY_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
         mean_x_g, mean_y_g = motion.aside_g

@@ -150,8 +150,6 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
         # it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
     hover = _hover_thrust(old, c.obs)
-    # While the loop was silent the watchdog may have brought it down or to the magnet: what was
-    # measured meanwhile counts from the tick before.
     within = contact_z_m is not None or c.state.reckoning.below_m < REACH_M
     blind = _has_lost_its_position(c)
     c = c.evolve(
@@ -329,7 +327,6 @@ def _reckon(c: Context) -> PlannerState:
     """The state with its dead reckoning one tick later."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
-    # By the target no sight is sent on the way down: the estimate's change is its own.
     astray = state.astray and not c.by_sight
     new = advance_reckoning(
         state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray
@@ -338,8 +335,6 @@ def _reckon(c: Context) -> PlannerState:
         new = add_step(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
-        # Pressed or hanging it stands still, whatever speed the impact left to the estimate. On
-        # its way to the target a gust moves it, and a blow knocks it off the magnet.
         blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
         x_mps, y_mps, _ = new.velocity_mps
         new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
@@ -485,12 +480,10 @@ def _descend(c: Context) -> Acted:
         c = c.with_state(state)
     low = c.height_m <= landing.handover_m
     if in_reach:
-        # Without fresh telemetry nobody can watch what the weight does.
         gives_up = c.in_phase_s > PEEL_S and (c.imu_proves or not doubtful)
         return release_by_thrust(c) if gives_up else _by_setpoints(c)
     if c.by_sight:
         return _level(c) if c.state.level_thrust or low else _by_setpoints(c)
-    # When the landing's time is over nothing is sent: by then it must be landing by itself.
     overdue = c.in_phase_s > landing.overdue_s
     return _own_landing(c) if doubtful or overdue or low else _by_setpoints(c)
 
@@ -510,7 +503,6 @@ def _stands(c: Context) -> bool:
     """True if it is on the floor, by proof."""
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return True
-    # Where height is measured, it stops as soon as it sinks no more, instead of sliding.
     level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
     low = c.height_m < STOP_BELOW_M and not is_in_reach(c)
     return level and low and c.climb_mps > -RESTS_MPS
@@ -551,7 +543,6 @@ def _by_setpoints(c: Context) -> Acted:
     landing, state = c.planner.landing, c.state
     here = hold_here(c)
     start = state.setpoint if state.caught and state.setpoint is not None else here
-    # A setpoint far above (the press, a search step) is not walked down slowly.
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
     goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
@@ -622,9 +613,7 @@ def _level(c: Context) -> Acted:
     # In the air the accelerometer reads what the thrust gives, on the floor one g.
     if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover):
         touch_s = None  # it falls with its thrust: that was no floor
-    # With less thrust than that it reads one g only if something carries it.
     carried = c.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover
-    # In the air it falls with its thrust, however long it takes.
     overdue = _is_overdue(c) and not (c.imu_proves and tel.acc_z_g < AIRBORNE_G)
     before = state.level_thrust or hover
     if touched_s < TOUCH_S:
@@ -698,7 +687,6 @@ def _is_overdue(c: Context) -> bool:
     if c.state.blind_s is None and not c.state.astray:
         return False
     way_m = max(0.0, c.state.entry_m[2] - c.state.ground_z_m)
-    # After a slip off the magnet the time begins anew.
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
     heard = c.attitude_age_s <= LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S

@@ -97,7 +97,6 @@ def _remember(c: Context) -> Context:
     hold, since, hover = hold_reason(c), conditions_since(c), c.state.hover_thrust
     if hold:
         since = lasting_conditions(since)  # a held vehicle proves nothing
-    # Near the target an ascent may press against a ceiling that is lower than thought.
     away = c.state.phase is not Phase.ASCEND or c.error_z_m > c.planner.ascend.near_m
     if away and c.state.phase in _LEARNING and hovers(c):
         hover = _learned_hover_thrust(c.state, c.obs)
@@ -324,7 +323,6 @@ def _ascend(c: Context) -> Acted:
     may_climb = c.fresh and c.error_xy_m < 0.7 * c.cone_m
     lag = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if c.error_z_m < ascend.near_m else ascend.speed_mps
-    # Slower towards the stand-off; the setpoint does not run away from a vehicle short of thrust.
     speed = min(speed, max(0.02, goal_z - setpoint.z_m))
     return _under_target(c, goal_z, up_mps=speed if may_climb and lag < 0.15 else 0.0)
 

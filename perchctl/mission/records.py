@@ -71,7 +71,6 @@ class Event:
             held = EventKind.HOLD, state.hold, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
-            # The pilot reads it also where the vehicle is not held for it.
             text = unplaced_text(Context(state, obs, profile))
             events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))
         return events

@@ -298,7 +298,6 @@ def is_off_as(finding: Finding) -> Predicate:
 def hold_reason(c: Context) -> str:
     """Why the vehicle must stay where it is in this tick, or the empty string."""
     phase = c.state.phase
-    # A take-off goes on by what is known; without a position nothing is.
     if phase in IN_THE_OPEN and c.position_is_stale:
         return unplaced_text(c)
     if phase not in BY_CAMERA:
