@@ -155,7 +155,7 @@ def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     assert state.released_s == NOW_S
     if known == "onboard":
         deaf, command = lander.act(context(known, True, since_s=PEEL_S + 0.1, tel={"t_s": 8.0}))
-        assert isinstance(command, PositionSetpoint)
+        assert is_setpoint(command, below_m=HANG_Z_M)
         assert deaf.released_s is None
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from perchctl.check import Verdict
-from perchctl.check.capture import comparison_rows, save_row
+from perchctl.check.capture import save_row
 from perchctl.check.row import failed, passed, warned
 from perchctl.commands import app
 from perchctl.errors import SafetyAbort
@@ -162,13 +162,6 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     if removable:
         with pytest.raises(SafetyAbort, match="never compared"):
             require()
-
-
-def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
-    deck = CONFIG.model_copy(update={"by": "deck"})
-    for config, simulated in ((deck, False), (CONFIG, True)):
-        session.require_comparison(config, URI, simulated=simulated)
-        assert comparison_rows(config, URI, NOW, simulated=simulated) == []
 
 
 # --- `fly` -------------------------------------------------------------------------------
