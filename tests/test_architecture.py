@@ -95,7 +95,7 @@ MOST_NAMES = {
     "flight": 15,
     "link": 11,
     "record": 13,
-    "mission": 25,
+    "mission": 26,
     "perception": 6,
     "positioning": 10,
     "profile": 35,

@@ -142,6 +142,8 @@ def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
     if end.locked:
         text = "The supervisor locked the vehicle: inspect and restart it"
         yield Sentence(end_s, text, "bad")
+    if end.touchdown is not None and end.touchdown.is_hard:
+        yield Sentence(end_s, f"It {end.touchdown.text}", "bad")
     if end.fell:
         yield Sentence(end_s, "The vehicle fell", "bad")
 

@@ -14,6 +14,7 @@ from .records import TurnInputs as TurnInputs
 from .records import Watcher as Watcher
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport
+from .report import Touchdown as Touchdown
 from .report import rest_of as rest_of
 from .state import ContactError as ContactError
 from .state import Mismatch as Mismatch

@@ -29,6 +29,7 @@ SINK_MPS = -0.25  # it begins to come down, whatever the offsets
 SINK_MEMORY_S, OFFSET_MEMORY_S = 1.5, 3.0
 IMPACT_G = -0.3  # what brakes a climb harder is an impact on the ceiling
 BLOW_MPS, BLOW_S = 0.22, 0.1  # gained upwards by the floor: no thrust gives it
+BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5  # a blow shows so much later; what follows belongs to it
 STEADY_MPS, STEADY_ASIDE_MPS, ASIDE_MEMORY_S = 0.06, 0.15, 0.15
 """Speeds so near to each other are one speed; sideways, near to the mean of the last moment."""
 REST_MEMORY_S = 0.5  # at rest on the ground the offsets are learned in so long
@@ -80,6 +81,17 @@ class Corrections:
 
 
 @dataclass(frozen=True)
+class Blow:
+    """A blow from below, as the floor gives one."""
+
+    t_s: float = -math.inf  # -inf: there was none
+    estimated_mps: float = 0.0  # vertical speed just before it, by the state estimate
+    felt_mps: float = 0.0  # the same by `ImuMotion.velocity_mps`
+    peak_g: float = 0.0  # the largest specific force read in it, along the body's z axis
+    z_m: float = 0.0  # where the state estimate had the vehicle
+
+
+@dataclass(frozen=True)
 class ImuMotion:
     """The vehicle's motion by its accelerometer and attitude alone. Times are on the loop's clock,
     `-inf` for what never happened."""
@@ -110,6 +122,8 @@ class ImuMotion:
     misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
     turning_radps: tuple[float, float] = (0.0, 0.0)
     corrections: Corrections = Corrections()  # of the estimate beside this motion
+    last_moment: tuple[Blow, ...] = ()  # what a blow that begins now has ended
+    blow: Blow = Blow()  # the newest from below
     off_s: float = math.inf  # since when the motors have been off; inf while they turn
 
     @property
@@ -166,6 +180,7 @@ class ImuMotion:
         steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
         if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
             steady_aside_s = new.t_s
+        now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
         keeps = math.exp(-dt_s / PUSH_MEMORY_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
         mean_x_g, mean_y_g = motion.aside_g
@@ -173,6 +188,7 @@ class ImuMotion:
             x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
             y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
         )
+        last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
         return replace(
             motion,
             velocity_mps=(x, y, z),
@@ -193,6 +209,8 @@ class ImuMotion:
             pushed_s=new.t_s if math.hypot(*aside_g) > PUSHED_G else motion.pushed_s,
             misled_rad=misled_rad,
             turning_radps=turning_radps,
+            last_moment=last_moment,
+            blow=_struck(motion, new, last_moment, blow),
         )
 
     @staticmethod
@@ -249,6 +267,30 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     if 0.0 < dt_s <= GAP_S:
         return new.velocity_mps[2] > SINKS_MPS and sunk_m > -NO_FALL_M
     return abs(gained_mps) <= NO_FALL_MPS and abs(way_m) <= NO_FALL_M
+
+
+def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mps: float) -> Blow:
+    """The newest blow, which has gained `mps` by now; of its bounces the hardest counts. The
+    onboard estimate has the whole of a blow before its second sample arrives."""
+    old = motion.blow
+    follows = new.t_s - old.t_s <= BOUNCES_S
+    if mps > BLOW_MPS:
+        begun = Blow(
+            new.t_s,
+            min(moment.estimated_mps for moment in last_moment),
+            min(moment.felt_mps for moment in last_moment),
+            max(moment.peak_g for moment in last_moment),
+            new.position_m[2],
+        )
+        if not follows:
+            return begun
+        return replace(
+            old,
+            peak_g=max(old.peak_g, begun.peak_g),
+            estimated_mps=min(old.estimated_mps, begun.estimated_mps),
+            felt_mps=min(old.felt_mps, begun.felt_mps),
+        )
+    return replace(old, peak_g=max(old.peak_g, new.acc_z_g)) if follows else old
 
 
 def _misled(
@@ -315,6 +357,7 @@ class Reckoning:
     sight_s: float = -math.inf  # exposure of the sight that it is carried on from
     stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate since
     stepped_s: float = -math.inf  # the newest of them
+    struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
 
 
 def advance_reckoning(
@@ -322,7 +365,11 @@ def advance_reckoning(
 ) -> Reckoning:
     """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
     it may be of another axis, and even after a silence the reckoned one is better."""
-    estimated = sample.velocity_mps
+    estimated, blow = sample.velocity_mps, imu.blow
+    if old.imu is not None and blow.t_s > old.imu.blow.t_s:
+        carried = not old.imu.t_s < imu.silent_s <= blow.t_s
+        carried_mps = old.velocity_mps[2] + blow.felt_mps - old.imu.velocity_mps[2]
+        old = replace(old, struck_mps=carried_mps if carried else blow.estimated_mps)
     frozen = imu.attitude_frozen_s > FROZEN_S
     if old.imu is None or imu.silent_s > old.imu.t_s or frozen:
         velocity_mps = estimated if believed else ZERO

@@ -1,5 +1,5 @@
-"""How a flight ended: where it met the target, and what it showed of the camera's latency and
-mounting. None of it needs a simulator.
+"""How a flight ended: where it met the target, how hard it met the floor, and what it showed of the
+camera's latency and mounting. None of it needs a simulator.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.context import Context
-from perchctl.mission.lander import rest_finding
+from perchctl.mission.lander import Finding, rest_finding
 from perchctl.mission.records import Event
 from perchctl.mission.state import (
     Condition,
@@ -23,9 +23,32 @@ from perchctl.values import replace
 from perchctl.vehicle import LOCKED
 from perchctl.vision import Consistency
 
+HARD_MPS = 0.6  # no way down that goes as it should ends faster
+LATEST_S = 5.0  # from the touchdown to the motors' stop: an earlier blow was no floor
+SAME_HEIGHT_M = 0.3  # a blow higher above the present place was none by the floor
 SURE = 1.96  # standard deviations on both sides of a 95 % interval
 LATENCY_GATE_S = 0.02  # 30 ms make an alignment swing by centimetres
 TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
+
+
+@dataclass(frozen=True)
+class Touchdown:
+    """The speed, downwards, at which the floor was met, and the largest acceleration that a sample
+    of the telemetry shows, one each 10 ms."""
+
+    speed_mps: float
+    peak_g: float
+
+    @property
+    def is_hard(self) -> bool:
+        """True if the way down did not go as it should."""
+        return self.speed_mps > HARD_MPS
+
+    @property
+    def text(self) -> str:
+        """The touchdown as a sentence without its end."""
+        how = "touched down hard" if self.is_hard else "touched down"
+        return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
 
 
 @dataclass(frozen=True)
@@ -91,6 +114,7 @@ class FlightReport:
     history: tuple[Event, ...] = ()  # its phases' events, the first at the start
     findings: Findings | None = None  # of latency and mounting, where it was long enough
     contact: ContactError | None = None  # of what hangs
+    touchdown: Touchdown | None = None  # of what met the floor
 
     @classmethod
     def of(
@@ -116,14 +140,36 @@ class FlightReport:
             history=history,
             findings=None if consistency is None else Findings.of(consistency, profile.camera),
             contact=contact if placed else None,
+            touchdown=touchdown_of(Context(state, obs, profile)),
         )
 
 
 def rest_of(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
     """Where the vehicle is, as a sentence without its end, once its motors have been seen off for
-    `off_s`; None before that."""
+    `off_s`; None before that. A hard touchdown is told with it."""
     c = Context(state, obs, profile)
-    return rest_finding(c).value if c.held(Condition.DOWN) >= off_s else None
+    if c.held(Condition.DOWN) < off_s:
+        return None
+    finding, touchdown = rest_finding(c), touchdown_of(c)
+    hangs = finding in (Finding.HANGS, Finding.HELD)
+    if hangs or touchdown is None or not touchdown.is_hard:
+        return finding.value
+    return f"{finding.value}; it {touchdown.text}"
+
+
+def touchdown_of(c: Context) -> Touchdown | None:
+    """The newest blow from below, where it may have been the floor's; None if there was none.
+
+    Its speed is the estimate's where that is believed, else as reckoned by the accelerometer."""
+    tel, imu, reckoning = c.telemetry, c.obs.imu, c.state.reckoning
+    blow = imu.blow
+    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > LATEST_S:
+        return None
+    if c.placed and c.state.blind_s is None and blow.z_m - tel.position_m[2] > SAME_HEIGHT_M:
+        return None
+    reckoned = c.state.blind_s is not None or c.state.astray
+    speed_mps = -(reckoning.struck_mps if reckoned else blow.estimated_mps)
+    return Touchdown(max(0.0, speed_mps), blow.peak_g)
 
 
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:

@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
-_GONE = {"blow", "last_moment", "timing"}  # in logs of before
+_GONE = {"timing"}  # in logs of before
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
@@ -140,8 +140,6 @@ def _dataclass_from(kind: Any, data: Any) -> Any:
         raise ValueError(f"{kind.__name__} is needed, found {data!r:.60}")
     hints, values = _hints(kind), {}
     for name, part in data.items():
-        if name in _GONE:
-            continue
         if name not in hints:
             raise ValueError(f"{kind.__name__} has no field {name}")
         try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.mission import ContactError, Findings
+from perchctl.mission import ContactError, Findings, Touchdown
 from perchctl.record.read import FlightLog, PhaseSpan
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -55,6 +55,7 @@ class FlightSummary:
         cause: what decided it, such as ``target not found``.
         miss_m: None where no truth is known.
         contact: the program's own error, of what hangs.
+        touchdown: how the floor was met, as far as that was felt.
         lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
         recording: what became of it; None of a flight without one, and of one that is read back.
     """
@@ -71,6 +72,7 @@ class FlightSummary:
     phases: tuple[PhaseSpan, ...] = ()
     findings: Findings | None = None
     contact: ContactError | None = None
+    touchdown: Touchdown | None = None
     lost_records: int = 0
     log_problem: str | None = None
     recording: RecordingEnd | None = None
@@ -100,6 +102,7 @@ class FlightSummary:
             phases=phases,
             findings=_part_in(end, Findings, _FINDINGS),
             contact=_part_in(end, ContactError, _CONTACT),
+            touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
         )
@@ -115,6 +118,7 @@ class FlightSummary:
             "attempts": self.attempts,
             "miss_m": self.miss_m,
             **_keys_of(self.contact, _CONTACT),
+            **_keys_of(self.touchdown, _TOUCHDOWN),
             "battery_min_v": self.battery_min_v,
             "locked": self.locked,
             "fell": self.fell,
@@ -143,6 +147,8 @@ class FlightSummary:
             lines += [f"advice:    {sentence}" for sentence in self.findings.advice]
         if self.locked:
             lines.append("vehicle:   locked by its supervisor: inspect and restart it")
+        if self.touchdown is not None and self.touchdown.is_hard:
+            lines.append(f"vehicle:   {self.touchdown.text}")
         if self.fell:
             lines.append("vehicle:   fell")
         if self.lost_records:
@@ -158,6 +164,7 @@ class FlightSummary:
 
 # A part of the summary by the record's keys and its own fields, in their order.
 _CONTACT = {"contact_aside_m": "aside_m", "contact_sigma_m": "sigma_m"}
+_TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _FINDINGS = {
     "latency_s": "latency_s",
     "latency_sigma_s": "latency_sigma_s",

@@ -153,6 +153,7 @@ class LogWatcher:
             phases=spans_of(report),
             findings=report.findings,
             contact=report.contact,
+            touchdown=report.touchdown,
         )
         self.writer.close(summary.as_record())
         return replace(

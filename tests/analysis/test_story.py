@@ -117,9 +117,11 @@ def test_a_killed_flight_has_no_end() -> None:
 
 
 def test_each_harm_of_the_end_is_told() -> None:
-    told = story(summary=SUMMARY | {"locked": True, "fell": True})
-    for words in ("locked the vehicle", "The vehicle fell"):
+    harm = {"locked": True, "fell": True, "touchdown_mps": 1.4, "touchdown_g": 6.0}
+    told = story(summary=SUMMARY | harm)
+    for words in ("locked the vehicle", "touched down hard: 1.4 m/s, 6.0 g", "The vehicle fell"):
         assert only(told, words).grade == "bad"
+    assert "touched down" not in str(story(summary=SUMMARY | harm | {"touchdown_mps": 0.3}))
 
 
 def test_a_log_of_the_first_version_and_one_without_a_tick() -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from perchctl.mission import ContactError, Findings
+from perchctl.mission import Findings
 from perchctl.profile import CameraConfig
 from perchctl.record import FlightSummary
 from perchctl.vision import Consistency
@@ -50,12 +50,9 @@ def test_only_what_is_surely_beyond_its_gate_is_an_advice(
     assert words in "".join(found.advice)
 
 
-def test_the_summary_tells_them_and_the_contact_with_intervals() -> None:
+def test_the_summary_tells_them_with_intervals() -> None:
     found = Findings.of(_seen(0.032, turn_deg=(0.2, -0.1, 0.4)), CAMERA)
-    contact = ContactError(1.8e-3, 0.6e-3)
-    summary = FlightSummary("perched", "hanging", findings=found, contact=contact)
-    lines = summary.text().splitlines()
-    assert "contact:   1.8 +- 0.6 mm off centre" in lines
+    lines = FlightSummary("perched", "hanging", findings=found).text().splitlines()
     assert "latency:   92 +- 6 ms" in lines
     assert "mounting:  turned by 0.2 +- 0.8, -0.1 +- 0.8, 0.4 +- 0.8 deg (x, y, z)" in lines
     assert f"advice:    {found.advice[0]}" in lines

@@ -1,0 +1,182 @@
+"""How a flight met the floor: felt, true of the vehicle, and told whoever flew the way down."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+from perchctl.analysis import FlightAnalysis, show_record, show_text
+from perchctl.analysis.report import ReportedFlight, page_of
+from perchctl.mission import (
+    ContactError,
+    EventKind,
+    ImuMotion,
+    Observation,
+    Operator,
+    Phase,
+    Touchdown,
+)
+from perchctl.mission.context import Context
+from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
+from perchctl.mission.report import HARD_MPS, touchdown_of
+from perchctl.profile import load_profile
+from perchctl.record import FlightSummary, read_log
+from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
+from tests.helpers import log
+from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
+from tests.helpers.mission import observation, state_in
+
+HARD = Touchdown(0.9, 3.1)
+SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
+
+
+# --- True of the vehicle ---------------------------------------------------------------------
+
+
+def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdown | None]:
+    """The vehicle comes down on a share of the thrust that it hovers on. Returns its true speed
+    at the floor, its largest true specific force, g, and what was felt."""
+    from perchctl.link import MockLink, Radio
+    from perchctl.sim import SimulatedVehicle, draw_scenario
+
+    profile = load_profile("sim")
+    scenario = draw_scenario(profile, seed)
+    vehicle = SimulatedVehicle(scenario)
+    link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
+    link.connect()
+    motion, carried, last = ImuMotion(), Reckoning(), None
+    t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0
+    place = (0.0, 0.0, 0.0)
+    while t_s < min(9.0, hit_s + 0.6):
+        if t_s < 5.0:
+            link.send(PositionSetpoint(place[0], place[1], place[2] + min(0.5, 0.3 * t_s), 0.0))
+        else:
+            dropped_s = min(dropped_s, t_s)
+            link.send(RawThrust(int(share * motion.hover_thrust)))
+        for _ in range(10):
+            t_s += 0.002
+            link.advance_to(t_s)
+            if dropped_s < t_s < hit_s and vehicle.world.on_floor():
+                hit_s, speed_mps = t_s, sink_mps
+            sink_mps = -vehicle.world.vz_mps
+        for sample in link.telemetry():
+            if last is None:
+                place = sample.position_m
+            motion = motion.with_sample(last, sample)
+            believed = not blind or t_s < dropped_s
+            carried, last = advance_reckoning(carried, motion, sample, believed=believed), sample
+    assert last is not None
+    obs = Observation(last.t_s, last, imu=motion)
+    blind_s = dropped_s if blind else None
+    state = replace(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, blind_s=blind_s)
+    return speed_mps, motion.blow.peak_g, touchdown_of(Context(state, obs, profile))
+
+
+@pytest.mark.parametrize("blind", [False, True])
+@pytest.mark.parametrize("share", [0.96, 0.85, 0.5])
+def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
+    pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+    truth_mps, _, felt = dropped(3, share, blind)
+    assert truth_mps > 0.4
+    assert felt is not None
+    assert felt.speed_mps == pytest.approx(truth_mps, abs=0.15 if blind else 0.08)
+    assert felt.is_hard is (truth_mps > HARD_MPS)
+    assert felt.peak_g > 2.0
+
+
+# --- A blow, sample by sample ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("state", "blow", "told"),
+    [
+        ({}, Blow(9.0, -0.9, 0.0, 3.1), True),
+        ({}, Blow(4.0, -0.9, 0.0, 3.1), False),  # long before
+        ({}, Blow(9.0, -0.9, 0.0, 3.1, 0.8), False),  # in the air
+        ({"phase": Phase.PERCHED}, Blow(9.0, -0.9, 0.0, 3.1), False),
+        ({}, Blow(), False),
+    ],
+)
+def test_only_the_floor_is_a_touchdown(state: dict[str, object], blow: Blow, told: bool) -> None:
+    ended = replace(state_in(Phase.LANDED, z_m=0.0), **state)  # type: ignore[arg-type]
+    obs = observation(10.0, 0.0, imu=ImuMotion(t_s=10.0, blow=blow))
+    assert touchdown_of(Context(ended, obs, PROFILE)) == (HARD if told else None)
+
+
+# --- Whoever flew the way down -------------------------------------------------------------------
+
+
+def striking() -> Callable[[Telemetry], Telemetry]:
+    """Samples of a vehicle that comes down at 0.9 m/s and meets the floor."""
+    before: list[Telemetry] = []
+    struck: list[float] = []
+
+    def changed(sample: Telemetry) -> Telemetry:
+        z_m = sample.position_m[2]
+        last_m = before[-1].position_m[2] if before else 0.0
+        before.append(sample)
+        if z_m < last_m - 1e-6 and z_m > 0.0:
+            return replace(sample, velocity_mps=(0.0, 0.0, -0.9))
+        if z_m == 0.0 and last_m > 0.0:
+            struck.append(sample.t_s)
+        if struck and sample.t_s < struck[0] + 0.025:
+            return replace(sample, acc_z_g=3.1)
+        return sample
+
+    return changed
+
+
+@pytest.mark.parametrize("hung", [False, True])
+def test_the_report_has_it_whether_the_planner_or_the_watchdog_brought_it_down(hung: bool) -> None:
+    link = Guarded(striking())
+    rig = Rig(link)
+    if hung:
+        rig.camera = hanging_camera(link, 12.0)
+    else:
+        rig.operator = lambda: Operator.LAND if link.now_s > 4.0 else Operator.NONE
+    report = rig.fly()
+    assert bool(link.own) is hung
+    assert report.phase is Phase.LANDED
+    assert report.touchdown == HARD
+
+
+def test_the_rescue_says_so() -> None:
+    rig = Rig(Vehicle(striking()))
+
+    def leave(tick: object) -> None:
+        if rig.link.now_s > 4.0:
+            raise Broken
+
+    rig.watcher.on_tick = leave
+    with pytest.raises(Broken):
+        rig.fly()
+    note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
+    assert note.reason.endswith(f"; it {SENTENCE}")
+
+
+# --- What is told ---------------------------------------------------------------------------------
+
+
+def test_all_that_tell_of_a_flight_tell_touchdown_and_contact(tmp_path: Path) -> None:
+    """The summary, `log show`, `log report` and the live page; a soft touchdown is not told."""
+    soft = FlightSummary("landed", "the operator asked to land", touchdown=Touchdown(0.3, 1.9))
+    assert "touched down" not in soft.text()
+    assert soft.as_record()["touchdown_mps"] == 0.3
+    told = FlightSummary("perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD)
+    end = log.SUMMARY | told.as_record() | {"outcome": "landed", "attempts": 1}
+    flown = read_log(log.write(tmp_path / "f.jsonl", summary=end))
+    flight = FlightAnalysis(flown)
+    for text in (told.text(), show_text(flight)):
+        assert "\ncontact:   1.8 +- 0.6 mm off centre" in text
+        assert f"\nvehicle:   {SENTENCE}" in text
+    for record in (told.as_record(), show_record(flight)):
+        assert (record["contact_aside_m"], record["contact_sigma_m"]) == (1.8e-3, 0.6e-3)
+        assert (record["touchdown_mps"], record["touchdown_g"]) == (0.9, 3.1)
+    whole = ReportedFlight(flight)
+    assert "1.8 +- 0.6 mm off centre" in unescape(page_of([whole])).replace("\xa0", " ")
+    assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]
