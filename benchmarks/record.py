@@ -39,7 +39,6 @@ from perchctl.mission import (
     Tick,
     Turn,
     TurnInputs,
-    TurnTiming,
 )
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher
@@ -145,7 +144,6 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
         number, "flown", t_s, t_s, TurnInputs(samples, frame=seen),
         {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
         obs, command, state.phase, "seek", reason="the target is looked for",
-        timing=TurnTiming(0.004, 0.0003, 0.0001, 0.005),
     )  # fmt: skip
     return Tick(t_s, samples[-1], output, target, state, command, 0.0, 0.03, 0.01, turn=turn)
 

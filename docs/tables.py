@@ -27,7 +27,6 @@ from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
-from perchctl.mission.lander import DESCENTS  # noqa: E402
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile  # noqa: E402
@@ -189,13 +188,6 @@ def promises() -> str:
     return "\n".join(f"- **{p.what}**: {p.happens}" for p in PROMISES.values())
 
 
-def manoeuvres() -> str:
-    """A row for each evidence."""
-    rows = [f"| {e.value} | {free.value} | {held.value} |" for e, (free, held) in DESCENTS.items()]
-    head = "| evidence | free | within the magnet's reach |"
-    return "\n".join([head, "|---|---|---|", *rows])
-
-
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (table.AIR, "in the air"),
     (FLYING_PHASES, "before landing"),
@@ -259,7 +251,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{mission_diagram()}\n```",
     "rows": mission_rows,
-    "manoeuvres": manoeuvres,
     "profile-keys": profile_keys,
     "log-fields": log_fields,
     "exit-codes": exit_codes,

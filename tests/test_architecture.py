@@ -95,7 +95,7 @@ MOST_NAMES = {
     "flight": 15,
     "link": 11,
     "record": 12,
-    "mission": 27,
+    "mission": 26,
     "perception": 6,
     "positioning": 10,
     "profile": 35,

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
 from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
-from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.mission import (
     ExternalPositions,
     FrameSeen,
@@ -20,7 +18,6 @@ from perchctl.mission import (
     SentCommand,
     Turn,
     TurnInputs,
-    TurnTiming,
     Watcher,
 )
 from perchctl.perception import (
@@ -290,7 +287,7 @@ def is_supported(history: History, now_s: float) -> bool:
     )
 
 
-# --- Each turn of the loop as a value, for the log; and how long its parts took ---
+# --- Each turn of the loop as a value, for the log ---
 
 
 @runtime_checkable
@@ -308,16 +305,12 @@ Decision = tuple[PlannerState, Command, FeedStatus | None]
 
 
 class Turns:
-    """Counts the loop's turns, and reports them to their watchers. In lockstep there are no
-    timings: the same seed gives the same turns."""
+    """Counts the loop's turns, and reports them to their watchers."""
 
-    def __init__(self, clock: Clock, watchers: Iterable[Watcher]) -> None:
-        in_real_time = isinstance(clock, (WallClock, SimulatedClock))
-        self._wall = time.perf_counter if in_real_time else None
+    def __init__(self, watchers: Iterable[Watcher]) -> None:
         self._watchers = [w for w in watchers if isinstance(w, LogKeeper)]
         self._count = 0
         self._began_s = 0.0
-        self._laps_s = [0.0]
         self._open: tuple[Observation, Decision | None] | None = None  # observed, not yet reported
 
     @property
@@ -327,13 +320,7 @@ class Turns:
 
     def begin(self, now_s: float) -> None:
         """Note when a turn of the loop begins."""
-        self._began_s, self._laps_s = now_s, []
-        self.lap()
-
-    def lap(self) -> None:
-        """Note the end of a part of the turn: begun, taken in, decided, sent."""
-        if self._wall is not None:
-            self._laps_s.append(self._wall())
+        self._began_s = now_s
 
     def waiting(self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None) -> None:
         """Report a turn before take-off."""
@@ -371,8 +358,7 @@ class Turns:
             return
         obs, decision = self._open
         if decision is not None:
-            turn = self.flown(inputs, obs, *decision)
-            self._report(replace(turn, timing=None))  # by now the rescue's time is in it
+            self._report(self.flown(inputs, obs, *decision))
         elif isinstance(error, Exception):  # else the planner was only interrupted
             self._open = None
             turn = Turn(
@@ -411,19 +397,8 @@ class Turns:
             held=bool(new.hold),
             attempts=new.attempts,
             outside=external_positions(outside),
-            timing=self._timing(),
             outcome=new.outcome,
             reason=new.reason,
-        )
-
-    def _timing(self) -> TurnTiming | None:
-        if self._wall is None:
-            return None
-        # A part that a turn did not come to took no time.
-        laps_s = [*self._laps_s, *[self._laps_s[-1]] * 3]
-        began_s, seen_s, decided_s, sent_s = laps_s[:4]
-        return TurnTiming(
-            seen_s - began_s, decided_s - seen_s, sent_s - decided_s, self._wall() - began_s
         )
 
     def _counted(self) -> int:

@@ -85,7 +85,7 @@ def fly(parts: FlightParts) -> FlightReport:
     Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
     `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue.
     """
-    turns = Turns(parts.clock, parts.watchers)
+    turns = Turns(parts.watchers)
     inputs = FlightInputs(
         parts.link,
         parts.source,
@@ -191,12 +191,10 @@ def _mission(
         late_s = max(0.0, now_s - due_s)
         outside = _outside(parts, inputs, now_s)
         obs = _observe(parts, inputs, now_s, late_s, outside)
-        turns.lap()
         turns.observed(obs)
         before = state
         new, command = step_mission(before, obs, parts.profile)
         turns.decided(obs, new, command, outside)
-        turns.lap()
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
@@ -205,7 +203,6 @@ def _mission(
         state, redone = new, False
         if not isinstance(command, Idle):
             parts.link.send(command)
-        turns.lap()
         watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
         inputs.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):

@@ -11,7 +11,6 @@ from .records import SentCommand as SentCommand
 from .records import Tick as Tick
 from .records import Turn as Turn
 from .records import TurnInputs as TurnInputs
-from .records import TurnTiming as TurnTiming
 from .records import Watcher as Watcher
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport

@@ -1,22 +1,17 @@
 """How much the battery has left, and whether it is enough for an attempt and a landing.
 
-No current is measured on a Crazyflie. Known are the resting voltage on the ground, the voltage
-under load, and the thrust that the load follows. Assumed are a lithium polymer cell's resting
-voltage by its charge (`CURVE`) and the current at full thrust (`FULL_A`), for a battery of
-`vehicle.battery_mah`. Fitted from the voltages are the sag under full thrust and `hunger`: how much
-faster this battery empties than assumed, both by least squares around usual values, with old
-readings fading.
+No current is measured on a Crazyflie. Assumed are a cell's resting voltage by its charge (`VOLTS`)
+and the current at full thrust (`FULL_A`). Fitted are the sag under full thrust and `hunger`: how
+much faster this battery empties than assumed, by least squares, with old readings fading.
 
-Before each attempt, what is left is compared with what the way up, the press and the way down take
-at the profile's speeds, with a reserve. The charge ends where `battery-low` would fire; what is
-below that is for a landing that nobody planned.
+Before each attempt, what is left until `battery-low` would fire is compared with what the way up,
+the press and the way down take at the profile's speeds, with a reserve.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
 
 from perchctl.mission.conditions import press_thrust
 from perchctl.mission.context import Context
@@ -25,38 +20,23 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, is_battery_reading
 
-CURVE: tuple[tuple[float, float], ...] = (
-    (0.0, 3.0),
-    (0.02, 3.4),
-    (0.05, 3.64),
-    (0.1, 3.76),
-    (0.2, 3.82),
-    (0.3, 3.86),
-    (0.4, 3.885),
-    (0.5, 3.915),
-    (0.6, 3.955),
-    (0.7, 3.995),
-    (0.8, 4.04),
-    (0.9, 4.1),
-    (1.0, 4.2),
-)
-"""Share of the charge, and the resting voltage: a little below the firmware's own table."""
+SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+VOLTS = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
+"""Of the charge, and of the resting cell with it: a little below the firmware's own table."""
 FULL_A = 4.4  # four motors at full thrust; proportional to the thrust below
-LOW_POWER_V = 3.2  # the firmware reports low power after 5 s, unless `pm.lowVoltage` differs
+LOW_POWER_V = 3.2  # the firmware's, unless `pm.lowVoltage` differs
 USUAL_SAG_V, SAG_WITHIN_V, LEAST_SAG_V = 0.63, 0.3, 0.2
 USUAL_HUNGER, HUNGER_WITHIN, LEAST_HUNGER, MOST_HUNGER = 1.1, 0.3, 1.0, 3.0
 READING_V, FADES_S = 0.02, 40.0  # error of a second of readings, and how long it counts
 SMOOTH_S, LAG_S = 1.0, 0.3  # of the resting voltage; of a reading behind its thrust
-STEADY_LOAD = 0.06  # a thrust that changed by more does not belong to the present reading
+STEADY_LOAD = 0.06  # a changed thrust does not belong to the reading
 COUNTED_SHARE = 0.05  # below this charge the voltage alone tells what is spent
-LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0  # an estimate needs so much thrust for so long
-FRESH_S = 1.0  # in flight a reading changes all the time: an older one counts as none
-UNKNOWN_S = 5.0  # without a reading for longer, the remaining charge is unknown
+LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0  # what an estimate needs
+FRESH_S = 1.0  # an older reading counts as none
+UNKNOWN_S = 5.0  # without a reading for longer it is unknown
 SETTLING_S, TOUCHING_S, LANDING_S = 3.0, 1.0, 3.0  # as measured in simulated flights
 PRESS_DIP_V = 0.3  # below `safety.min_load_v`, for a press shorter than the debounce
-BACK_OFF_S = 3.0  # from a failed attempt until it is steady and sees the target again
-
-_SHARES, _VOLTS = zip(*CURVE, strict=True)
+BACK_OFF_S = 3.0  # until it is steady and sees the target again
 
 
 # --- The battery's state, fitted reading by reading -------------------
@@ -120,12 +100,12 @@ def fit_battery(state: EnergyState) -> tuple[float, float]:
 
 def charge_at(rest_v: float) -> float:
     """The share of its charge, 0..1, that a cell with that resting voltage has."""
-    return min(1.0, max(0.0, _along(_VOLTS, _SHARES, rest_v)))
+    return min(1.0, max(0.0, _along(VOLTS, SHARES, rest_v)))
 
 
 def resting_v(share: float) -> float:
     """The resting voltage at a share of the charge."""
-    return _along(_SHARES, _VOLTS, share)
+    return _along(SHARES, VOLTS, share)
 
 
 def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
@@ -138,8 +118,6 @@ def _summed(
 ) -> tuple[float, float, float, float, float]:
     """`EnergyState.fit` with one more reading, as deviations from the usual values."""
     assert state.ground_v is not None
-    # A battery larger than assumed goes on where the count has come to the curve's steep end:
-    # counted on, a sag would make up for it. A voltage above the curve counts as nothing spent.
     begun = charge_at(state.ground_v)
     counted = max(min(begun, COUNTED_SHARE), begun - state.used)
     spent_v = resting_v(begun) - resting_v(counted)
@@ -167,20 +145,9 @@ def _towards(value: float, goal: float, part: float) -> float:
 # --- What that is enough for ------------------------------------------
 
 
-@dataclass(frozen=True)
-class Needs:
-    """The seconds of flight that the attempt at hand, each further one and the landing take."""
-
-    attempt_s: float
-    again_s: float
-    landing_s: float
-
-
 def outlook(c: Context) -> BatteryOutlook:
-    """The outlook of the battery: what it has left, and for how many attempts that is enough.
-
-    An unknown charge counts as what the last reading left, less what was used since, and at most
-    as the grace of a vehicle without a reading (fault 7)."""
+    """What the battery has left, and for how many attempts that is enough. An unknown charge counts
+    at most as the grace of a vehicle without a reading (fault 7)."""
     energy = c.state.energy
     used_mah = energy.used * c.profile.vehicle.battery_mah
     load = (c.state.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
@@ -188,23 +155,20 @@ def outlook(c: Context) -> BatteryOutlook:
     seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
     if c.target_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    enough_s, needs = seconds, needs_of(c)
+    enough_s, (attempt_s, again_s, landing_s) = seconds, needs_s(c)
     if enough_s is None:
         enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
-    spare_s = enough_s - c.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
+    spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
     left = c.planner.attempts - c.state.attempts
     attempts = 0  # also where the figures are no numbers
     if spare_s >= 0.0:
-        attempts = 1 + math.floor(min(spare_s / needs.again_s, max(0, left)))
+        attempts = 1 + math.floor(min(spare_s / again_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
 def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
     """Seconds for which hovering on a share of the full thrust keeps the voltage above that at
-    which `battery-low` fires; None if that is unknown.
-
-    It fires by the firmware's limit under a long load, by the profile's under one that outlasts
-    `safety.battery_debounce_s`, which a press seldom does."""
+    which `battery-low` fires; None if that is unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     safety, perch = profile.safety, profile.planner.perch
@@ -220,8 +184,9 @@ def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
     return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah))
 
 
-def needs_of(c: Context) -> Needs:
-    """The seconds that attempts and landing take, by the height of a target that was seen."""
+def needs_s(c: Context) -> tuple[float, float, float]:
+    """The seconds that the attempt at hand, each further one and the landing take, by the height of
+    a target that was seen."""
     planner = c.planner
     up_m = max(0.0, c.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
@@ -230,30 +195,25 @@ def needs_of(c: Context) -> Needs:
     if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
         aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
     again_m = planner.recover.descend_m + planner.ascend.standoff_m
-    return Needs(
-        aligned_s + _climb_s(c.profile, up_m) + touch_s,
-        2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s,
-        max(0.0, c.height_m + up_m) / planner.landing.speed_mps + LANDING_S,
-    )
+    attempt_s = aligned_s + _climb_s(c.profile, up_m) + touch_s
+    again_s = 2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s
+    return attempt_s, again_s, max(0.0, c.height_m + up_m) / planner.landing.speed_mps + LANDING_S
 
 
 def is_short_of_charge(c: Context) -> bool:
-    """True if the attempt that would begin now has not enough. Without a remembered target none
-    begins: a search comes first, and the question after it."""
+    """True if the attempt that would begin now has not enough; without a target none begins."""
     gated = c.safety.energy_gate and c.target_m is not None
     return gated and not c.state.battery.attempts
 
 
 def why_short(c: Context) -> str:
     """The shortfall with its figures, as a sentence."""
-    seconds, needs = c.state.battery.left_s, needs_of(c)
-    has = (
-        "what the battery has left is not known"
-        if seconds is None
-        else (f"the battery has {seconds:.0f} s left")
-    )
+    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, needs_s(c)
+    has = "what the battery has left is not known"
+    if seconds is not None:
+        has = f"the battery has {seconds:.0f} s left"
     return (
-        f"{has}; an attempt takes {needs.attempt_s:.0f} s, the landing {needs.landing_s:.0f} s, "
+        f"{has}; an attempt takes {attempt_s:.0f} s, the landing {landing_s:.0f} s, "
         f"the reserve is {c.safety.energy_reserve_s:g} s"
     )
 

@@ -15,20 +15,20 @@ from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST, LOW_POWER, NO_BATTERY_READING_V
 
 DESCENDED_M, HELD_WITHIN_M = 0.1, 0.1
-CARRIED_ON_MPS = 0.1  # a pressed vehicle's height may run away from the last sight's by this
+CARRIED_ON_MPS = 0.1  # a pressed vehicle's height may run away by this
 TOUCHES_M = 0.001  # by which the touch itself moves the gear
-SHAKEN_M, SLIDES_MPS = 0.002, 0.01  # error by decks: from the blow, and for each second unseen
-DRIFTED_M = 0.02  # a slip counts though the estimate has drifted up from the contact by this
-PRESSED_M = 0.08  # a setpoint so far above a vehicle that stands still presses it
+SHAKEN_M, SLIDES_MPS = 0.002, 0.01  # by decks: by the blow, each second
+DRIFTED_M = 0.02  # a slip counts though the estimate has drifted up by this
+PRESSED_M = 0.08  # a setpoint so far above a still vehicle presses it
 HARD_CLIMB_MPS = 0.27
 BELOW_M = 0.3  # no target on the ceiling can be so far below the vehicle
-KNOCKED_MPS = 0.5  # sideways, under the target: no draught gives a held vehicle so much
-OTHERWISE_MPS = 0.15  # true positions make at most 0.07, also those that are 0.15 s late
+KNOCKED_MPS = 0.5  # sideways: no draught gives so much
+OTHERWISE_MPS = 0.15  # true positions make at most 0.07
 SATURATED = 0.98  # of the full thrust: how much more it takes is unknown
-LITTLE_LEFT = 0.93  # of the full thrust: hovering on more, full thrust is no sign of a press
-SUPERVISOR_S = 5.0  # the flying bit outlives the motors by 2 s (docs/firmware.md, "Supervisor")
+LITTLE_LEFT = 0.93  # of the full thrust: on more it is no sign of a press
+SUPERVISOR_S = 5.0  # the flying bit outlives the motors by 2 s
 PROVABLE = 0.99  # of the pressing thrust: a contact's proof asks for no more
-STILL_MOTORS_THRUST = 5000  # and less stops them (docs/firmware.md, "Release in raw mode")
+STILL_MOTORS_THRUST = 5000  # and less stops them
 FALLING_MPS = -0.05
 
 
@@ -46,8 +46,7 @@ def _settled(c: Context) -> bool:
 
 
 def _moves_otherwise(c: Context) -> bool:
-    """True if the estimate follows a motion capture against the accelerometer, since the capture's
-    axes are mirrored, turned or swapped. A vehicle at rest cannot show it."""
+    """True if the estimate follows a motion capture against the accelerometer."""
     by_capture = c.profile.positioning.by == "mocap"
     return by_capture and math.hypot(*c.state.reckoning.beside_mps) > OTHERWISE_MPS
 
@@ -56,20 +55,19 @@ def _contact(c: Context) -> bool:
     """True if position, acceleration and thrust together show a contact (fault 40).
 
     The gear has stopped at the target's height, the accelerometer reads one g, and the thrust is
-    above what hovering takes: the ceiling must carry the difference. By the target alone, the
-    height is the last sight's, carried on, and the accelerometer shows that nothing climbs: an
-    impact spoils the estimated speed (docs/firmware.md, "After the impact").
+    above what hovering takes: the ceiling must carry the difference.
     """
     perch, tel = c.planner.perch, c.telemetry
     steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and c.placed
     felt_s = c.t_s - c.obs.imu.steady_s
+    wanted = perch.contact_thrust_ratio * c.state.hover_thrust  # as far as there is more
     return (
         abs(c.error_z_m) <= perch.contact_z_m + (CARRIED_ON_MPS * unseen_s(c) if c.by_sight else 0)
         and (steady or felt_s >= perch.contact_dwell_s)
         and c.reads_one_g
         and c.state.hover_thrust > 0
         and c.thrust_is_known
-        and tel.thrust >= contact_thrust(c)
+        and tel.thrust >= min(wanted, PROVABLE * press_thrust(c.profile))
     )
 
 
@@ -79,11 +77,8 @@ def unseen_s(c: Context) -> float:
 
 
 def contact_error(c: Context) -> ContactError:
-    """How far the gear is from the target's axis.
-
-    By decks, the last sight is carried on by an estimate that slides and that the blow on the
-    ceiling shakes; without positions `reckoned` has counted that already. A step of the estimate
-    since the last sight makes the place unsure by as much."""
+    """How far the gear is from the target's axis. By decks the last sight is carried on by an
+    estimate that slides and that the blow on the ceiling shakes."""
     reckoning = c.state.reckoning
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if c.profile.positioning.by == "deck" and c.placed:
@@ -93,8 +88,7 @@ def contact_error(c: Context) -> ContactError:
 
 def touched_error(c: Context) -> ContactError | None:
     """The `contact_error` of the moment in which the gear touched something at the target's
-    height: what has not left since is still there. None after it left, and where a sight of now or
-    a motion capture gives the place."""
+    height; None after it left, and where a sight of now or a motion capture gives the place."""
     state = c.state
     if state.phase is not Phase.RECOVER or state.contact is None or c.fresh:
         return None
@@ -107,16 +101,14 @@ def touched_error(c: Context) -> ContactError | None:
 
 
 def contact_within_m(c: Context) -> float:
-    """Tolerance of the target's height for a gear in contact, with the estimate's bounded drift
-    since the last sight."""
+    """Tolerance of the target's height for a gear in contact."""
     planner = c.planner
     drift_mps = CARRIED_ON_MPS if c.by_sight else planner.landing.drift_mps
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * unseen_s(c))
 
 
 def is_at_target(c: Context) -> bool:
-    """True if the gear is at the target's height and within the magnet's radius of its axis, all
-    known well enough."""
+    """True if the gear is surely in the magnet's reach."""
     near = contact_error(c).is_within(c.planner.perch.contact_xy_m)
     return near and abs(c.error_z_m) <= contact_within_m(c)
 
@@ -127,15 +119,8 @@ def press_thrust(profile: Profile) -> float:
     return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
 
 
-def contact_thrust(c: Context) -> float:
-    """The thrust that proves a contact: more than hovering takes, as far as there is more."""
-    wanted = c.planner.perch.contact_thrust_ratio * c.state.hover_thrust
-    return min(wanted, PROVABLE * press_thrust(c.profile))
-
-
 def hovers(c: Context) -> bool:
-    """True if the thrust is what hovering takes: the vehicle is neither carried nor pressed, not
-    at its thrust's limit, and hardly accelerated."""
+    """True if the thrust is what hovering takes: neither carried nor pressed nor accelerated."""
     tel, setpoint = c.telemetry, c.state.setpoint
     vz = tel.velocity_mps[2]
     stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < 0.05
@@ -148,11 +133,6 @@ def hovers(c: Context) -> bool:
         and abs(tel.acc_z_g - 1.0) < 0.1
         and not stuck
     )
-
-
-def _magnet_holds(c: Context) -> bool:
-    """True if the vehicle stays up on a thrust that could not carry it."""
-    return _is_carried(c) and not _magnet_slips(c) and (c.placed or _still(c))
 
 
 def _is_carried(c: Context) -> bool:
@@ -171,8 +151,7 @@ def _magnet_slips(c: Context) -> bool:
 
 
 def _still(c: Context) -> bool:
-    """True if it does not move, and something carries it: the accelerometer reads one g. While no
-    position corrects the speed, the accelerometer alone counts."""
+    """True if it does not move, and something carries it: the accelerometer reads one g."""
     return c.reads_one_g and (abs(c.telemetry.velocity_mps[2]) < 0.05 or not c.placed)
 
 
@@ -188,9 +167,7 @@ def _weight_hangs(c: Context) -> bool:
 
 def _hanging(c: Context) -> bool:
     """True if something holds it up: it is still, off the floor, on a thrust that could not carry
-    it. `is_at_target` tells if that is the target's magnet.
-
-    Without a position a magnet looks like the floor; the slow release that follows suits both."""
+    it. Without a position a magnet looks like the floor; the slow release suits both."""
     tel, complete = c.telemetry, c.planner.complete
     if not c.placed:
         return _is_carried(c) and _still(c)
@@ -202,22 +179,20 @@ def _hanging(c: Context) -> bool:
         and abs(tel.position_m[2] - c.state.contact_z_m) <= complete.slip_m
     )
     at_target = c.obs.target is not None and abs(c.error_z_m) <= 0.15
-    # A landing that does not come down is held, wherever the target was thought to be.
     stayed = c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M and not c.far_below_target
     return held and (at_contact or at_target or stayed)
 
 
 def _down(c: Context) -> bool:
-    """True if the motors are off by the telemetry, and the supervisor agrees that nothing flies, or
-    has not changed its word for long."""
+    """True if the motors are off, and the supervisor agrees, or has not changed its word long."""
     stopped_s = c.state.stopped_s
     long_off = stopped_s is not None and c.t_s - stopped_s > SUPERVISOR_S
     return c.telemetry.thrust < 1 and (not c.telemetry.has(FLYING) or long_off)
 
 
 def _on_floor(c: Context) -> bool:
-    """True if it does not move on a thrust that could not carry it, low or below where the landing
-    began: a drifting estimate may place the floor anywhere."""
+    """True if it does not move on a thrust that could not carry it, low or come down: a drifting
+    estimate may place the floor anywhere."""
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
     came_down_m = c.state.entry_m[2] - c.telemetry.position_m[2]
     came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
@@ -227,8 +202,7 @@ def _on_floor(c: Context) -> bool:
 
 def _blocked(c: Context) -> bool:
     """True if it is pressed against something: the setpoint is above, the thrust at its limit or
-    above what hovering takes, and nothing moves. If hovering takes nearly all thrust, that is no
-    proof."""
+    above what hovering takes, and nothing moves."""
     setpoint, tel, safety = c.state.setpoint, c.telemetry, c.safety
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
@@ -241,9 +215,8 @@ def _blocked(c: Context) -> bool:
 
 
 def _carried(c: Context) -> bool:
-    """True if accelerometer and thrust alone show that something carries or presses it: much more
-    or much less thrust than hovering takes, at one g and a steady speed, by which it would rise or
-    sink in the air."""
+    """True if accelerometer and thrust alone show that something carries or presses it: by much
+    more or much less thrust than hovering takes it would rise or sink in the air."""
     tel, perch, hover = c.telemetry, c.planner.perch, c.state.hover_thrust
     apart = (c.safety.blocked_thrust_ratio - 1.0) * hover
     pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
@@ -257,13 +230,13 @@ def _carried(c: Context) -> bool:
 
 
 def _saturated(c: Context) -> bool:
-    """True at full thrust on which the vehicle does not rise (nor is it just being caught)."""
+    """True at full thrust on which the vehicle does not rise."""
     full = c.telemetry.thrust >= SATURATED * FULL_THRUST
     return full and -0.15 < c.climb_mps < 0.05
 
 
 def _battery_is_low(c: Context) -> bool:
-    """True if the firmware reports low power, or the voltage is low and was measured at all."""
+    """True if the firmware reports low power, or a measured voltage is low."""
     tel = c.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
     low = known and tel.battery_v < c.safety.min_load_v
@@ -288,13 +261,13 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.NEAR_STANDOFF: lambda c: c.tracked and c.is_near_standoff,
     Condition.SETTLED: _settled,
     Condition.CONTACT: _contact,
-    Condition.MAGNET_HOLDS: _magnet_holds,
+    Condition.MAGNET_HOLDS: lambda c: (
+        _is_carried(c) and not _magnet_slips(c) and (c.placed or _still(c))
+    ),
     Condition.SLIPPING: _magnet_slips,
     Condition.HANGING: _hanging,
     Condition.STEADY: lambda c: c.speed_mps <= c.planner.recover.steady_mps,
-    Condition.TILTED: lambda c: (  # by a fresh attitude, however old the position is
-        c.imu_proves and c.tilt_rad > math.radians(c.safety.max_tilt_deg)
-    ),
+    Condition.TILTED: lambda c: c.imu_proves and c.tilt_rad > math.radians(c.safety.max_tilt_deg),
     Condition.DOWN: _down,
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
@@ -312,25 +285,14 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
 C = Condition
 LASTING = frozenset({C.BATTERY_LOW, C.TILTED, C.UNSURE, C.SATURATED, C.CARRIED, C.OTHERWISE})
 """The vehicle's own, whatever the phase, and however it is held."""
-PROOFS = frozenset(
-    {
-        C.HANGING,
-        C.CONTACT,
-        C.MAGNET_HOLDS,
-        C.WEIGHT_HANGS,
-        C.DOWN,
-        C.ON_FLOOR,
-        C.CARRIED,
-        C.SATURATED,
-    }
-)
-"""What may stop the motors or end a flight: these count over fresh telemetry only."""
 BY_PLACE = frozenset({C.HANGING, C.CONTACT, C.ON_FLOOR})
 """Proofs that rest on the position: these count only while it is measured."""
+PROOFS = BY_PLACE | {C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.CARRIED, C.SATURATED}
+"""What may stop the motors or end a flight: these count over fresh telemetry only."""
 
 
 def conditions_since(c: Context) -> dict[Condition, float]:
-    """`PlannerState.since` of this tick, without the conditions that are void in it."""
+    """`PlannerState.since` of this tick, without what is void in it."""
     old, now_s, void = c.state.since, c.t_s, _void(c)
     return {
         name: old.get(name, now_s)
@@ -340,12 +302,12 @@ def conditions_since(c: Context) -> dict[Condition, float]:
 
 
 def lasting_conditions(since: dict[Condition, float]) -> dict[Condition, float]:
-    """The entries of `PlannerState.since` that last when the phase changes, or while held."""
+    """The entries that last when the phase changes, or while held."""
     return {name: s for name, s in since.items() if name in LASTING}
 
 
 def _void(c: Context) -> frozenset[Condition]:
-    """The conditions that do not count in this tick, since what they rest on is not fresh."""
+    """The conditions that rest on what is not fresh in this tick."""
     void: frozenset[Condition] = frozenset()
     if not c.imu_proves:
         void = PROOFS
@@ -365,8 +327,7 @@ def _void(c: Context) -> frozenset[Condition]:
 
 
 def has_slipped(c: Context) -> bool:
-    """True if it has slipped off its contact: debounced, but in free fall at once, since each 10 ms
-    costs what full thrust takes 80 ms to give back."""
+    """True if it has slipped off its contact: debounced, but in free fall at once."""
     tel, complete = c.telemetry, c.planner.complete
     falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and c.imu_proves and c.climb_mps < FALLING_MPS:

@@ -3,30 +3,118 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from perchctl.geometry import Array
 from perchctl.mission.state import Condition, Mismatch, Observation, PlannerState
-from perchctl.profile import PlannerConfig, Profile, SafetyConfig
+from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Telemetry
 
 FAR_BELOW_M = 0.5
-PUT_RIGHT_S = 0.5  # when external positions come again, the estimate is drawn back for so long
-CORRECTED_S, BLOWN_MPS = 0.2, 0.2  # of a newest sight, and 0.06 m/s in flights without a fault
+PUT_RIGHT_S = 0.5  # the estimate is drawn back to new positions for so long
+CORRECTED_S, BLOWN_MPS = 0.2, 0.2  # 0.06 m/s in flights without a fault
 ANSWER_S = 0.2  # within it the telemetry shows an ordered raw thrust
-HANGING_S = 1.0  # a thrust below the weight must be enough for so long to prove the magnet
+HANGING_S = 1.0  # to prove the magnet
 
 
-@dataclass(frozen=True, eq=False)
 class Context:
-    """The argument of the table's predicates and the phases' actions: one tick, whole."""
+    """The argument of the table's predicates and the phases' actions: one tick, whole.
 
-    state: PlannerState
-    obs: Observation
-    profile: Profile
+    Attributes:
+        by_sight: the target itself is the positioning system.
+        mismatch: what would bring the target to rest; zero while it rests.
+        height_m: above the ground that the flight started from.
+        attitude_age_s: of attitude, acceleration, thrust and supervisor bits, which come
+            together; `imu_proves`: new enough to prove anything.
+        variance_m2: of the position; 0 if the firmware reports none, infinite for a NaN.
+        thrust_is_known: the thrust that is read follows what is ordered.
+        reads_one_g: so does the accelerometer, as of what something carries.
+        telemetry_age_s: of its oldest part; a frozen reading is as old as its first one; `proves`:
+            new enough.
+        position_age_s: of the newest external position that was sent to the vehicle; with decks, of
+            the newest correction of its estimate; `position_is_stale`: none is fresh (fault 10).
+        located: the estimated position and speed are believed: positions come, not only just again,
+            and pictures that give them fit the accelerometer; `placed`: and can prove anything,
+            since they are fresh.
+        is_blown: after a blow or gust that only the accelerometer has measured, until a sight
+            corrects the estimate: the firmware's estimator ignores sideways forces.
+        climb_mps: vertical speed, by the estimate where that is believed and fresh, else by the
+            accelerometer.
+        target_m, target_yaw_rad: the target in the world of the state estimate, (3,), and its
+            heading; None while none was seen.
+        error_xy_m, error_z_m, error_yaw_rad: from the gear to the target; infinite while none was
+            seen.
+        contact_goal_z_m: height of the body at which the gear touches the target.
+        target_age_s: since the exposure of the last frame in which the target was measured.
+        tracked: the target is seen, or coasts within the filter's n_max frames; `fresh`: and was
+            measured as lately as the latency allows; `small_is_fresh`: so was the small marker.
+        far_below_target: the camera sees that nothing holds the vehicle where it is.
+        is_near_standoff: the gear is at the height at which an ascent settles.
+        cone_m: how far aside an ascent may be at the present height.
+    """
+
+    def __init__(self, state: PlannerState, obs: Observation, profile: Profile) -> None:
+        tel, imu, ascend = obs.telemetry, obs.imu, profile.planner.ascend
+        self.state = state
+        self.obs = obs
+        self.profile = profile
+        self.t_s = obs.t_s
+        self.telemetry = tel
+        self.planner = profile.planner
+        self.safety = profile.safety
+        self.by_sight = profile.positioning.by == "target"
+        self.mismatch = obs.mismatch or Mismatch()
+        self.in_phase_s = obs.t_s - state.entered_s
+        self.height_m = tel.position_m[2] - state.ground_z_m
+        self.attitude_age_s = obs.t_s - tel.t_s
+        self.imu_proves = self.attitude_age_s <= profile.safety.proof_age_s
+        self.reads_one_g = abs(tel.acc_z_g - 1.0) <= profile.planner.perch.contact_acc_g
+        self.speed_mps = math.sqrt(sum(v * v for v in tel.velocity_mps))
+        up = math.cos(tel.roll_rad) * math.cos(tel.pitch_rad)
+        self.tilt_rad = math.acos(max(-1.0, min(1.0, up)))
+        variance = tel.position_variance_m2 or 0.0
+        self.variance_m2 = math.inf if math.isnan(variance) else variance
+        unanswered_s = state.unanswered_s
+        self.thrust_is_known = unanswered_s is None or obs.t_s - unanswered_s <= ANSWER_S
+        oldest_s = max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
+        self.telemetry_age_s = obs.t_s - tel.t_s + oldest_s
+        self.proves = self.telemetry_age_s <= profile.safety.proof_age_s
+        self.position_age_s = obs.position_age_s
+        if profile.positioning.by == "deck":
+            self.position_age_s = max(obs.position_age_s, imu.corrections.age_s(obs.t_s))
+        self.position_is_stale = self.position_age_s > profile.positioning.hold_s
+        doubted = state.astray or (self.by_sight and obs.mismatch is not None)
+        just_again = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
+        self.located = not (doubted or self.position_is_stale or just_again)
+        self.placed = self.located and self.proves
+        reckoning, (x_mps, y_mps, climb_mps) = state.reckoning, tel.velocity_mps
+        is_reckoned, (rx_mps, ry_mps, _) = reckoning.imu is not None, reckoning.velocity_mps
+        uncorrected = self.by_sight and is_reckoned and self.position_age_s > CORRECTED_S
+        self.is_blown = uncorrected and math.hypot(rx_mps - x_mps, ry_mps - y_mps) > BLOWN_MPS
+        by_imu = is_reckoned and (state.blind_s is not None or not self.placed)
+        self.climb_mps = reckoning.velocity_mps[2] if by_imu else climb_mps
+        self.contact_goal_z_m = math.inf
+        self.target_m: Array | None = None
+        self.target_yaw_rad: float | None = None
+        self.error_xy_m = self.error_z_m = self.error_yaw_rad = self.target_age_s = math.inf
+        self.tracked = self.fresh = self.small_is_fresh = False
+        if (target := obs.target) is not None:
+            self.target_m, self.target_yaw_rad = target.world_m, target.world_yaw_rad
+            self.error_xy_m = math.hypot(target.e_m[0], target.e_m[1])
+            self.error_z_m, self.error_yaw_rad = float(target.e_m[2]), target.e_yaw_rad
+            self.target_age_s = obs.t_s - target.measured_s
+            self.tracked = target.tracked
+            if target.world_m is not None:
+                gear_z_m = profile.vehicle.gear_body_m[2]
+                self.contact_goal_z_m = float(target.world_m[2]) - gear_z_m
+            # On its arrival a frame is as old as the camera's latency.
+            latency_s = profile.camera.start_latency_s + obs.delay_s
+            limit_s = ascend.fresh_s + latency_s
+            self.fresh = target.tracked and self.target_age_s <= limit_s
+            self.small_is_fresh = obs.t_s - target.small_measured_s <= limit_s
+        self.far_below_target = self.target_m is not None and self.error_z_m > FAR_BELOW_M
+        self.is_near_standoff = self.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+        self.cone_m = ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)
 
     def with_state(self, state: PlannerState) -> Context:
         """The same tick with another state."""
@@ -36,136 +124,10 @@ class Context:
         """The same tick with changes of its state."""
         return self.with_state(replace(self.state, **changes))
 
-    @property
-    def t_s(self) -> float:
-        """Time of the tick on the loop's clock."""
-        return self.obs.t_s
-
-    @property
-    def telemetry(self) -> Telemetry:
-        """The newest sample."""
-        return self.obs.telemetry
-
-    @property
-    def planner(self) -> PlannerConfig:
-        """The profile's section of that name."""
-        return self.profile.planner
-
-    @property
-    def safety(self) -> SafetyConfig:
-        """The profile's section of that name."""
-        return self.profile.safety
-
-    @property
-    def mismatch(self) -> Mismatch:
-        """What would bring the target to rest; zero while it rests."""
-        return self.obs.mismatch or Mismatch()
-
-    @property
-    def in_phase_s(self) -> float:
-        """Seconds since the phase was entered."""
-        return self.t_s - self.state.entered_s
-
     def held(self, condition: Condition) -> float:
         """Seconds for which the condition has been true; -1 when it is not."""
         since = self.state.since.get(condition)
         return -1.0 if since is None else self.t_s - since
-
-    # --- the vehicle -----------------------------------------------------
-
-    @cached_property
-    def speed_mps(self) -> float:
-        """Length of the estimated velocity."""
-        return math.sqrt(sum(v * v for v in self.telemetry.velocity_mps))
-
-    @property
-    def height_m(self) -> float:
-        """Height above the ground that the flight started from, in the estimate's world."""
-        return self.telemetry.position_m[2] - self.state.ground_z_m
-
-    @property
-    def telemetry_age_s(self) -> float:
-        """Age of the telemetry's oldest part: position and velocity come in a packet of their own,
-        and a frozen reading is as old as its first one."""
-        tel, imu = self.telemetry, self.obs.imu
-        return self.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
-
-    @property
-    def attitude_age_s(self) -> float:
-        """Age of attitude, acceleration, thrust and supervisor bits, which come together."""
-        return self.t_s - self.telemetry.t_s
-
-    @property
-    def position_age_s(self) -> float:
-        """Age of the newest external position that was sent to the vehicle; with decks, of the
-        newest correction of its estimate."""
-        age_s = self.obs.position_age_s
-        if self.profile.positioning.by == "deck":
-            age_s = max(age_s, self.obs.imu.corrections.age_s(self.t_s))
-        return age_s
-
-    @property
-    def position_is_stale(self) -> bool:
-        """True while no external position is fresh (fault 10)."""
-        return self.position_age_s > self.profile.positioning.hold_s
-
-    @property
-    def proves(self) -> bool:
-        """True if all of the telemetry is new enough to prove anything."""
-        return self.telemetry_age_s <= self.safety.proof_age_s
-
-    @property
-    def imu_proves(self) -> bool:
-        """True if attitude, acceleration, thrust and supervisor bits are new enough to prove
-        anything, whatever the age of the position."""
-        return self.attitude_age_s <= self.safety.proof_age_s
-
-    @property
-    def thrust_is_known(self) -> bool:
-        """True if the thrust that is read follows what is ordered."""
-        unanswered_s = self.state.unanswered_s
-        return unanswered_s is None or self.t_s - unanswered_s <= ANSWER_S
-
-    @property
-    def located(self) -> bool:
-        """True if the estimated position and speed are believed: positions come, not only just
-        again, and pictures that give them fit the accelerometer."""
-        if self.by_sight and self.obs.mismatch is not None:
-            return False
-        if self.state.astray or self.position_is_stale:
-            return False
-        stale_s = self.state.stale_s
-        return stale_s is None or self.t_s - stale_s > PUT_RIGHT_S
-
-    @property
-    def placed(self) -> bool:
-        """True if the estimated position and speed can prove anything: believed, and fresh."""
-        return self.located and self.proves
-
-    @property
-    def is_blown(self) -> bool:
-        """True after a blow or gust that only the accelerometer has measured, until a sight
-        corrects the estimate: the firmware's estimator ignores sideways forces."""
-        reckoning = self.state.reckoning
-        if not self.by_sight or reckoning.imu is None or self.position_age_s <= CORRECTED_S:
-            return False
-        (x, y, _), (ex, ey, _) = reckoning.velocity_mps, self.telemetry.velocity_mps
-        return math.hypot(x - ex, y - ey) > BLOWN_MPS
-
-    @property
-    def climb_mps(self) -> float:
-        """Vertical speed, by the estimate where that is believed and fresh, else by the
-        accelerometer."""
-        blind = self.state.blind_s is not None or not self.placed
-        reckoning = self.state.reckoning
-        if blind and reckoning.imu is not None:
-            return reckoning.velocity_mps[2]
-        return self.telemetry.velocity_mps[2]
-
-    @property
-    def by_sight(self) -> bool:
-        """True if the target itself is the positioning system."""
-        return self.profile.positioning.by == "target"
 
     def sinks(self, mps: float) -> bool:
         """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts
@@ -174,106 +136,3 @@ class Context:
         if self.climb_mps >= -mps:
             return False
         return self.placed or tel.acc_z_g < 1.0 - self.planner.perch.contact_acc_g
-
-    @property
-    def variance_m2(self) -> float:
-        """Variance of the position; 0 if the firmware reports none, infinite if it is no number."""
-        variance = self.telemetry.position_variance_m2 or 0.0
-        return math.inf if math.isnan(variance) else variance
-
-    @property
-    def reads_one_g(self) -> bool:
-        """True if the accelerometer reads one g, as of what something carries."""
-        acc_g = self.planner.perch.contact_acc_g
-        return abs(self.telemetry.acc_z_g - 1.0) <= acc_g
-
-    @property
-    def tilt_rad(self) -> float:
-        """Angle between the vehicle's upward axis and the vertical."""
-        tel = self.telemetry
-        return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
-
-    # --- the target ------------------------------------------------------
-
-    @property
-    def target_m(self) -> Array | None:
-        """The target in the world of the state estimate, (3,); None while none was seen."""
-        return None if self.obs.target is None else self.obs.target.world_m
-
-    @property
-    def target_yaw_rad(self) -> float | None:
-        """The target's heading in the world of the state estimate; None while none was seen."""
-        return None if self.obs.target is None else self.obs.target.world_yaw_rad
-
-    @property
-    def error_xy_m(self) -> float:
-        """Horizontal distance of the gear from the target's axis; infinite without a target."""
-        target = self.obs.target
-        return math.inf if target is None else math.hypot(target.e_m[0], target.e_m[1])
-
-    @property
-    def error_z_m(self) -> float:
-        """Height of the target above the gear; infinite without a target."""
-        target = self.obs.target
-        return math.inf if target is None else float(target.e_m[2])
-
-    @property
-    def error_yaw_rad(self) -> float:
-        """Heading of the target relative to the vehicle's; infinite without a target."""
-        target = self.obs.target
-        return math.inf if target is None else target.e_yaw_rad
-
-    @property
-    def target_age_s(self) -> float:
-        """Seconds since the exposure of the last frame in which the target was measured."""
-        target = self.obs.target
-        return math.inf if target is None else self.t_s - target.measured_s
-
-    @property
-    def tracked(self) -> bool:
-        """True if the target is seen, or coasts within the filter's n_max frames."""
-        return self.obs.target is not None and self.obs.target.tracked
-
-    @property
-    def fresh(self) -> bool:
-        """True if the target is tracked, and was measured as lately as the latency allows."""
-        return self.tracked and self.target_age_s <= self._fresh_limit_s
-
-    @property
-    def small_is_fresh(self) -> bool:
-        """True if the small marker was measured as lately as the latency allows."""
-        target = self.obs.target
-        if target is None:
-            return False
-        return self.t_s - target.small_measured_s <= self._fresh_limit_s
-
-    @property
-    def _fresh_limit_s(self) -> float:
-        # On its arrival a frame is as old as the camera's latency.
-        latency_s = self.profile.camera.start_latency_s + self.obs.delay_s
-        return self.planner.ascend.fresh_s + latency_s
-
-    @property
-    def contact_goal_z_m(self) -> float:
-        """Height of the body at which the gear touches the target."""
-        if self.target_m is None:
-            return math.inf
-        return float(self.target_m[2]) - self.profile.vehicle.gear_body_m[2]
-
-    @property
-    def far_below_target(self) -> bool:
-        """True if the camera sees that nothing holds the vehicle where it is, whatever height a
-        frozen positioning system reports."""
-        return self.target_m is not None and self.error_z_m > FAR_BELOW_M
-
-    @property
-    def is_near_standoff(self) -> bool:
-        """True once the gear is at the height at which an ascent settles."""
-        ascend = self.planner.ascend
-        return self.error_z_m <= ascend.standoff_m + ascend.settle_z_m
-
-    @property
-    def cone_m(self) -> float:
-        """How far aside of the target an ascent may be at the present height."""
-        ascend = self.planner.ascend
-        return ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)

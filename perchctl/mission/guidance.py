@@ -1,9 +1,8 @@
 """Setpoints, the release at the ceiling, and the catch of a slip: for the phases and the lander.
 
-In position mode the onboard controller never goes below `THRUST_MIN`, so a magnet that carries half
-of the weight would pass for one that holds. Raw thrust goes on to where the motors stand still
-while the stream lives, ready to spin again (docs/firmware.md, "Release in raw mode"): the whole
-weight is put on the magnet and monitored, and only then the motors are stopped.
+In position mode the onboard controller never goes below `THRUST_MIN`. Raw thrust goes on to where
+the motors stand still (docs/firmware.md, "Release in raw mode"): the whole weight is put on the
+magnet and monitored, and only then the motors are stopped.
 """
 
 from __future__ import annotations
@@ -28,25 +27,24 @@ Acted = tuple[PlannerState, Command]
 HEIGHT_GAIN, HEIGHT_RATE_S, HEIGHT_LIMIT_M = 1.5, 0.25, 0.15
 POSITION_GAIN, VELOCITY_GAIN_S = 1.0, 0.3
 STIFF_BELOW_M, STIFF_RANGE_M, STIFF_LIMIT_M = 0.8, 0.4, 0.1
-FLOOR_M = 0.05  # above the ground, no lower; what is left is the vehicle's own landing
+FLOOR_M = 0.05  # above the ground, no lower
 PRESSING_PART, PRESSING_RATIO = 0.95, 1.05
 UNPRESSED_MPS, UNPRESSED_M, FALLING_MPS = 0.05, 0.08, -0.3
 UNWIND_M, UNWIND_AWAY_M, UNPRESS_LIMIT_S = 1.0, 0.25, 4.0
-LIFTED_M = 0.1  # below it a vehicle may still stand, and its height is not to be corrected
+LIFTED_M = 0.1  # below it a vehicle may still stand
+WARY_MPS = 0.25  # sideways, while nothing confirms the camera's mounting
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 SINK_MPS, LOWEST_M = 0.2, 0.3
-STILL_THRUST = 1000  # raw: the motors stand still and the stream lives (5000 and less)
-UNREAD_S = 1.5  # longer hang if thrust is not read: lost orders end in the firmware's cut at 2 s
+STILL_THRUST = 1000  # raw: the motors stand still, the stream lives
+UNREAD_S = 1.5  # longer hang if thrust is not read
 THRUST_MIN = 20000  # the least of position mode
 STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
 CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
-"""Motors that stand still need all the thrust there is. Those that turn with most of it would carry
-the vehicle back to the ceiling, beside the target's centre."""
+"""By all the thrust there is, motors that turn would carry it back to the ceiling."""
 CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
-CARRIED_RATIO = 0.85  # of the hover thrust: what still has so much sinks slowly by itself
 MOST_BRAKED_MPS = 1.0  # no blow that the vehicle survives leaves more
 POSITION_GAIN_PER_S = 2.0  # the firmware's `posCtlPid.xKp` and `yKp`
-CAUGHT_MPS = -0.1  # by then the thrust is above the weight, and rises on
+CAUGHT_MPS = -0.1  # by then the thrust is above the weight
 
 
 # --- Setpoints --------------------------------------------------------
@@ -67,33 +65,31 @@ def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
 
 
 def walk(
-    old: PositionSetpoint,
-    goal: PositionSetpoint,
-    dt_s: float,
-    *,
-    xy_mps: float,
-    up_mps: float,
-    down_mps: float,
-    yaw_rate_radps: float,
+    c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> PositionSetpoint:
-    """The setpoint one tick later: towards the goal, at limited speeds."""
+    """The setpoint one tick later: towards the goal, at limited speeds; wary of a mounting that
+    nothing confirms. What comes down does not turn. Only a search, an ascent, a take-off and the
+    press pass an `up_mps`; a catch climbs in another way."""
+    old, dt_s, align = c.state.setpoint or hold_here(c), c.t_s - c.state.t_s, c.planner.align
+    xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
+    if c.state.phase is Phase.LANDING:
+        yaw_radps = 0.0
+    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
+        xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
     part = 1.0 if distance <= xy_mps * dt_s else xy_mps * dt_s / distance
     dz = max(-down_mps * dt_s, min(up_mps * dt_s, goal.z_m - old.z_m))
     dyaw = wrap_rad(goal.yaw_rad - old.yaw_rad)
-    dyaw = max(-yaw_rate_radps * dt_s, min(yaw_rate_radps * dt_s, dyaw))
+    dyaw = max(-yaw_radps * dt_s, min(yaw_radps * dt_s, dyaw))
     return PositionSetpoint(
         old.x_m + part * dx, old.y_m + part * dy, old.z_m + dz, wrap_rad(old.yaw_rad + dyaw)
     )
 
 
 def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """Integral of the gear's position error, world axes, limited.
-
-    It takes away the offset that a steady draught leaves to the onboard position loop, and rests
-    while the error is large.
-    """
+    """Integral of the gear's position error, m, world axes, limited; it rests while the error is
+    large, and takes away what a steady draught leaves."""
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
@@ -108,12 +104,9 @@ def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[f
 
 
 def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
-    """The setpoint that brings the vehicle to the reference.
-
-    Horizontally the learned trim is added and, near the target, the position loop is stiffened. In
-    height a multiple of the error is added: the onboard integrator, wound up in a climb, carries
-    the vehicle several centimetres past a setpoint that stops.
-    """
+    """The setpoint that brings the vehicle to the reference: with the learned trim, a stiffer
+    position loop near the target, and, with `lift`, a multiple of the error in height, since the
+    onboard integrator carries it past a setpoint that stops."""
     tel = c.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
@@ -127,8 +120,7 @@ def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> 
 
 
 def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Position and velocity feedback on top of the onboard loop, near the target only: far away
-    attitude errors move the seen target by centimetres, which a stiff loop would chase."""
+    """Feedback on top of the onboard loop, near the target only."""
     near = (STIFF_BELOW_M - c.error_z_m) / STIFF_RANGE_M
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
@@ -142,8 +134,8 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint one tick later. Without a sight of the target it sinks: the camera's cone
-    opens upwards, so the target is soonest seen again from lower down."""
+    """The held setpoint one tick later. Without a sight of the target it sinks: from lower down it
+    is soonest seen again."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
@@ -189,11 +181,7 @@ def _is_strong(c: Context) -> bool:
 
 def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     """A setpoint below the vehicle until it is away from what it pressed against and the onboard
-    integrators have come down; None once they have, or if nothing was pressed.
-
-    After a second at full thrust they need many seconds of a setpoint just below, and a change to
-    the vehicle's own landing does not reset them.
-    """
+    integrators have come down; None once they have, or if nothing was pressed."""
     state, tel = c.state, c.telemetry
     x, y, z = state.entry_m
     if not state.pressed:
@@ -217,12 +205,10 @@ def lower_thrust(c: Context) -> Acted:
     if perch.mode == "raw":
         if not c.imu_proves:
             return hold_by_position(c)
-        # The lowest step stays below what could carry the vehicle, above the idle cut.
         lowest = 0.9 * complete.hold_ratio * state.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
     assert state.contact_z_m is not None
-    # Without a position the estimate slides, and the vehicle does not: the setpoint goes with it.
     slid_m = 0.0 if c.placed else c.telemetry.position_m[2] - state.contact_z_m
     top = state.entry_m[2] + perch.press_m + slid_m
     low = state.contact_z_m - complete.release_drop_m + slid_m
@@ -233,8 +219,7 @@ def lower_thrust(c: Context) -> Acted:
 
 def release_by_thrust(c: Context) -> Acted:
     """The release's second stage: raw thrust down to still motors, and the stop when the whole
-    weight has hung long enough. Without fresh telemetry it begins anew; in a landing late telemetry
-    is enough, or what hangs would end by its own landing."""
+    weight has hung long enough. Without fresh telemetry it begins anew; late is enough to land."""
     late_s = c.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
         return hold_by_position(c)
@@ -254,26 +239,24 @@ def release_by_thrust(c: Context) -> Acted:
 
 
 def hold_by_position(c: Context) -> Acted:
-    """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught.
-    Still motors would be a stop without a proof."""
+    """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught."""
     state, tel = c.state, c.telemetry
     x, y, z_m = tel.position_m
-    if state.contact_z_m is not None and c.placed:  # else the estimate has slid away from it
+    if state.contact_z_m is not None and c.placed:
         z_m = state.contact_z_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)
 
 
 def is_still(c: Context) -> bool:
-    """True if the motors stand still by raw thrust: a stop then only ends the stream without a
-    lock."""
+    """True if the motors stand still by raw thrust."""
     released_s = c.state.released_s
     return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Acted:
-    """Stop and notify, `STOPS` times whatever the telemetry shows: one lost notify locks a vehicle
-    that hangs. Again while there is thrust."""
+    """Stop and notify, `STOPS` times: one lost notify locks what hangs. Again while there is
+    thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
@@ -290,14 +273,8 @@ def catch_above_m(hover_thrust: float, thrust: float) -> float:
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
 
 
-def is_carried(hover_thrust: float, thrust: float) -> bool:
-    """True if what slips hardly falls, since the motors carry most of the weight."""
-    return thrust >= CARRIED_RATIO * hover_thrust
-
-
 def catch(c: Context) -> Acted | None:
-    """After a slip a setpoint far above, until the vehicle hardly sinks; None when it is caught, or
-    its telemetry is old."""
+    """After a slip a setpoint far above; None when it is caught, or its telemetry is old."""
     state, tel = c.state, c.telemetry
     if state.caught or not c.imu_proves:
         return None
@@ -312,8 +289,7 @@ def catch(c: Context) -> Acted | None:
 
 
 def _braked_place_m(c: Context) -> tuple[float, float]:
-    """The setpoint that takes out a sideways speed which the estimate misses: the position mode
-    asks for `POSITION_GAIN_PER_S` times the way to it."""
+    """The setpoint that takes out a sideways speed which the estimate misses."""
     tel, reckoned_mps = c.telemetry, c.state.reckoning.velocity_mps
     missed_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in missed_mps)

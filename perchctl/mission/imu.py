@@ -2,9 +2,7 @@
 
 `ImuMotion` integrates the specific force over each sample of the telemetry, and notes when the
 vehicle fell, sank or was silent. `Reckoning` is the planner's: the speed and the place under the
-target, carried on from the last good position. In flight the firmware's estimator measures
-accelerations along the thrust only (docs/firmware.md, "Target as position"): a blow or a gust from
-the side moves the vehicle and not its estimate, and shows in the accelerometer's other two axes.
+target, carried on from the last good position.
 """
 
 from __future__ import annotations
@@ -23,52 +21,39 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 GAP_S = 0.2  # a silence in which a vehicle falls 20 cm, more than it may and still hang
 NO_FALL_MPS, NO_FALL_M = 0.25, 0.25
-"""By its estimate what hangs gains no more speed in a silence, beyond its speed before; a fall of
-half a metre gains 3 m/s, or, where the floor has stopped it, the way."""
-SINKS_MPS = -0.3  # by the estimate of each moment what hangs is no faster: 5 cm of a fall are
-FROZEN_S = 0.2  # an accelerometer that reads the same for so long counts as a silence
-FALL_G, FALL_S = 0.6, 0.1  # specific force of a fall, and its least time: an impact is shorter
-SINK_MPS = -0.25  # a vehicle that begins to come down, whatever its accelerometer's offsets
+"""What hangs gains no more speed in a silence, nor way beyond its speed before."""
+SINKS_MPS = -0.3  # what hangs is no faster: 5 cm of a fall are
+FROZEN_S = 0.2  # the same reading for so long counts as a silence
+FALL_G, FALL_S = 0.6, 0.1  # of a fall: an impact is shorter
+SINK_MPS = -0.25  # it begins to come down, whatever the offsets
 SINK_MEMORY_S, OFFSET_MEMORY_S = 1.5, 3.0
-IMPACT_G = -0.3  # what brakes a climb harder is an impact on the ceiling, and no way down
-BLOW_MPS, BLOW_S = 0.22, 0.1  # gained upwards in that time, more than any thrust gives: the floor
+IMPACT_G = -0.3  # what brakes a climb harder is an impact on the ceiling
+BLOW_MPS, BLOW_S = 0.22, 0.1  # gained upwards by the floor: no thrust gives it
 BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5  # a blow shows so much later; what follows belongs to it
 STEADY_MPS, STEADY_ASIDE_MPS, ASIDE_MEMORY_S = 0.06, 0.15, 0.15
-"""Speeds so near to each other are one speed. Sideways the mean of the last moment is what it is
-near to: 0.01 rad of wrong attitude adds 0.1 m/s each second, and a blow all of it at once."""
+"""Speeds so near to each other are one speed; sideways, near to the mean of the last moment."""
 REST_MEMORY_S = 0.5  # at rest on the ground the offsets are learned in so long
 SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
-"""In so long the reckoned speed is drawn to a believed estimate's, and what is left of the offsets,
-a wrong attitude's too, is learned: wrong pictures lead the estimate astray within a second."""
+"""In so long the reckoned speed is drawn to a believed estimate's, and the offsets are learned."""
 MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5  # more is a blow, or a correction of the estimate
-CLIMB_SPARE_MPS = 0.1  # by which the vehicle may come nearer to the target than reckoned
+CLIMB_SPARE_MPS = 0.1  # it may climb faster than reckoned
 MOST_CLIMB_MPS = 1.0  # in a silence, by the position mode's own limit
 REACH_M = 0.04  # a gear so near below the target may have been caught by its magnet
 BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.06, 1.5
-"""Memory of the difference between the speeds gained by estimate and accelerometer; a push from the
-side shows in the accelerometer at once, and in the estimate a second or two later."""
-PUSH_MEMORY_S = 0.05
-"""Of the mean sideways force: turning motors shake single samples by as much as a push gives. A
-gust that gains 1 m/s in a second makes a mean of 0.09 g."""
+"""A push from the side shows in the estimate a second or two later."""
+PUSH_MEMORY_S = 0.05  # turning motors shake single samples by as much as a push gives
 STEP_M, STEP_MPS = 0.005, 0.2
-"""Motion of the estimated position beyond its speed, and beyond that times the samples' distance:
-at most 4 mm in 10 ms without a fault, kicks included."""
-UNSEEN_S = 0.15  # samples missing for longer: a step of the position may be the vehicle's motion
-CARRIED_S = 0.05  # for at most so long a position is carried on to its sample's time
+"""Motion of the estimated position beyond its speed, and the same for each second."""
+UNSEEN_S = 0.15  # after a longer silence a step may be the vehicle's motion
+CARRIED_S = 0.05  # a position is carried on for at most so long
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
-"""Spread of a reckoned place: by the learned offset, by the speed at the last sight, and the share
-of the way, since the samples of a blow come each 10 ms."""
+"""Spread of a reckoned place: by the offset, by the speed at the last sight, and by the way."""
 CORRECTED_MPS, CORRECTED_MPS2, CORRECTED_MEMORY_S = 0.08, 5.0, 6.0
-"""A sideways speed that the estimate gains at once, and beyond what a tilt gives, is a correction
-by a position, which may have turned the attitude, too."""
+"""A sideways speed that the estimate gains at once is a correction by a position."""
 HOVER_MEMORY_S, LEAST_FLYING, SATURATED = 0.5, 0.4, 0.95
-"""Of the measured hover thrust, which needs a share of the full thrust within these."""
-LED_PER_S = 1.5
-"""Acceleration that wrong positions feign for each m/s by which they have led the speed astray: the
-onboard filter corrects the attitude with it (docs/firmware.md, "Estimator in flight")."""
+LED_PER_S = 1.5  # acceleration that positions feign for each m/s of lead
 UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
-"""The variance of the estimated vertical speed grows by 1e-3 a second if nothing corrects it
-(docs/firmware.md, "Variances"); half that rate over five of its packets is no chance."""
+"""Half of what the variance of the vertical speed grows by if nothing corrects it."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +62,7 @@ class Corrections:
 
     variance_m2ps2: float | None = None  # the newest
     changed_s: float = -math.inf  # when that came
-    none_since_s: float = math.inf  # since when it has grown without a break as uncorrected
+    none_since_s: float = math.inf  # since when it only grows
 
     def age_s(self, now_s: float) -> float:
         """Age of the last correction, if it is certain that none comes any more; else 0."""
@@ -85,7 +70,7 @@ class Corrections:
         return now_s - self.none_since_s if certain else 0.0
 
     def updated(self, sample: Telemetry) -> Corrections:
-        """The corrections with one more sample. An unchanged variance means that no packet came."""
+        """The corrections with one more sample."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -112,11 +97,11 @@ class ImuMotion:
     `-inf` for what never happened."""
 
     t_s: float = -math.inf  # of the newest sample
-    velocity_mps: Vector = ZERO  # integral since the first sample, world axes; it drifts
+    velocity_mps: Vector = ZERO  # since the first sample, world axes
     offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
     fell_s: float = -math.inf  # when it last fell, or came down and met the floor
-    silent_s: float = -math.inf  # end of the newest silence, or of a frozen accelerometer
-    gap_s: float = -math.inf  # end of the newest one over which the estimate may hide a fall
+    silent_s: float = -math.inf  # end of the newest silence
+    gap_s: float = -math.inf  # of the newest that may hide a fall
     started_s: float = -math.inf  # first heard again after it had started anew
     sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
     steady_s: float = math.inf  # since when the vertical speed has stayed what it is
@@ -131,8 +116,8 @@ class ImuMotion:
     frozen_s: float = 0.0  # for how long the accelerometer has read the very same
     attitude_frozen_s: float = -math.inf  # the same of the attitude; -inf before a change
     place_frozen_s: float = -math.inf  # the same of position and velocity
-    hover_thrust: float = 0.0  # thrust for each measured g in flight, 0..65535; 0 before it
-    aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes, without offsets
+    hover_thrust: float = 0.0  # for each measured g in flight
+    aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes
     pushed_s: float = -math.inf  # when something last pushed it sideways
     misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
     turning_radps: tuple[float, float] = (0.0, 0.0)
@@ -196,7 +181,6 @@ class ImuMotion:
         if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
             steady_aside_s = new.t_s
         now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
-        # The mean sideways force with one more sample.
         keeps = math.exp(-dt_s / PUSH_MEMORY_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
         mean_x_g, mean_y_g = motion.aside_g
@@ -233,8 +217,8 @@ class ImuMotion:
     def acceleration_mps2(
         sample: Telemetry, offset_g: Vector, misled_rad: tuple[float, float] = (0.0, 0.0)
     ) -> Vector:
-        """Acceleration in world axes by the specific force and the attitude of one sample, without
-        the accelerometer's offset and what corrections have turned roll and pitch by wrongly."""
+        """Acceleration in world axes by force and attitude of a sample, without the offset and
+        what corrections have turned roll and pitch by wrongly."""
         roll_rad, pitch_rad = sample.roll_rad - misled_rad[0], sample.pitch_rad - misled_rad[1]
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
@@ -274,8 +258,7 @@ def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) ->
 
 
 def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
-    """True if the estimate excludes a fall in a silence between two samples, or in a moment in
-    which only the accelerometer stood still."""
+    """True if the estimate excludes a fall between two samples."""
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     way_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
@@ -313,8 +296,7 @@ def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mp
 def _misled(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The angles by which corrections have turned roll and pitch, in rad, and the rates of the
-    vehicle's own rotation, in rad/s."""
+    """How far corrections have turned roll and pitch, and the own rates."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S
@@ -342,7 +324,7 @@ def _frozen_s(
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    """The hover thrust with one more sample, which counts if it neither rests nor presses."""
+    """The hover thrust with one more sample of free flight."""
     flies = sample.has(FLYING) and sample.thrust < SATURATED * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
@@ -364,16 +346,16 @@ class Reckoning:
 
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
-    bias_mps2: Vector = ZERO  # excess of accelerometer and attitude, learned beside the estimate
+    bias_mps2: Vector = ZERO  # excess of accelerometer and attitude
     estimated_mps: Vector = ZERO
     beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
-    below_m: float = math.inf  # gear below the target at the least; inf if unseen or fallen
+    below_m: float = math.inf  # gear below the target; inf if unseen or fallen
     nearest_m: float = math.inf  # the same with a climb in silences; a fall only adds to it
     unsure_s: float = -math.inf  # end of the newest silence that may have led to the magnet
     aside_m: tuple[float, float] = (0.0, 0.0)  # from the gear to the target's axis
     aside_sigma_m: float = math.inf  # standard deviation of that; inf if unknown
     sight_s: float = -math.inf  # exposure of the sight that it is carried on from
-    stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate beyond its speed since
+    stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate since
     stepped_s: float = -math.inf  # the newest of them
     struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
 
@@ -394,11 +376,9 @@ def advance_reckoning(
         if astray:
             vx, vy, vz = old.velocity_mps
             if old.imu is not None and imu.silent_s <= old.imu.t_s:
-                # Only the attitude stands still.
                 vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
             velocity_mps = (vx, vy, vz)
         elif not believed and old.imu is not None:
-            # No position corrects the estimate in a silence: its change was measured on board.
             vx, vy, vz = (
                 v + e - o
                 for v, e, o in zip(old.velocity_mps, estimated, old.estimated_mps, strict=True)
@@ -408,8 +388,14 @@ def advance_reckoning(
             old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated, beside_mps=(0.0, 0.0)
         )
         if old.imu is not None and imu.silent_s > old.imu.t_s:
-            flew = _may_have_flown(old.imu, imu)
-            nearest_m = old.nearest_m - _most_climb_m(old, imu.t_s, flew=flew)
+            # Not with motors that were off around the silence, nor started anew.
+            off = old.imu.off_s <= old.imu.t_s and imu.off_s <= imu.t_s
+            flew = not (off or imu.started_s > old.imu.t_s)
+            climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
+            climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
+            if flew:
+                climb_m = MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
+            nearest_m = old.nearest_m - climb_m
             near = nearest_m < REACH_M
             unknown = replace(
                 unknown,
@@ -459,30 +445,14 @@ def advance_reckoning(
 
 
 def discount_wrong_positions(old: Reckoning) -> Reckoning:
-    """The reckoning once the positions are found to be wrong: they have turned the attitude, too,
-    of which hardly any was learned in so short a time."""
+    """The reckoning once wrong positions have turned the attitude."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
 
-def _may_have_flown(before: ImuMotion, after: ImuMotion) -> bool:
-    """True unless the motors were off around a silence, or the vehicle started anew."""
-    off = before.off_s <= before.t_s and after.off_s <= after.t_s
-    return not (off or after.started_s > before.t_s)
-
-
-def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
-    """The highest climb in a silence; without thrust, by the speed before it."""
-    if flew:
-        return MOST_CLIMB_MPS * (now_s - (old.imu.t_s if old.imu else now_s))
-    climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
-    return climb_mps**2 / (2.0 * GRAVITY_MPS2)
-
-
 def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
-    """The reckoning with the step of the estimate's position between two samples, which its speed
-    does not explain. Steps smeared over some samples add up, a step aside and back cancels; where
-    samples are missing none is seen."""
+    """The reckoning with the step of the position between two samples that its speed does not
+    explain. Steps add up; where samples are missing none is seen."""
     dt_s = _position_s(sample) - _position_s(last)
     if not 0.0 < dt_s <= UNSEEN_S:
         return old
@@ -499,15 +469,14 @@ def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
 
 
 def _position_s(sample: Telemetry) -> float:
-    """Time of the position, whose older packet is carried on by at most `CARRIED_S`."""
+    """Time of the position, carried on by at most `CARRIED_S`."""
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
 def add_sight(
     old: Reckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> Reckoning:
-    """The reckoning with a sight: `aside_m` from the gear to the target's axis, world axes,
-    `below_m` from the gear up to it."""
+    """The reckoning with a sight: from the gear to the target's axis, world axes, and up to it."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
     )

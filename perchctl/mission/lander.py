@@ -3,17 +3,11 @@
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
 What lands by itself, has its weight on the magnet or is stopped goes on with that, whatever is
-known. What still comes down follows `DESCENTS` (the table of docs/mission.md), by the `Evidence`
-that is fresh and by whether the vehicle may be where the magnet holds it.
+known. What still comes down does it by what is known and fresh, and by whether the vehicle may be
+where the magnet holds it (the table of docs/mission.md). Nothing here climbs but a catch.
 
-Two proofs go before the table: what falls off the magnet is caught, and what stands on the floor is
-stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
-wherever it is by then: it is ordered only where a position that does not rest on pictures shows the
-vehicle away from the ceiling, and in flight.
-
-Before each command: if it is the last packet, a position setpoint or a raw thrust ends in the
-firmware's level-out after 0.5 s and its cut after 2 s, an own landing goes on by itself
-(docs/firmware.md, "When setpoints stop"). Nothing here climbs but a catch.
+The vehicle's own landing follows a trajectory by its clock and then stops the motors, wherever it
+is by then: it is ordered only where a position shows the vehicle away from the ceiling.
 """
 
 from __future__ import annotations
@@ -61,38 +55,6 @@ from perchctl.vehicle import (
 )
 
 
-class Evidence(Enum):
-    """The best of what is known and fresh."""
-
-    POSITION = "position"  # measured by decks or motion capture
-    SIGHT = "position by the target"
-    HEIGHT = "height"  # and vertical speed; the heading is lost
-    IMU = "attitude and acceleration"
-    ONBOARD = "the vehicle's own"  # it has a position; telemetry, link or loop cannot be relied on
-    NOTHING = "nothing"
-
-
-class Manoeuvre(Enum):
-    """How the lander brings a vehicle down."""
-
-    SETPOINTS = "position setpoints, then its own landing"
-    SETPOINTS_LEVEL = "position setpoints, then level"
-    PEEL = "a setpoint below, then the weight on the magnet"
-    LEVEL = "level, by thrust"
-    OWN_LANDING = "its own landing"
-
-
-DESCENTS: dict[Evidence, tuple[Manoeuvre, Manoeuvre]] = {
-    Evidence.POSITION: (Manoeuvre.SETPOINTS, Manoeuvre.PEEL),
-    Evidence.SIGHT: (Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL),
-    Evidence.ONBOARD: (Manoeuvre.OWN_LANDING, Manoeuvre.PEEL),
-    Evidence.HEIGHT: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
-    Evidence.IMU: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
-    Evidence.NOTHING: (Manoeuvre.LEVEL, Manoeuvre.LEVEL),
-}
-"""Evidence -> manoeuvre of what comes down free, and within the magnet's reach."""
-
-
 class Finding(Enum):
     """Where a vehicle with its motors off is, as a sentence without its end."""
 
@@ -103,45 +65,41 @@ class Finding(Enum):
     UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"  # they may turn
 
 
-LOOKED_S = 2.0  # a target that is seen far above has so long to show where the vehicle is
+LOOKED_S = 2.0  # a target far above has so long to show
 HUNG_WITHIN_M = 0.3
-CARRIED_WITHIN_M = 0.3  # what carries or presses a vehicle so near below the target is the target
+CARRIED_WITHIN_M = 0.3  # what carries it so near below the target is the target
 REPEAT_ORDER_S, LEAST_ORDERS, MAX_ORDERS = 0.3, 3, 6
-"""No telemetry shows a lost notify, without which an order is not flown and the vehicle is cut 2 s
-later (docs/firmware.md, "Order without notify"): so the pair is sent three times, and more often
-while nothing shows."""
-PLANNED_MPS, SETTLING_S = 0.35, 1.8  # of the own landing's quintic: largest speed; time to begin
-PEAK_OF_MEAN = 1.875  # of a quintic from rest to rest: its largest speed over its mean
+"""Without its notify an order is not flown (docs/firmware.md, "Order without notify")."""
+PLANNED_MPS, SETTLING_S = 0.35, 1.8  # of the own landing's quintic
+PEAK_OF_MEAN = 1.875  # a quintic's largest speed over its mean
 MOST_DRIFT_M = 1.0
 PEELED_M = 0.1  # below the contact by so much, the magnet has let go
 PEEL_BELOW_M, PEEL_S = 0.35, 4.0
 DROPPING_MPS = -0.35
-FALLING_G, FALLEN_MPS = 0.5, 1.0  # a landing that ends 5 cm above the floor drops it no faster
-FALLEN_BELOW_M = 0.4  # by a position: such an end from higher up is a cut in the air
+FALLING_G, FALLEN_MPS = 0.5, 1.0  # from 5 cm above the floor it drops no faster
+FALLEN_BELOW_M = 0.4  # from higher up it is a cut in the air
 HIGH_M, LOW_M, STAYED_M = 0.45, 0.3, 0.15
-HELD = "held"  # the transition of a landing that began since something held the vehicle
+HELD = "held"  # the row of a landing since something held it
 SINK_MPS, LOW_SINK_MPS, SLOW_BELOW_M = 0.7, 0.4, 0.6
-"""Level it comes down fast from high up: by the gyroscope's offset it goes sideways with the third
-power of the time, 2 m in 4 s."""
+"""By the gyroscope's offset it goes 2 m sideways in 4 s."""
 MOST_GAIN_S_PER_M, LEAST_GAIN_S_PER_M, GAIN_AGE_S2_PER_M = 0.5, 0.2, 0.06
 """Part of the hover thrust for each m/s; an older speed wants less, or it swings."""
 HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
 LATEST_S, UNHEARD_PART, OWN_ESTIMATE_S = 1.0, 0.98, 1.5
 """Later telemetry no longer tells the speed; then a little less thrust lets it come down."""
-ON_THE_SPOT_S = 0.6  # so long by setpoints at one place, and no speed of before is left
+ON_THE_SPOT_S = 0.6  # by setpoints at one place; no speed is left then
 RAMP_PER_S, STILL_MPS = 0.25, 0.05  # what does not sink gets less and less thrust
 LEAST_PART, MOST_RAW = 0.4, 60000.0
-BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22  # by 1/e in 0.4 s; takes 2.5 % of the thrust
+BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22  # takes 2.5 % of the thrust
 BRAKED_AGE_S = 0.2  # an older speed is braked less, or it swings
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
-"""Left of the reckoned speed: an attitude error of 0.01 rad adds 0.1 m/s to it each second."""
-LEVEL_FELT_S = 6.0  # an attitude error that pictures measured is not the present one for longer
+"""An attitude error of 0.01 rad adds 0.1 m/s each second."""
+LEVEL_FELT_S = 6.0  # an attitude error of before is not the present one
 STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
-UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther before an order is answered
+UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther
 CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
 TOUCH_PART, TOUCH_S, TOUCH_BELOW_M = 0.5, 0.25, 0.7
-"""A blow from below so near the floor is the floor: half of the hover thrust proves it, since in
-the air the vehicle falls with it."""
+"""A blow from below so near the floor is the floor."""
 LEVEL_SPARE_S, UNHEARD_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.8, 0.35
 AT_REST_S = 0.3
 
@@ -181,7 +139,7 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
     tel, stopped_s = c.telemetry, old.stopped_s
     heard = c.t_s - tel.t_s <= c.safety.proof_age_s
     ordered = heard and tel.has(HL_ACTIVE) and not c.by_sight
-    if ordered and not c.state.astray:  # else it would follow the wrong positions to its end
+    if ordered and not c.state.astray:
         c = c.evolve(orders=LEAST_ORDERS, ordered_s=c.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
         # The motors were stopped, or never turned: nothing spins them up again.
@@ -192,8 +150,6 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
         # it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
     hover = _hover_thrust(old, c.obs)
-    # While the loop was silent the watchdog may have brought it down or to the magnet: what was
-    # measured meanwhile counts from the tick before.
     within = contact_z_m is not None or c.state.reckoning.below_m < REACH_M
     blind = _has_lost_its_position(c)
     c = c.evolve(
@@ -209,20 +165,13 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
 # --- What is known ----------------------------------------------------
 
 
-def evidence_of(c: Context) -> Evidence:
-    """The best that is fresh in this tick."""
+def _knows_its_place(c: Context) -> bool:
+    """True if a position and a heading are left to come down by."""
+    if c.state.astray or c.state.blind_s is not None or (c.by_sight and not _is_sighted(c)):
+        return False
+    # Without a vertical speed raw thrust would be blind, and the vehicle's own landing is left.
     heard = c.attitude_age_s <= c.safety.telemetry_hold_s
-    unplaced = c.state.astray or c.state.blind_s is not None
-    if not heard and (c.by_sight or unplaced):
-        return Evidence.NOTHING
-    if unplaced or (c.by_sight and not _is_sighted(c)):
-        return Evidence.IMU
-    if c.by_sight:
-        return Evidence.HEIGHT if c.state.heading_lost else Evidence.SIGHT
-    if heard and c.state.heading_lost:
-        fresh = c.telemetry_age_s <= c.safety.telemetry_hold_s
-        return Evidence.HEIGHT if fresh and c.placed else Evidence.IMU
-    return Evidence.ONBOARD if _is_doubtful(c) else Evidence.POSITION
+    return not (c.state.heading_lost and (c.by_sight or heard))
 
 
 def _is_doubtful(c: Context) -> bool:
@@ -257,11 +206,8 @@ def is_driven(c: Context) -> bool:
 
 
 def rest_finding(c: Context) -> Finding:
-    """Where the vehicle is, once its motors are off.
-
-    What was within the magnet's reach and has not fallen since hangs, unless a silence of the
-    telemetry could hide a fall. Else a position decides, or the picture of a target far above.
-    """
+    """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
+    above, or by the falls that were felt since it came into the magnet's reach."""
     tel, state = c.telemetry, c.state
     if _is_held_elsewhere(c):
         return Finding.HELD
@@ -277,8 +223,7 @@ def rest_finding(c: Context) -> Finding:
 
 
 def _is_held_elsewhere(c: Context) -> bool:
-    """True if it is up, and not on the target's magnet: held as the landing began and not fallen
-    since, or below the target by a position."""
+    """True if it is up, and not on the target's magnet."""
     state = c.state
     if state.phase is not Phase.LANDING:
         return False
@@ -293,7 +238,7 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 def _by_fall(c: Context, since_s: float | None) -> Finding:
     """Where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the falls
-    that the accelerometer felt since, and the silences that could hide one."""
+    since, and the silences that could hide one."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
     unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt
@@ -304,11 +249,9 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
 
 
 def hangs_where_it_did(c: Context) -> bool:
-    """True if it is at its contact by a position, or has hung all the time by the accelerometer.
-    A silence as long as a fall leaves it unknown."""
+    """True if it is at its contact by a position, or has hung all the time by the accelerometer."""
     contact_z_m, tel = c.state.contact_z_m, c.telemetry
     if not c.by_sight and c.placed and contact_z_m is not None:
-        # A slip ends the contact at once, and the estimate of what hangs drifts less.
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
             return True
@@ -327,11 +270,9 @@ def hangs_stopped(c: Context) -> bool:
 
 
 def observe(c: Context) -> Context:
-    """The tick with what is remembered of its observation. Hangs of the loop, jumps of the estimate
-    and lost positions are noticed here, for all who fly a way down."""
+    """The tick with what is remembered of its observation, for all who fly a way down."""
     state, obs = c.state, c.obs
     if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
-        # After a hang of the loop everything from before is stale; dwell times begin anew.
         kept = lasting_conditions(state.since)
         off_s = max(obs.imu.off_s, obs.imu.silent_s)
         if Condition.DOWN in state.since and math.isfinite(off_s):
@@ -356,19 +297,16 @@ def observe(c: Context) -> Context:
 
 
 def note_order(state: PlannerState, command: Command) -> PlannerState:
-    """The state with the commanded raw thrust, which the telemetry's thrust has to follow."""
-    match command:
-        case RawThrust(thrust):
-            return replace(state, raw_order=thrust)
-        case Idle():
-            return state
-        case _:
-            return replace(state, raw_order=None, unanswered_s=None)
+    """The state with the commanded raw thrust."""
+    if isinstance(command, RawThrust):
+        return replace(state, raw_order=command.thrust)
+    if isinstance(command, Idle):
+        return state
+    return replace(state, raw_order=None, unanswered_s=None)
 
 
 def _answered(c: Context) -> Context:
-    """The tick with the time since which the thrust that is read differs from the order: a reading
-    that stands still under a changed order leaves the thrust unknown."""
+    """The tick with since when the thrust differs from the order."""
     order = c.state.raw_order
     if order is None:
         return c
@@ -380,17 +318,15 @@ def _answered(c: Context) -> Context:
 
 
 def lose_position(c: Context) -> Context:
-    """The tick once accelerometer and attitude are all that is left, for good: each change of the
-    mode costs height, so no sight is believed again on this way down."""
+    """The tick once accelerometer and attitude are all that is left, for good."""
     hover = _hover_thrust(c.state, c.obs)
     return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
 
 
 def _reckon(c: Context) -> PlannerState:
-    """The state with its dead reckoning one tick later, and whether the magnet is within reach."""
+    """The state with its dead reckoning one tick later."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
-    # By the target no sight is sent on the way down: the estimate's change is its own.
     astray = state.astray and not c.by_sight
     new = advance_reckoning(
         state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray
@@ -399,8 +335,6 @@ def _reckon(c: Context) -> PlannerState:
         new = add_step(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
-        # Pressed or hanging it stands still, whatever speed the impact left to the estimate. On
-        # its way to the target a gust moves it, and a blow knocks it off the magnet.
         blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
         x_mps, y_mps, _ = new.velocity_mps
         new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
@@ -422,14 +356,13 @@ def _reckon(c: Context) -> PlannerState:
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
-            # An estimate without a position since then was moved when that came back.
             if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
             new = add_sight(new, target.measured_s, aside_m, float(ez), sigma_m)
             if seen and target.measured_s > new.stepped_s:
                 new = replace(new, stepped_m=(0.0, 0.0))
     held_s = c.held(Condition.CARRIED)
-    flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
+    flies = state.phase is not Phase.LANDING
     near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
     if near and held_s >= c.planner.perch.contact_dwell_s:
         # It is at the target; late pictures show it lower.
@@ -454,7 +387,6 @@ def _reckon(c: Context) -> PlannerState:
         last, tel = state.last, obs.telemetry
         heard_again = obs.imu.silent_s > state.reckoning.imu.t_s and c.proves and not obs.jumped
         if heard_again and last is not None and tel.start == last.start:
-            # No position corrected the estimate in the silence: its change was measured on board.
             down_m = tel.position_m[2] - last.position_m[2]
     return replace(
         state, reckoning=new, reach_s=reach_s, blind_height_m=state.blind_height_m + down_m
@@ -478,7 +410,6 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
         moved_m = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
-        # Its own landing goes on along a line in the old world: it dives, or climbs.
         state = replace(
             state,
             entered_s=obs.t_s,
@@ -506,9 +437,7 @@ def _moved(place: Vector, by_m: Vector) -> Vector:
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """The hover thrust as learned; else the present thrust for each g that is measured, since in a
-    climb, or sinking, the thrust differs from the weight. Nothing hovers on the least of position
-    mode."""
+    """The hover thrust as learned, or as measured now."""
     tel = obs.telemetry
     measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
     return state.hover_thrust or obs.imu.hover_thrust or measured
@@ -518,7 +447,7 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
 
 
 def act(c: Context) -> Acted:
-    """The command of one tick: by the two proofs, then by the table."""
+    """The command of one tick: by the two proofs, then by what is known."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
@@ -536,18 +465,31 @@ def act(c: Context) -> Acted:
 
 
 def _descend(c: Context) -> Acted:
-    manoeuvre = DESCENTS[evidence_of(c)][is_in_reach(c)]
-    if manoeuvre in BY_SETPOINTS and (c.by_sight or manoeuvre is not Manoeuvre.PEEL):
+    """Come down level, by thrust, unless the place is known. In the magnet's reach a setpoint below
+    takes the thrust to its least, and what that does not move is given to the magnet. Else sink by
+    setpoints to the hand-over, and from there by the vehicle's own landing: at once where height,
+    stream or loop are doubtful. By the target it would follow an estimate that rests on pictures,
+    to an unmeasured floor: then it is level from there."""
+    if not _knows_its_place(c):
+        return _level(c)
+    landing, in_reach, doubtful = c.planner.landing, is_in_reach(c), _is_doubtful(c)
+    if c.by_sight or not (in_reach or doubtful):
         state, away = leave_press(c)
         if away is not None:
             return state, away
         c = c.with_state(state)
-    return ACTIONS[manoeuvre](c)
+    low = c.height_m <= landing.handover_m
+    if in_reach:
+        gives_up = c.in_phase_s > PEEL_S and (c.imu_proves or not doubtful)
+        return release_by_thrust(c) if gives_up else _by_setpoints(c)
+    if c.by_sight:
+        return _level(c) if c.state.level_thrust or low else _by_setpoints(c)
+    overdue = c.in_phase_s > landing.overdue_s
+    return _own_landing(c) if doubtful or overdue or low else _by_setpoints(c)
 
 
 def _falls_free(c: Context) -> bool:
-    """True if it has come off the magnet: released or stopped up there, or peeled with too little
-    thrust left to go down slowly."""
+    """True if it has come off the magnet, and falls."""
     if not c.imu_proves:
         return False
     if not is_driven(c):
@@ -561,14 +503,13 @@ def _stands(c: Context) -> bool:
     """True if it is on the floor, by proof."""
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return True
-    # Where height is measured, it stops as soon as it sinks no more, instead of sliding.
     level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
     low = c.height_m < STOP_BELOW_M and not is_in_reach(c)
     return level and low and c.climb_mps > -RESTS_MPS
 
 
 def _caught_again(c: Context) -> Acted:
-    """The landing, begun anew below: the vehicle is free of the magnet, and falls."""
+    """The landing, begun anew below, with a catch."""
     tel = c.telemetry
     state = replace(
         c.state,
@@ -593,35 +534,8 @@ def _caught_again(c: Context) -> Acted:
 
 
 def _catch(c: Context) -> Acted | None:
-    """A catch by position; None without a heading, or astray, where position control would lead
-    away and the raw thrust of the level descent brakes the fall."""
+    """A catch by position; None without a heading, or astray."""
     return None if c.state.heading_lost or c.state.astray else catch(c)
-
-
-def _setpoints(c: Context) -> Acted:
-    """Sink by setpoints to the hand-over, and by the vehicle's own landing from there."""
-    # When the landing's time is over nothing is sent: by then it must be landing by itself.
-    overdue = c.in_phase_s > c.planner.landing.overdue_s
-    if overdue or c.height_m <= c.planner.landing.handover_m:
-        return _own_landing(c)
-    return _by_setpoints(c)
-
-
-def _setpoints_level(c: Context) -> Acted:
-    """Sink by setpoints to the hand-over, and level from there: the vehicle's own landing would
-    follow an estimate that rests on pictures, to an unmeasured floor."""
-    if c.state.level_thrust or c.height_m <= c.planner.landing.handover_m:
-        return _level(c)
-    return _by_setpoints(c)
-
-
-def _peel(c: Context) -> Acted:
-    """Send a setpoint below, which takes the thrust to its least. What that does not move is given
-    to the magnet; without fresh telemetry the setpoint goes on down to the floor."""
-    watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
-    if c.in_phase_s > PEEL_S and watched:
-        return release_by_thrust(c)
-    return _by_setpoints(c)
 
 
 def _by_setpoints(c: Context) -> Acted:
@@ -629,21 +543,10 @@ def _by_setpoints(c: Context) -> Acted:
     landing, state = c.planner.landing, c.state
     here = hold_here(c)
     start = state.setpoint if state.caught and state.setpoint is not None else here
-    # A setpoint far above (the press, a search step) is not walked down slowly.
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
     goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
-    setpoint = walk(
-        start,
-        goal,
-        c.t_s - state.t_s,
-        xy_mps=c.planner.align.speed_mps,
-        up_mps=0.0,
-        down_mps=landing.speed_mps,
-        yaw_rate_radps=0.0,
-    )
-    # The setpoint does not run away from a vehicle that does not follow, beyond what takes the
-    # thrust down to its least.
+    setpoint = walk(c.evolve(setpoint=start), goal, down_mps=landing.speed_mps)
     if c.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
@@ -653,9 +556,8 @@ def _by_setpoints(c: Context) -> Acted:
 def own_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
     """The order for the vehicle's own landing from `z_m`, a quintic from rest to rest.
 
-    It aims below the ground, and the lower the longer the estimate has had to drift: at the
-    trajectory's end the motors stop, and over a lower floor they would drop it. It never aims above
-    the vehicle, whose estimate may be far below the ground by now.
+    It aims below the ground, and the lower the longer the estimate has had to drift, and never
+    above the vehicle: at the trajectory's end the motors stop.
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
@@ -668,7 +570,6 @@ def _own_landing(c: Context) -> Acted:
     state, away = leave_press(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
         return state, away
-    # Ordered often enough, a short fall near the floor, or at an unknown height, is its end.
     ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
@@ -683,18 +584,15 @@ def _own_landing(c: Context) -> Acted:
 
 
 def _level(c: Context) -> Acted:
-    """Sink level by raw thrust, on the vertical speed of the accelerometer and, where it is
-    believed, the estimate; tilted against the sideways speed. What does not sink gets less and less
-    thrust: it begins to sink, the ceiling lets go or proves that it holds, and the floor proves
-    itself."""
+    """Sink level by raw thrust on the vertical speed, tilted against the sideways speed. What does
+    not sink gets less and less thrust: it sinks, the magnet lets go, or the floor proves itself."""
     state, tel = c.state, c.telemetry
     dt_s = max(0.0, min(0.1, c.t_s - state.t_s))
     age_s = max(1e-3, dt_s, c.attitude_age_s)
     unheard = age_s > LATEST_S
     unlearned = state.level_thrust == 0.0 and state.level_within == UNLEARNED_WITHIN
     if unheard and unlearned and c.in_phase_s < OWN_ESTIMATE_S:
-        return _by_setpoints(c)  # the vehicle's own estimate is nearer than an unknown thrust
-    # Without telemetry since before, it was held by setpoints until now: it hardly moves.
+        return _by_setpoints(c)
     held = tel.t_s < state.entered_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else c.climb_mps) + state.under_way_mps
     hover = _learned_hover(c, dt_s)
@@ -715,9 +613,7 @@ def _level(c: Context) -> Acted:
     # In the air the accelerometer reads what the thrust gives, on the floor one g.
     if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover):
         touch_s = None  # it falls with its thrust: that was no floor
-    # With less thrust than that it reads one g only if something carries it.
     carried = c.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover
-    # In the air it falls with its thrust, however long it takes.
     overdue = _is_overdue(c) and not (c.imu_proves and tel.acc_z_g < AIRBORNE_G)
     before = state.level_thrust or hover
     if touched_s < TOUCH_S:
@@ -746,8 +642,8 @@ def _level(c: Context) -> Acted:
 
 
 def is_spent(c: Context) -> bool:
-    """True if a way down is over: a level one has come to its least thrust, on which nothing flies
-    for long, or the setpoint to the floor. Without a stop the firmware would lock it 2 s later."""
+    """True if a way down is over: a level one has come to its least thrust, or the setpoint to the
+    floor. Without a stop the firmware would lock the vehicle."""
     setpoint, ground_m = c.state.setpoint, c.state.ground_m
     if setpoint is not None and ground_m is not None:
         landing = c.planner.landing
@@ -772,8 +668,7 @@ def left_level(c: Context) -> Context:
 
 
 def _learned_hover(c: Context, dt_s: float) -> float:
-    """The hover thrust, drawn to the thrust for each g in free flight: what was learned in a climb,
-    or not at all, is several per cent off."""
+    """The hover thrust, drawn to the thrust for each g in free flight."""
     state, tel = c.state, c.telemetry
     first = state.level_hover or state.hover_thrust
     within = state.level_within
@@ -788,17 +683,15 @@ def _learned_hover(c: Context, dt_s: float) -> float:
 
 
 def _is_overdue(c: Context) -> bool:
-    """True if it was blind for so long that it has come down, or hangs, or its reckoned speed has
-    drifted away."""
+    """True if it was blind for so long that it has come down, or hangs."""
     if c.state.blind_s is None and not c.state.astray:
         return False
     way_m = max(0.0, c.state.entry_m[2] - c.state.ground_z_m)
-    # After a slip off the magnet the time begins anew.
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
     heard = c.attitude_age_s <= LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
     if not heard and c.state.level_within == UNLEARNED_WITHIN:
-        spare_s += OWN_ESTIMATE_S  # in which its own estimate has flown it on the spot
+        spare_s += OWN_ESTIMATE_S
     return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
 
@@ -836,13 +729,3 @@ def _weight_on_magnet(c: Context) -> Acted:
         return release_by_thrust(c)
     thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))
     return replace(c.state, released_s=c.t_s), RawThrust(thrust)
-
-
-ACTIONS = {
-    Manoeuvre.SETPOINTS: _setpoints,
-    Manoeuvre.SETPOINTS_LEVEL: _setpoints_level,
-    Manoeuvre.PEEL: _peel,
-    Manoeuvre.LEVEL: _level,
-    Manoeuvre.OWN_LANDING: _own_landing,
-}
-BY_SETPOINTS = (Manoeuvre.SETPOINTS, Manoeuvre.SETPOINTS_LEVEL, Manoeuvre.PEEL)

@@ -1,10 +1,8 @@
 """Checks that the camera is mounted as the profile says: the target stands still in the world.
 
-Where `camera.mount` is turned by an angle a about the vehicle's upward axis, the target is
-placed T = p + M (t - p), with the true target t, M the turn by -a, and p the place where that
-axis meets the target's plane: it moves with the vehicle and with each of its tilts, by
-(1 - M) of the motion of p. In the plane a turn is a complex number of length 1, so one least
-squares over a decimetre of that motion gives s = 1 - M (docs/mission.md, "The mounting").
+Where `camera.mount` is turned about the vehicle's upward axis, the target moves by (1 - M) of the
+motion of the place where that axis meets the target's plane, M being the turn as a complex number:
+one least squares over a decimetre gives it (docs/mission.md, "The mounting").
 """
 
 from __future__ import annotations
@@ -17,22 +15,19 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-WINDOW_S = 3.0  # older sights are left out: a drifting estimate moves vehicle and target together
+WINDOW_S = 3.0  # older sights are left out: the estimate drifts
 LEAST_SIGHTS = 10
 JUDGED_M, PROVEN_M = 0.12, 0.3
-"""Motion of the vehicle's upward axis at the target's height from which on the mounting is judged,
-and beyond which a target that has stood still ends the watch."""
+"""Motion of the axis from which on the mounting is judged, and beyond which it is proven."""
 STANDS_STILL, MOVES_ALONG = 0.35, 0.6
-"""Share of the vehicle's motion: below the first the target stands still, above the second it moves
-along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
+"""Of the vehicle's motion. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
 LEAST_SPREAD_M = 0.05
-MOST_UNEXPLAINED = 0.45  # of the target's spread: more, and no turn explains its motion
-LEAST_TURN = 0.5  # length of M; about 0 is a world that drifts under both, and no turn
-LEAST_TURN_RAD = math.radians(65.0)  # a lesser turn leads to the target all the same, in a bow
+MOST_UNEXPLAINED = 0.45  # of the target's spread
+LEAST_TURN = 0.5  # length of M; about 0 is a world that drifts
+LEAST_TURN_RAD = math.radians(65.0)  # a lesser one leads to the target in a bow
 SIGHTS_IN_A_ROW = 4
 JUMPS, SETTLES_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
-"""Metres, seconds: a target that moves so much farther than twice the vehicle so quickly has
-been moved, or is another one; then sights count again after `SETTLES_S`."""
+"""Metres, seconds: a target that moves so much farther than twice the vehicle has been moved."""
 ESTIMATE_JUMP_M, FASTEST_MPS = 0.05, 1.5  # farther between two sights is a new world
 _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
@@ -77,12 +72,6 @@ class MountWatch:
     def wrong(self) -> bool:
         """True once enough sights in a row speak against the mounting."""
         return self.against >= SIGHTS_IN_A_ROW
-
-    @property
-    def last_from(self) -> tuple[float, float] | None:
-        """The vehicle's place, x and y, at the last sight."""
-        place = self.sights[-1].vehicle if self.sights else None
-        return None if place is None else (place.real, place.imag)
 
     @property
     def open(self) -> bool:
@@ -142,17 +131,3 @@ def _judged(watch: MountWatch, against: int) -> MountWatch:
     ):
         return replace(watch, against=against + 1, turn_rad=-cmath.phase(turn))
     return watch
-
-
-def describe_turn(turn_rad: float) -> str:
-    """A sentence on the turn, to the nearest quarter if it is about one, else to 10 degrees."""
-    turn_deg = math.degrees(turn_rad)
-    quarter = 90.0 * round(turn_deg / 90.0)
-    near = abs(turn_deg - quarter) <= 35.0 and quarter != 0.0
-    shown = quarter if near else 10.0 * round(turn_deg / 10.0)
-    shown = 180.0 if shown == -180.0 else shown
-    return (
-        f"camera seems turned by about {shown:.0f} deg from what the profile says: the target "
-        f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
-        f"{shown:.0f} to the last of camera.mount.rpy_deg"
-    )

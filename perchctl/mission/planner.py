@@ -1,8 +1,7 @@
 """The perching planner: `step_mission(state, observation, profile) -> (state, command)`.
 
-Pure: no clock, no input but its arguments, so a log replays to the same commands
-(`perchctl.analysis.decide`, and `tests/replay/test_corpus.py` demands it). One tick: remember what
-was observed, look up the table, act for the phase.
+Pure: no clock, no input but its arguments, so a log replays to the same commands. One tick:
+remember what was observed, look up the table, act for the phase.
 
 Before each command ask: what if it is the last packet? A position setpoint left alone levels out
 after 0.5 s and is cut after 2 s (docs/firmware.md, "When setpoints stop").
@@ -34,7 +33,6 @@ from perchctl.mission.guidance import (
     corrected,
     hold_here,
     integrated,
-    is_carried,
     is_still,
     leave_press,
     left_contact,
@@ -52,11 +50,11 @@ from perchctl.mission.mounting import MountWatch, sight_of, update_watch
 from perchctl.mission.state import (
     Condition,
     ContactError,
-    MotorStop,
     Observation,
     Outcome,
     Phase,
     PlannerState,
+    Severity,
 )
 from perchctl.mission.table import (
     IN_THE_OPEN,
@@ -67,12 +65,13 @@ from perchctl.mission.table import (
 )
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Command, EmergencyStop, Idle, PositionSetpoint, RawThrust, StopMotors
+from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
 
 HOVER_WITHIN = 0.2
-AWAY_M = 0.05  # below the contact by so much, or by half of the descent, it has left the ceiling
-BLOCKED_ROOM_M = 0.1  # how far a search keeps from what it was once pressed against
-WARY_MPS, WARY_M = 0.25, 0.2  # sideways, while nothing confirms the camera's mounting
+CARRIED_RATIO = 0.85  # of the hover thrust: with so much it sinks slowly
+AWAY_M = 0.05  # below the contact, or half of the descent: it has left
+BLOCKED_ROOM_M = 0.1  # a search keeps away from what blocked it
+WARY_M = 0.2  # sideways, while nothing confirms the camera's mounting
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
 
@@ -97,8 +96,7 @@ def _remember(c: Context) -> Context:
     c = lander.observe(c.with_state(_with_target(c.state, c.obs)))
     hold, since, hover = hold_reason(c), conditions_since(c), c.state.hover_thrust
     if hold:
-        since = lasting_conditions(since)  # a held vehicle proves nothing: dwell times begin anew
-    # Near the target an ascent may press against a ceiling that is lower than thought.
+        since = lasting_conditions(since)  # a held vehicle proves nothing
     away = c.state.phase is not Phase.ASCEND or c.error_z_m > c.planner.ascend.near_m
     if away and c.state.phase in _LEARNING and hovers(c):
         hover = _learned_hover_thrust(c.state, c.obs)
@@ -129,12 +127,11 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 def _mount_watched(c: Context) -> MountWatch:
     """The mounting's watch with this tick's frame, if that measured the target over fresh
     telemetry."""
-    mount, target = c.state.mount, c.obs.target
-    if c.state.phase not in IN_THE_OPEN or c.state.hold or not (c.obs.new_frame and c.proves):
-        return mount
-    if target is None or not target.measured or target.world_m is None:
-        return mount
-    return update_watch(mount, sight_of(c.t_s, c.telemetry, target.world_m))
+    state = c.state
+    measured = c.obs.new_frame and state.confirmed > 0 and c.proves and not state.hold
+    if state.target_m is None or not measured or state.phase not in IN_THE_OPEN:
+        return state.mount
+    return update_watch(state.mount, sight_of(c.t_s, c.telemetry, state.target_m))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -157,13 +154,13 @@ def _enter(c: Context, row: Transition) -> Context:
     new = c.evolve(
         phase=row.to,
         entered_s=c.t_s,
-        reason=row.explain(c),
+        reason=row.reason if isinstance(row.reason, str) else row.reason(c),
         row=row.name,
         severity=state.severity.then(row.severity),
-        motor_stop=row.motor_stop,
+        stop=row.stop,
         outcome=_outcome(state, row),
         since=lasting_conditions(state.since),
-        attempts=state.attempts + int(row.counts_attempt),
+        attempts=state.attempts + int(row.severity is Severity.BACK_OFF),
         entry_m=c.telemetry.position_m,
         entry_yaw_rad=c.telemetry.yaw_rad,
         search_step_s=c.t_s,
@@ -176,8 +173,7 @@ def _enter(c: Context, row: Transition) -> Context:
 
 
 def _outcome(state: PlannerState, row: Transition) -> Outcome | None:
-    """The flight's outcome. What is found hanging on its way down keeps the outcome of what led to
-    the landing: nobody has seen whether it hangs on the target."""
+    """The outcome; what hangs on its way down keeps the landing's."""
     if state.phase is Phase.LANDING and row.outcome is Outcome.PERCHED and state.outcome:
         return state.outcome
     if row.name == "hung" and state.outcome is Outcome.TARGET_NOT_FOUND:
@@ -200,7 +196,8 @@ def _started_phase(new: Context, c: Context) -> Context:
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
-                caught=row != "slipped" or is_carried(old.hover_thrust, c.telemetry.thrust),
+                # What the motors carry most of hardly falls.
+                caught=row != "slipped" or c.telemetry.thrust >= CARRIED_RATIO * old.hover_thrust,
                 catch_above_m=catch_above_m(old.hover_thrust, c.telemetry.thrust),
                 blocked_z_m=z_m if row == "blocked" else old.blocked_z_m,
             )
@@ -226,8 +223,7 @@ def _started_phase(new: Context, c: Context) -> Context:
 
 
 def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
-    """How far aside of the target the gear touched something at the target's height, for what
-    backs off from there; None if nothing was touched."""
+    """Where the gear touched something; None if nothing was touched."""
     if row == "not-released":  # the contact was proven, and nothing has come off
         return old.contact
     if old.phase is Phase.RECOVER:  # pressed again before it had left
@@ -257,36 +253,12 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
     return replace(c.state, setpoint=reference), limited(c, corrected(c, reference, lift=lift))
 
 
-def _walk_to(
-    c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
-) -> Acted:
-    """Walk the setpoint towards the goal. Only SEARCH and ASCEND pass an `up_mps`; APPROACH, the
-    press and a catch climb in other ways."""
-    return _fly_to(c, _walked(c, goal, up_mps, down_mps))
-
-
-def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) -> PositionSetpoint:
-    align = c.planner.align
-    xy_mps = align.speed_mps
-    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
-        xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
-    return walk(
-        c.state.setpoint or hold_here(c),
-        goal,
-        c.t_s - c.state.t_s,
-        xy_mps=xy_mps,
-        up_mps=up_mps,
-        down_mps=down_mps,
-        yaw_rate_radps=math.radians(align.yaw_rate_dps),
-    )
-
-
 def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
     """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
     trim = integrated(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = c.evolve(integral_m=trim)
-    return _walk_to(c, goal, up_mps=up_mps)
+    return _fly_to(c, walk(c, goal, up_mps=up_mps))
 
 
 def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
@@ -297,8 +269,7 @@ def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
 
 
 def _approach(c: Context) -> Acted:
-    """Rise from the ground on position setpoints: if they stop at any moment, the firmware levels
-    out and cuts, and the vehicle never hovers on its own."""
+    """Rise from the ground on position setpoints, without which the firmware levels out."""
     planner, state = c.planner, c.state
     assert state.ground_m is not None
     x, y, z = state.ground_m
@@ -306,15 +277,13 @@ def _approach(c: Context) -> Acted:
     if planner.approach_xy_m is not None and c.height_m > 0.7 * planner.takeoff_height_m:
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
-    c = c.with_state(replace(state, setpoint=start))
-    setpoint = _walked(c, goal, planner.takeoff_speed_mps, 0.4)
+    setpoint = walk(c.evolve(setpoint=start), goal, up_mps=planner.takeoff_speed_mps)
     return _fly_to(c, setpoint, lift=c.height_m > LIFTED_M)
 
 
 def _search(c: Context) -> Acted:
     """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
-    before is looked for from under it; while nothing confirms the camera's mounting, only a little
-    nearer than where it was seen last."""
+    before is looked for from under it."""
     search, state, ground_m = c.planner.search, c.state, c.state.ground_m
     assert ground_m is not None
     if c.t_s - state.search_step_s > search.wait_s:
@@ -323,7 +292,7 @@ def _search(c: Context) -> Acted:
     x, y, z = state.entry_m
     if c.target_m is not None:
         there = under_target_xy(c, state.entry_yaw_rad)
-        x, y = _not_far(state.mount.last_from or (x, y), there) if state.mount.open else there
+        x, y = _not_far(state.mount, (x, y), there) if state.mount.open else there
         height = min(z, c.contact_goal_z_m - c.planner.ascend.near_m)
     else:
         top = max(z, ground_m[2] + search.max_height_m)
@@ -331,24 +300,19 @@ def _search(c: Context) -> Acted:
             top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
         height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
-    up_mps = c.planner.ascend.speed_mps
-    return _walk_to(c, PositionSetpoint(x, y, height, yaw), up_mps=up_mps)
+    goal = PositionSetpoint(x, y, height, yaw)
+    return _fly_to(c, walk(c, goal, up_mps=c.planner.ascend.speed_mps))
 
 
-def _not_far(start: tuple[float, float], goal: tuple[float, float]) -> tuple[float, float]:
-    """The goal, or as far towards it as a wrong mounting may lead."""
+def _not_far(
+    mount: MountWatch, start: tuple[float, float], goal: tuple[float, float]
+) -> tuple[float, float]:
+    """The goal, or as far towards it from the last sight as a wrong mounting may lead."""
+    if mount.sights:
+        start = (mount.sights[-1].vehicle.real, mount.sights[-1].vehicle.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]
     part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
-
-
-def _estimate(c: Context) -> Acted:
-    return _fly_to(c, c.state.setpoint or hold_here(c))
-
-
-def _align(c: Context) -> Acted:
-    setpoint = c.state.setpoint or hold_here(c)
-    return _under_target(c, setpoint.z_m)
 
 
 def _ascend(c: Context) -> Acted:
@@ -359,7 +323,6 @@ def _ascend(c: Context) -> Acted:
     may_climb = c.fresh and c.error_xy_m < 0.7 * c.cone_m
     lag = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if c.error_z_m < ascend.near_m else ascend.speed_mps
-    # Slower towards the stand-off; the setpoint does not run away from a vehicle short of thrust.
     speed = min(speed, max(0.02, goal_z - setpoint.z_m))
     return _under_target(c, goal_z, up_mps=speed if may_climb and lag < 0.15 else 0.0)
 
@@ -372,7 +335,7 @@ def _perch(c: Context) -> Acted:
     if c.target_m is None:
         return _fly_to(c, c.state.setpoint or hold_here(c), lift=False)
     goal = _target_goal(c, c.contact_goal_z_m + perch.press_m)
-    return _fly_to(c, _walked(c, goal, perch.climb_mps, 0.0), lift=False)
+    return _fly_to(c, walk(c, goal, up_mps=perch.climb_mps, down_mps=0.0), lift=False)
 
 
 def _complete(c: Context) -> Acted:
@@ -384,8 +347,7 @@ def _complete(c: Context) -> Acted:
 
 
 def _recover(c: Context) -> Acted:
-    """Hold in the air `descend_m` below where the attempt ended, in position mode all along, so
-    that no controller is reset."""
+    """Hold in the air `descend_m` below where the attempt ended, in position mode all along."""
     if (caught := catch(c)) is not None:
         return caught
     recover = c.planner.recover
@@ -406,39 +368,28 @@ def _recover(c: Context) -> Acted:
     else:
         goal = replace(setpoint, z_m=z)
     c = c.with_state(replace(state, setpoint=setpoint))
-    return _walk_to(c, goal, up_mps=0.0, down_mps=FREE_SPEED_MPS)
-
-
-def _terminal(c: Context) -> Acted:
-    return c.state, Idle()
+    return _fly_to(c, walk(c, goal, down_mps=FREE_SPEED_MPS))
 
 
 def _aborted(c: Context) -> Acted:
-    """The motor stop, once, as the transition wants it. What hangs with its motors still would be
-    locked 2 s after the stream's end: it gets the pair that prevents that."""
+    """The motor stop, once; what hangs with its motors still would be locked without one."""
     if c.state.orders:
         return c.state, Idle()
-    state = replace(c.state, orders=1, ordered_s=c.t_s)
-    match state.motor_stop:
-        case MotorStop.EMERGENCY:
-            return state, EmergencyStop()
-        case MotorStop.PLAIN:
-            return state, StopMotors()
-        case MotorStop.NONE:
-            return state, StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
+    ends = StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
+    return replace(c.state, orders=1, ordered_s=c.t_s), c.state.stop or ends
 
 
 ACTIONS: dict[Phase, Callable[[Context], Acted]] = {
     Phase.APPROACH: _approach,
     Phase.SEARCH: _search,
-    Phase.ESTIMATE: _estimate,
-    Phase.ALIGN: _align,
+    Phase.ESTIMATE: lambda c: _fly_to(c, c.state.setpoint or hold_here(c)),
+    Phase.ALIGN: lambda c: _under_target(c, (c.state.setpoint or hold_here(c)).z_m),
     Phase.ASCEND: _ascend,
     Phase.PERCH: _perch,
     Phase.COMPLETE: _complete,
     Phase.RECOVER: _recover,
     Phase.LANDING: lander.act,
-    Phase.PERCHED: _terminal,
-    Phase.LANDED: _terminal,
+    Phase.PERCHED: lambda c: (c.state, Idle()),
+    Phase.LANDED: lambda c: (c.state, Idle()),
     Phase.ABORTED: _aborted,
 }

@@ -71,7 +71,6 @@ class Event:
             held = EventKind.HOLD, state.hold, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
-            # The pilot reads it also where the vehicle is not held for it.
             text = unplaced_text(Context(state, obs, profile))
             events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))
         return events
@@ -137,16 +136,6 @@ class PoseSeen:
     e_yaw_rad: float
 
 
-@dataclass(frozen=True)
-class TurnTiming:
-    """Duration of a turn's parts: perception, planner, sending, and all but the watchers."""
-
-    pipeline_s: float
-    planner_s: float
-    send_s: float
-    turn_s: float
-
-
 @dataclass(frozen=True, eq=False)
 class Turn:
     """One turn of the loop, whole and exact.
@@ -169,7 +158,6 @@ class Turn:
     held: bool = False
     attempts: int = 0
     outside: ExternalPositions | None = None
-    timing: TurnTiming | None = None  # None in lockstep
     outcome: Outcome | None = None
     reason: str | None = None  # None: of a log before version 4, without outcome, too
     error: str | None = None  # name of what the planner raised

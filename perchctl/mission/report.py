@@ -20,7 +20,7 @@ from perchctl.mission.state import (
 )
 from perchctl.profile import CameraConfig, Profile
 from perchctl.values import replace
-from perchctl.vehicle import FRESH_S, LOCKED
+from perchctl.vehicle import LOCKED
 from perchctl.vision import Consistency
 
 HARD_MPS = 0.6  # no way down that goes as it should ends faster
@@ -131,7 +131,7 @@ class FlightReport:
         return cls(
             phase=state.phase,
             outcome=state.outcome or Outcome.SAFETY,
-            reason=_reason(state, obs, history),
+            reason=_reason(state, history),
             # A hold that is noticed once the attempts are used up has been counted as failed.
             attempts=state.attempts + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP),
             duration_s=obs.t_s - state.started_s,
@@ -172,16 +172,8 @@ def touchdown_of(c: Context) -> Touchdown | None:
     return Touchdown(max(0.0, speed_mps), blow.peak_g)
 
 
-def _reason(state: PlannerState, obs: Observation, history: tuple[Event, ...]) -> str:
+def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     """Why the flight ended so, behind what led to the landing where there was one."""
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
-    if state.phase in (Phase.LANDED, Phase.PERCHED):
-        return f"{why}; {state.reason}" if why else state.reason
-    if state.row != "landing-timeout":
-        return state.reason
-    age_s = obs.t_s - obs.telemetry.t_s
-    cause = "by its telemetry the vehicle still flies"
-    if age_s > FRESH_S:
-        cause = f"nothing was heard from the vehicle for {age_s:.1f} s"
-    text = f"the landing was ordered but could not be confirmed: {cause}"
-    return f"{why}; {text}" if why else text
+    told = why and (state.phase is not Phase.ABORTED or state.row == "landing-timeout")
+    return f"{why}; {state.reason}" if told else state.reason

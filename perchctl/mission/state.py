@@ -9,7 +9,7 @@ from enum import Enum, IntEnum
 from perchctl.geometry import Array
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
-from perchctl.vehicle import PositionSetpoint, Telemetry
+from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors, Telemetry
 from perchctl.vision import TargetEstimate
 
 
@@ -106,14 +106,6 @@ class Condition(Enum):
     TARGET_BELOW = "target below"
     BATTERY_LOW = "battery low"
     OTHERWISE = "moves otherwise than its positions"
-
-
-class MotorStop(Enum):
-    """How the motors are stopped when a row aborts the flight."""
-
-    NONE = "none"  # they are left alone
-    PLAIN = "plain"  # stopped, where the supervisor has ended the flight already
-    EMERGENCY = "emergency"  # cut and locked
 
 
 @dataclass(frozen=True)
@@ -227,7 +219,7 @@ class PlannerState:
     reason: str = "start"
     row: str = ""
     severity: Severity = Severity.CONTINUE
-    motor_stop: MotorStop = MotorStop.NONE
+    stop: EmergencyStop | StopMotors | None = None  # what aborts the flight sends it
     outcome: Outcome | None = None
     since: dict[Condition, float] = field(default_factory=dict)
     attempts: int = 0

@@ -30,18 +30,16 @@ from perchctl.mission.lander import (
     hangs_where_it_did,
     rest_finding,
 )
-from perchctl.mission.mounting import describe_turn
 from perchctl.mission.state import (
     BEFORE_CONTACT,
     FLYING_PHASES,
     Condition,
-    MotorStop,
     Operator,
     Outcome,
     Phase,
     Severity,
 )
-from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
+from perchctl.vehicle import CRASHED, LOCKED, TUMBLED, EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
 Reason = str | Callable[[Context], str]
@@ -51,8 +49,7 @@ Reason = str | Callable[[Context], str]
 class Transition:
     """A row of the table: from any of `phases`, when `when` holds, to the phase `to`.
 
-    `reason` is shown to the user; `motor_stop` is what a transition into ABORTED does to the
-    motors.
+    `reason` is shown to the user; `stop` is what a transition into ABORTED sends at once.
     """
 
     name: str
@@ -62,12 +59,7 @@ class Transition:
     reason: Reason
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
-    counts_attempt: bool = False
-    motor_stop: MotorStop = MotorStop.NONE
-
-    def explain(self, c: Context) -> str:
-        """The reason as a sentence without its end."""
-        return self.reason if isinstance(self.reason, str) else self.reason(c)
+    stop: EmergencyStop | StopMotors | None = None
 
 
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
@@ -81,14 +73,12 @@ BEFORE_COMPLETION = BY_CAMERA | {P.PERCH}
 KNOCKED_S = 0.04  # more than one sample of telemetry
 LIFTED_M, SIDEWAYS_M = 0.05, 0.12
 LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
-"""While only a climb was ordered, a vehicle stays within a few centimetres (7 in simulated
-flights); later a setpoint is walked ahead of it, and a gust may carry it half a metre."""
 ABOVE_START_M = 0.1
 OTHERWISE_S, BELOW_S, WEAK_S, UNSTOPPED_S = 0.1, 0.3, 2.0, 10.0
-SWINGS_MPS = 0.5  # what hovers or walks up sinks so fast only if position control swings it
+SWINGS_MPS = 0.5  # only swings of position control sink so fast
 BLIND_PRESS_S = 1.25
-HELD_S = 2.0  # by then a hold at the magnet has been told from any other
-BLIND_VARIANCE_M2 = 0.02  # about 3 s after the last sight (docs/firmware.md, "Target as position")
+HELD_S = 2.0  # by then the magnet has been told from others
+BLIND_VARIANCE_M2 = 0.02  # about 3 s after the last sight
 UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 
 
@@ -97,12 +87,8 @@ UNCORRECTED = "the estimate's variance only grows; is the positioning system gon
 
 def is_astray(c: Context) -> bool:
     """True if position control leads away from its setpoint, by external positions in other axes
-    than the vehicle's, which a vehicle at rest does not show (fault 11).
-
-    That is a step sideways at take-off, where only a climb was ordered; later a way farther than
-    any draught carries it; in a landing that began for another reason, too, which would speed up
-    until it tilts over. A motion capture that is late swings what is walked, until it sinks fast.
-    """
+    than the vehicle's, which a vehicle at rest does not show (fault 11): farther than any draught
+    carries it, or in swings."""
     setpoint, phase = c.state.setpoint, c.state.phase
     if c.profile.positioning.by == "deck" or not c.placed:
         return False
@@ -154,8 +140,7 @@ def why_astray(c: Context) -> str:
 
 
 def is_lost(c: Context) -> bool:
-    """True if no position has come for so long that none is waited for any more; by the target
-    alone, by the estimate's own variance, too."""
+    """True if no position has come for so long that none is waited for any more."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
@@ -198,7 +183,13 @@ def mounted_wrong(c: Context) -> bool:
 def why_mounted_wrong(c: Context) -> str:
     turn_rad = c.mismatch.turn_rad
     if turn_rad or c.state.mount.wrong:
-        text = describe_turn(turn_rad or c.state.mount.turn_rad)
+        turn_deg = 10 * round(math.degrees(turn_rad or c.state.mount.turn_rad) / 10.0)
+        turn_deg = 180 if turn_deg == -180 else turn_deg
+        text = (
+            f"camera seems turned by about {turn_deg} deg from what the profile says: the target "
+            f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
+            f"{turn_deg} to the last of camera.mount.rpy_deg"
+        )
         capture = not turn_rad and c.profile.positioning.by == "mocap"
         return f"{text}; or swapped axes in the motion capture" if capture else text
     return (
@@ -217,8 +208,7 @@ def why_not_found(c: Context) -> str:
 
 
 def is_caught(c: Context) -> bool:
-    """True if the target's magnet holds it already: it hangs at the target, or where it met the
-    target's height, within the magnet's radius as far as its place there was known."""
+    """True if the target's magnet holds it already."""
     if c.held(C.HANGING) < HANGING_S:
         return False
     touched, radius_m = touched_error(c), c.planner.perch.contact_xy_m
@@ -227,18 +217,12 @@ def is_caught(c: Context) -> bool:
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """True if something else than the target's magnet holds it: at another height than the
-    target's, or surely beside the magnet (two standard deviations)."""
+    """True if something else than the target's magnet holds it: at another height, or beside."""
     touched = touched_error(c)
     error = touched or contact_error(c)
     at_its_height = touched is not None or abs(c.error_z_m) <= contact_within_m(c)
     beside = error.aside_m - 2.0 * error.sigma_m > c.planner.perch.contact_xy_m
     return c.held(C.HANGING) >= HELD_S and (beside or not at_its_height)
-
-
-def why_hangs_at_contact(c: Context) -> str:
-    error = touched_error(c) or contact_error(c)
-    return f"it hangs at the target's height, {error.text}: that may be its magnet"
 
 
 def is_blocked(c: Context) -> bool:
@@ -247,15 +231,13 @@ def is_blocked(c: Context) -> bool:
 
 
 def is_blocked_off_target(c: Context) -> bool:
-    """True if it is blocked, and in the press so far from the target's height that no contact can
-    be proven."""
+    """True if it is blocked, and in the press too far from the target to prove a contact."""
     pressing = c.state.phase is P.PERCH
     return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_within_m(c))
 
 
 def too_weak(c: Context) -> bool:
-    """True if no thrust is left to press with: seen at full thrust, or known before the press. A
-    press that it backs off from explains full thrust."""
+    """True if no thrust is left to press with: seen at full thrust, or known before the press."""
     if c.state.pressed:
         return False
     if c.held(C.SATURATED) >= WEAK_S:
@@ -265,10 +247,6 @@ def too_weak(c: Context) -> bool:
 
 
 # --- Attempts, the press and the release ------------------------------
-
-
-def attempts_used(c: Context) -> bool:
-    return c.state.attempts >= c.planner.attempts
 
 
 def is_aligned(c: Context) -> bool:
@@ -285,7 +263,7 @@ def has_recovered(c: Context) -> bool:
 def too_little_left(c: Context) -> bool:
     """True if an attempt would begin, or begin anew, and the battery has not enough for it."""
     begins = is_aligned(c) if c.state.phase is P.ALIGN else has_recovered(c)
-    return begins and not attempts_used(c) and is_short_of_charge(c)
+    return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
 
 
 def is_in_contact(c: Context) -> bool:
@@ -320,7 +298,6 @@ def is_off_as(finding: Finding) -> Predicate:
 def hold_reason(c: Context) -> str:
     """Why the vehicle must stay where it is in this tick, or the empty string."""
     phase = c.state.phase
-    # A take-off goes on by what is known; without a position nothing is.
     if phase in IN_THE_OPEN and c.position_is_stale:
         return unplaced_text(c)
     if phase not in BY_CAMERA:
@@ -342,14 +319,21 @@ def why_no_picture(c: Context) -> str:
     return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
 
 
-# --- The three ways out of the mission --------------------------------
+# --- The ways out of the mission --------------------------------
 
 
-def stops(
-    name: str, when: Predicate, reason: str, motor_stop: MotorStop, outcome: Outcome = O.SAFETY
-) -> Transition:
-    """The motors are stopped, wherever in the air it is."""
-    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, motor_stop=motor_stop)
+def cuts(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
+    """The motors are cut and locked, wherever in the air it is."""
+    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, stop=EmergencyStop())
+
+
+def ends(name: str, bit: int, reason: str) -> Transition:
+    """The supervisor has ended the flight: the motors are stopped."""
+
+    def when(c: Context) -> bool:
+        return c.telemetry.has(bit)
+
+    return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, O.SAFETY, stop=StopMotors())
 
 
 def lands(
@@ -361,17 +345,20 @@ def lands(
 
 def backs_off(name: str, phases: Set[Phase], when: Predicate, reason: Reason) -> Transition:
     """The attempt has failed: down a little, and another one."""
-    return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF, counts_attempt=True)
+    return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF)
 
 
-# --- The safety rows, gravest first -----------------------------------
+def gives_up(name: str, when: Predicate, reason: str) -> Transition:
+    """The landing has ended, and not as it should."""
+    return Transition(name, {P.LANDING}, when, P.ABORTED, reason, S.LAND, O.SAFETY)
 
-SAFETY: tuple[Transition, ...] = (
-    stops(
+
+TABLE: tuple[Transition, ...] = (
+    # --- the safety rows, gravest first ------------------------------------------
+    cuts(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
         "second Ctrl-C: emergency stop",
-        MotorStop.EMERGENCY,
         O.EMERGENCY,
     ),
     Transition(
@@ -382,29 +369,13 @@ SAFETY: tuple[Transition, ...] = (
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=O.PERCHED,
     ),
-    stops(
-        "locked",
-        lambda c: c.telemetry.has(LOCKED),
-        "the supervisor has locked the vehicle: inspect and restart it",
-        MotorStop.PLAIN,
-    ),
-    stops(
-        "tumbled",
-        lambda c: c.telemetry.has(TUMBLED),
-        "the vehicle has tumbled: inspect and restart it",
-        MotorStop.PLAIN,
-    ),
-    stops(
-        "crashed",
-        lambda c: c.telemetry.has(CRASHED),
-        "the supervisor reports a crash: inspect and restart the vehicle",
-        MotorStop.PLAIN,
-    ),
-    stops(
+    ends("locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"),
+    ends("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
+    ends("crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"),
+    cuts(
         "tilted",
         lambda c: c.held(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
         "tilted beyond the limit: motors cut",
-        MotorStop.EMERGENCY,
     ),
     lands(
         "operator-land",
@@ -506,12 +477,6 @@ SAFETY: tuple[Transition, ...] = (
         "the perching time is over",
         O.ATTEMPTS_USED_UP,
     ),
-)
-
-# --- The whole table --------------------------------------------------
-
-TABLE: tuple[Transition, ...] = (
-    *SAFETY,
     # --- the magnet may catch early ---------------------------------------------
     Transition("caught", BEFORE_COMPLETION, is_caught, P.COMPLETE, "hanging on the magnet already"),
     lands(HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"),
@@ -519,7 +484,10 @@ TABLE: tuple[Transition, ...] = (
         "hangs-at-contact",
         BEFORE_COMPLETION,
         lambda c: c.held(C.HANGING) >= HELD_S,
-        why_hangs_at_contact,
+        lambda c: (
+            f"it hangs at the target's height, {(touched_error(c) or contact_error(c)).text}: "
+            f"that may be its magnet"
+        ),
     ),
     # --- something is in the way -----------------------------------------------
     lands(
@@ -692,7 +660,7 @@ TABLE: tuple[Transition, ...] = (
     lands(
         "attempts-used",
         {P.RECOVER},
-        lambda c: attempts_used(c) and c.in_phase_s > 0.5,
+        lambda c: c.state.attempts >= c.planner.attempts and c.in_phase_s > 0.5,
         "all perching attempts are used up",
         O.ATTEMPTS_USED_UP,
     ),
@@ -727,43 +695,30 @@ TABLE: tuple[Transition, ...] = (
             + ("" if c.state.blind_s is None else "; it was felt to come down to the floor")
         ),
     ),
-    Transition(
+    gives_up(
         "held-elsewhere",
-        {P.LANDING},
         is_off_as(Finding.HELD),
-        P.ABORTED,
         "motors off; something holds it where its estimate has no target: look before you touch it",
-        S.LAND,
-        O.SAFETY,
     ),
-    Transition(
+    gives_up(
         "hangs-or-stands",
-        {P.LANDING},
         lambda c: c.held(C.DOWN) >= LOOKED_S,
-        P.ABORTED,
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it",
-        S.LAND,
-        O.SAFETY,
     ),
-    Transition(
+    gives_up(
         "landing-timeout",
-        {P.LANDING},
         lambda c: c.in_phase_s > c.planner.landing.timeout_s,
-        P.ABORTED,
         "the landing was not confirmed in time",
-        S.LAND,
-        O.SAFETY,
     ),
 )
-_ROWS_OF = {phase: tuple(row for row in TABLE if phase in row.phases) for phase in Phase}
 
 
 def first_match(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
     """The first transition that applies, or None to stay. Whatever the table says, one that would
     lead from a landing to a flying phase is passed over."""
     landing = c.state.severity >= Severity.LAND
-    for row in _ROWS_OF[c.state.phase] if table is TABLE else table:
+    for row in table:
         undoes = landing and row.to in FLYING_PHASES
         if not undoes and c.state.phase in row.phases and row.when(c):
             return row

@@ -8,7 +8,6 @@ its server is gone. So with VRPN silence is all that can be told.
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import os
 import signal
 import socket
@@ -16,7 +15,7 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -207,7 +206,6 @@ class MotionCapture:
 START_TIMEOUT_S = 30.0
 MOST_HZ = 500.0
 """No system is faster; what comes faster is not a measurement, and would keep the parent busy."""
-AFTER_PARENT_S = 1.0
 PAUSE_S, AT_ONCE_S = 0.1, 2e-4
 
 Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, float]]]
@@ -222,43 +220,17 @@ def serve_parent() -> None:
     setup = channel.receive(START_TIMEOUT_S)
     is_loaded = False
     try:
-        with _bounded(setup):
-            import motioncapture
+        import motioncapture
 
-            is_loaded = True
-            client = motioncapture.connect(setup.kind, _by_address(setup))
+        is_loaded, options = True, setup.options
+        if setup.kind == "optitrack":  # its reader knows no names
+            options = options | {"hostname": socket.gethostbyname(options["hostname"])}
+        client = motioncapture.connect(setup.kind, options)
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.partial)
     except Exception as error:  # whatever the library, or the loading of its own modules, raises
         with contextlib.suppress(OSError):  # the parent may be gone, and have caused it
             channel.send(Failed(str(error) or type(error).__name__, is_loaded))
-
-
-@contextlib.contextmanager
-def _bounded(setup: CaptureSetup) -> Iterator[None]:
-    """End the process if the block takes too long, by a thread that needs no turn of Python's, also
-    when the parent has been killed meanwhile."""
-    with open(os.devnull, "w") as nowhere:
-        faulthandler.dump_traceback_later(setup.timeout_s + AFTER_PARENT_S, exit=True, file=nowhere)
-        try:
-            yield
-        finally:
-            faulthandler.cancel_dump_traceback_later()
-
-
-def _by_address(setup: CaptureSetup) -> dict[str, str]:
-    """Return the options, with an address for OptiTrack's reader, which knows no names. Errors:
-    ConnectionFailed."""
-    if setup.kind != "optitrack":
-        return setup.options
-    host = setup.options["hostname"]
-    try:
-        return setup.options | {"hostname": socket.gethostbyname(host)}
-    except (OSError, UnicodeError) as error:
-        raise ConnectionFailed(
-            f"the host name {host!r} cannot be resolved ({error}): correct positioning.host, or "
-            f"give the address, as in 192.168.1.2"
-        ) from None
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from perchctl.errors import InvalidValue, distinct_figures, no_motion_capture
+from perchctl.errors import InvalidValue, no_motion_capture
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
@@ -228,17 +228,14 @@ class PositionFeed:
 
     def _why(self, now_s: float) -> str:
         who = self._config.label
-        if self._turned_s is None:
-            return f"nothing has been asked of {who} yet"
-        if now_s - self._turned_s > HANGS_S:
+        if self._turned_s is not None and now_s - self._turned_s > HANGS_S:
             return (
                 f"the positions of {who} have not been passed on for {now_s - self._turned_s:.1f} s"
             )
         if self._problem is not None:
             return self._problem
-        if self._framed_s == -math.inf:
-            return f"no frame has come from {who} yet"
-        return f"no frame has come from {who} for {now_s - self._framed_s:.1f} s"
+        for_s = "yet" if self._framed_s < 0.0 else f"for {now_s - self._framed_s:.1f} s"
+        return f"no frame has come from {who} {for_s}"
 
 
 # --- Which of a capture's frames may be believed, and where the vehicle's body is in them ---
@@ -258,8 +255,6 @@ FASTEST_MPS, FASTEST_RADPS, AT_FASTEST_S = 5.0, 10.0, 0.02
 """A vehicle that falls 1.3 m, or is pushed over, for the first moment."""
 HELD_MPS, HELD_RADPS = 0.5, 1.0
 """After that moment: without a position it is held where it is, and drifts."""
-SEEN_S = 1.0
-"""Names of other bodies that a sentence mentions are not older."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +291,6 @@ class Judge:
         self._newest: BodyPose | None = None
         self._believed: Placed | None = None
         self._stranger: Placed | None = None
-        self._seen: dict[str, float] = {}
         self.problem: str | None = None
         """Why the newest frame with news was not believed; None if it was."""
 
@@ -307,28 +301,24 @@ class Judge:
         if not math.isfinite(arrived_s) or arrived_s <= self._arrived_s:
             return None
         self._arrived_s = arrived_s
-        self._seen |= dict.fromkeys(frame.bodies, now_s)
         pose = frame.bodies.get(self._config.body)
         if pose is None:
-            self.problem = self._missing(now_s)
+            others = ", ".join(sorted(frame.bodies)) or "none"
+            who, label = self._config.body, self._config.label
+            self.problem = f"{label} does not see the rigid body {who!r}; it sees {others}"
             return None
         if now_s - arrived_s > STALE_S:
-            age, allowed = distinct_figures(now_s - arrived_s, STALE_S, 2)
-            self.problem = (
-                f"{self._who} is {age} s old when it is read; at most {allowed} s may pass"
-            )
+            self.problem = f"{self._who} is {now_s - arrived_s:.3f} s old when it is read"
             return None
         if not _is_pose(pose):
-            self.problem = (
-                f"{self._who} has a pose that is none: position {_numbers(pose.position_m)}, "
-                f"quaternion {_numbers(pose.quaternion)}"
-            )
+            self.problem = f"{self._who} has a pose that is none: {pose}"
             return None
         if pose == self._newest:
             # Measured noise never repeats all seven numbers; a filter or a doubled frame may,
             # for a frame or two, and then nothing is lost. So a repetition is no news, and
             # `Placed.t_s` stays that of its first frame.
-            self.problem = self._frozen() if self._stranger is None else self.problem
+            if self._stranger is None:
+                self.problem = f"{self._who} is frozen: is it hidden, or the capture paused?"
             return None
         self._newest = pose
         return self._followed(
@@ -344,33 +334,19 @@ class Judge:
         """
         last, stranger = self._believed, self._stranger
         if last is not None:
-            jump = _jump(last, placed)
-            if stranger is not None and _jump(stranger, placed) is None:
-                nearer = _way_m(stranger, placed) <= _way_m(last, placed)
-                jump = jump or (_way(last, placed) if nearer else None)
-            if jump is not None:
+            jumps, way_m = _jumps(last, placed), _way_m(last, placed)
+            if stranger is not None and not _jumps(stranger, placed):
+                jumps = jumps or _way_m(stranger, placed) <= way_m
+            if jumps:
                 self._stranger = placed
                 self.problem = (
-                    f"{self._who} jumped by {jump}: perhaps another body is taken for it; it is "
-                    f"not believed until it is seen where it was, or perchctl starts again"
+                    f"{self._who} jumped by {way_m:.2f} m and "
+                    f"{math.degrees(_turn_rad(last, placed)):.0f} deg: perhaps another body is "
+                    f"taken for it; it is not believed until it is seen where it was"
                 )
                 return None
         self._believed, self._stranger, self.problem = placed, None, None
         return placed
-
-    def _missing(self, now_s: float) -> str:
-        others = sorted(name for name, t_s in self._seen.items() if now_s - t_s <= SEEN_S)
-        others = [name for name in others if name != self._config.body]
-        return (
-            f"{self._config.label} does not see the rigid body {self._config.body!r}; "
-            f"it sees {', '.join(others) or 'none'}"
-        )
-
-    def _frozen(self) -> str:
-        return (
-            f"{self._who} is frozen: all of its numbers repeat, and a measured pose has noise; "
-            f"is it hidden, or the capture paused?"
-        )
 
 
 def _is_pose(pose: BodyPose) -> bool:
@@ -379,20 +355,13 @@ def _is_pose(pose: BodyPose) -> bool:
     return abs(math.sqrt(sum(part * part for part in pose.quaternion)) - 1.0) <= UNIT_WITHIN
 
 
-def _jump(a: Placed, b: Placed) -> str | None:
-    """Say what is too far from `a` to `b`; None if a vehicle can have gone so."""
+def _jumps(a: Placed, b: Placed) -> bool:
+    """True if no vehicle can have gone from `a` to `b` in their time."""
     dt_s = b.t_s - a.t_s
     first_s = min(dt_s, AT_FASTEST_S)
     far_m = NOISE_M + FASTEST_MPS * first_s + HELD_MPS * (dt_s - first_s)
     far_rad = NOISE_RAD + FASTEST_RADPS * first_s + HELD_RADPS * (dt_s - first_s)
-    return _way(a, b) if _way_m(a, b) > far_m or _turn_rad(a, b) > far_rad else None
-
-
-def _way(a: Placed, b: Placed) -> str:
-    return (
-        f"{_way_m(a, b):.2f} m and {math.degrees(_turn_rad(a, b)):.0f} deg in "
-        f"{(b.t_s - a.t_s) * 1e3:.0f} ms"
-    )
+    return _way_m(a, b) > far_m or _turn_rad(a, b) > far_rad
 
 
 def _way_m(a: Placed, b: Placed) -> float:
@@ -401,7 +370,3 @@ def _way_m(a: Placed, b: Placed) -> float:
 
 def _turn_rad(a: Placed, b: Placed) -> float:
     return math.acos(max(-1.0, min(1.0, (float(np.trace(a.R.T @ b.R)) - 1.0) / 2.0)))
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(f"{value:g}" for value in values)

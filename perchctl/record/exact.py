@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
+_GONE = {"timing"}  # in logs of before
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 

@@ -21,7 +21,7 @@ from perchctl.faults.oracle import (
     claims_of_rescue,
 )
 from perchctl.mission import Event, EventKind, Finding, FlightReport, Outcome, Phase
-from perchctl.mission.state import TERMINALS, MotorStop
+from perchctl.mission.state import TERMINALS
 from perchctl.mission.table import TABLE
 
 LAST_ROWS = {row.name: row for row in TABLE if row.to in TERMINALS}
@@ -43,7 +43,7 @@ def test_a_row_claims_what_its_sentence_says(name: str) -> None:
     row, claims = LAST_ROWS[name], ROW_CLAIMS[name]
     if row.to is not Phase.ABORTED:
         assert PHASE_CLAIMS[row.to] <= claims or "hangs on the target" in claims
-    if row.motor_stop is not MotorStop.NONE:
+    if row.stop is not None:
         assert "motors off" in claims
     if isinstance(row.reason, str):
         said = {

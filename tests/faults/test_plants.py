@@ -20,7 +20,6 @@ from perchctl.flight import OperatorSwitch, loop
 from perchctl.mission import Observation, Operator, Phase, PlannerState, lander, planner
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import Acted, stop_motors
-from perchctl.mission.lander import Manoeuvre
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.flights import SHORT
@@ -46,14 +45,18 @@ def ignores_the_second_press(patch: Patch) -> None:
 
 def lands_fast(patch: Patch) -> None:
     """At 1.5 m/s, by itself and by thrust."""
-    order = lander.own_landing
+    order, by_setpoints = lander.own_landing, lander._by_setpoints
 
     def fast(*known: Any) -> Land:
         land = order(*known)
         return Land(land.height_m, max(0.1, (known[-1] - land.height_m) / 1.5))
 
+    def by_itself(c: Context) -> Acted:
+        slow = c.by_sight or lander.is_in_reach(c)
+        return by_setpoints(c) if slow else lander._own_landing(c)
+
     patch.setattr(lander, "own_landing", fast)
-    patch.setitem(lander.ACTIONS, Manoeuvre.SETPOINTS, lander._own_landing)
+    patch.setattr(lander, "_by_setpoints", by_itself)
     for name in ("SINK_MPS", "LOW_SINK_MPS"):
         patch.setattr(lander, name, 1.5)
 

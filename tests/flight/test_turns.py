@@ -76,7 +76,6 @@ def test_each_turn_is_told_once_and_in_order(monkeypatch: pytest.MonkeyPatch) ->
         assert turn.observation is not None
         assert turn.observation.target is tick.target
         assert turn.observation.telemetry is tick.telemetry
-        assert turn.timing is None
     assert next(turn for turn in told.turns if turn.role == "redone").command is not None
 
 

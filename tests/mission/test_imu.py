@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -23,7 +22,7 @@ from perchctl.mission.imu import (
     advance_reckoning,
 )
 from perchctl.vehicle import Telemetry
-from tests.helpers.mission import HOVER_THRUST, telemetry
+from tests.helpers.mission import telemetry
 
 
 def flown(samples: list[Telemetry], motion: ImuMotion | None = None) -> ImuMotion:
@@ -120,51 +119,27 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
     assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
 
 
-@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 2.0))
-def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silent_s: float) -> None:
-    """However it was last heard to sink. A sight from after it tells again where it is."""
-    before = telemetry(1.0, velocity_mps=(0.0, 0.0, -0.3))
-    after = telemetry(1.0 + silent_s, velocity_mps=(0.0, 0.0, -0.3))
-    imu = flown([before])
-    old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
-    new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
-    assert (new.unsure_s == after.t_s) == (below_m - MOST_CLIMB_MPS * silent_s < REACH_M)
-    assert new.below_m == below_m
-    seen = add_sight(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
-    assert seen.nearest_m == below_m
-
-
 @given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 3.0))
-def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s: float) -> None:
-    """With motors that were off, or started anew: it lies, or hangs where it hung."""
-    for thrust, start in ((0.0, 0), (HOVER_THRUST, 1)):
-        before = telemetry(1.0, thrust=thrust)
-        after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
+def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
+    below_m: float, silent_s: float
+) -> None:
+    """However it was last heard to sink. With motors that were off, or started anew, it lies, or
+    hangs where it hung."""
+    sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
+    near = below_m - MOST_CLIMB_MPS * silent_s < REACH_M
+    off = {"thrust": 0.0}
+    for z_m, before, after, unsure, kept in (
+        (below_m, telemetry(1.0, **sinks), telemetry(1.0 + silent_s, **sinks), near, True),
+        (below_m, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), False, False),
+        (below_m, telemetry(1.0), telemetry(1.0 + silent_s, start=1, **off), False, False),
+        (0.02, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), True, True),
+    ):
         imu = flown([before])
-        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
         new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
-        assert new.unsure_s == -math.inf
-        assert new.below_m == math.inf
-        near = replace(old, below_m=0.02, nearest_m=0.02)
-        new = advance_reckoning(near, imu.with_sample(before, after), after, believed=False)
-        assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
-
-
-def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
-    """It fell by 5 cm, and the setpoint that catches it is a metre above."""
-    falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
-    reckoning = add_sight(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
-    motion = flown(falls[:1])
-    for last, new in pairwise(falls):
-        motion = motion.with_sample(last, new)
-        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
-    assert motion.fell_s > 1.0
-    assert 0.02 < reckoning.nearest_m < 0.1
-    late = telemetry(falls[-1].t_s + 1.5)
-    reckoning = advance_reckoning(
-        reckoning, motion.with_sample(falls[-1], late), late, believed=False
-    )
-    assert reckoning.unsure_s == late.t_s
+        assert (new.unsure_s == after.t_s) is unsure
+        assert new.below_m == (z_m if kept else math.inf)
+        assert add_sight(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).nearest_m == z_m
 
 
 def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:

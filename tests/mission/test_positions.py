@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
@@ -32,7 +31,6 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     MOCAP,
     PROFILE,
-    PROFILES,
     READY,
     Felt,
     observation,
@@ -268,27 +266,6 @@ def test_what_something_carries_is_put_down_gently_whatever_that_is(
 # --- Where it touched ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("by", "unseen_s", "least_m", "most_m"),
-    [("deck", 0.1, 0.002, 0.003), ("deck", 1.0, 0.01, 0.012), ("mocap", 1.0, 0.001, 0.002)],
-)
-def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
-    by: str, unseen_s: float, least_m: float, most_m: float
-) -> None:
-    """A target that is only remembered keeps the spread of its last sight."""
-
-    def look(t_s: float) -> Observation:
-        remembered = target_at(
-            t_s, body_m=(0.0, 0.0, HANG_Z_M), measured_s=t_s - unseen_s, measured=False,
-            tracked=False, sigma_m=np.full(3, 1e-4),
-        )  # fmt: skip
-        return observation(t_s, HANG_Z_M, target=remembered)
-
-    flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 0.1, PROFILES[by])
-    sigma_m = contact_error(Context(flight.state, flight.obs, PROFILES[by])).sigma_m
-    assert least_m <= sigma_m <= most_m
-
-
 SMEARED_M = (0.0196, 0.0158, 0.0123, 0.0098)
 
 
@@ -330,16 +307,13 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
 
 
 class Falls(Motors):
-    """A vehicle that flies by its thrust alone from a height on, or from the ground; seen by an
-    accelerometer that reads too much, and by a position in another world."""
+    """A vehicle that flies by its thrust alone from the ground, in a world with its y up, seen by
+    an accelerometer that reads too much."""
 
-    def __init__(
-        self, z_m: float, thrust: float, hover: float = HOVER_THRUST, too_much_g: float = 0.0,
-        y_up: bool = False,
-    ) -> None:  # fmt: skip
-        super().__init__(thrust)
-        self.z_m, self.up_mps, self.hover, self.too_much_g = z_m, 0.0, hover, too_much_g
-        self.y_up, self.highest_m, self.met_mps = y_up, z_m, 0.0
+    def __init__(self, hover: float, too_much_g: float) -> None:
+        super().__init__(1.15 * hover)
+        self.hover, self.too_much_g = hover, too_much_g
+        self.z_m = self.up_mps = self.highest_m = self.met_mps = 0.0
 
     def look(self, t_s: float, state: PlannerState) -> Observation:
         acc_g = self.thrust / self.hover
@@ -348,14 +322,9 @@ class Falls(Motors):
             self.z_m += self.up_mps * TICK_S
             self.highest_m = max(self.highest_m, self.z_m)
             self.met_mps = self.up_mps if self.z_m <= 0.0 else 0.0
-        body_m = (0.0, self.z_m, 0.0) if self.y_up else (2.0 * (t_s - BEGIN_S), 0.0, self.z_m)
-        velocity_mps = (0.0, self.up_mps, 0.0) if self.y_up else (2.0, 0.0, self.up_mps)
-        tel = telemetry(
-            t_s, position_m=body_m, velocity_mps=velocity_mps, thrust=self.thrust,
-            acc_z_g=acc_g + self.too_much_g,
-        )  # fmt: skip
-        target = target_at(t_s, body_m=body_m) if self.y_up else None
-        return observation(t_s, telemetry=tel, target=target)
+        body_m, velocity_mps = (0.0, self.z_m, 0.0), (0.0, self.up_mps, 0.0)
+        tel = {"thrust": self.thrust, "acc_z_g": acc_g + self.too_much_g}
+        return at(position_m=body_m, velocity_mps=velocity_mps, **tel)(t_s)
 
     def obey(self, state: PlannerState, command: Command) -> None:
         if isinstance(command, RawThrust):
@@ -370,24 +339,12 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
     """A world with its y up: the vehicle rises, its position slides, its height and its vertical
     speed stand. It is let down by what its accelerometer feels, one with an offset too."""
     begin = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
-    it = Falls(0.0, 1.15 * hover, hover, felt_too_much_g, y_up=True)
+    it = Falls(hover, felt_too_much_g)
     state = fly(begin, it, 5.0, MOCAP, feels=True).state
     assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
     assert "perchctl check --lift" in state.reason
     assert -0.9 < it.met_mps < 0.0
     assert it.highest_m < 0.3
-
-
-@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
-@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
-def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
-    """The axes are swapped in the plane alone. The accelerometer's offset, which would sum up on
-    the longer way, was learned at rest."""
-    felt = Felt().at_rest(BEGIN_S, 1.0 + felt_too_much_g)
-    it = Falls(height_m, HOVER_THRUST, too_much_g=felt_too_much_g)
-    flight = fly(state_in(Phase.ALIGN, z_m=height_m), it, 12.0, MOCAP, feels=felt)
-    assert flight.state.row == "position-astray"
-    assert -0.9 < it.met_mps < 0.0
 
 
 def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from perchctl.mission import (
     ContactError,
@@ -345,16 +343,6 @@ def test_no_row_undoes_a_landing() -> None:
     assert first_match(context, (ROGUE,)) is None
     flying = planner.Context(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
     assert first_match(flying, (ROGUE,)) is ROGUE
-
-
-@given(st.lists(st.sampled_from(Severity), max_size=20))
-def test_from_landing_on_the_severity_only_rises(rows: list[Severity]) -> None:
-    severity, grave = Severity.CONTINUE, False
-    for row in rows:
-        before, severity = severity, severity.then(row)
-        assert not grave or severity >= before
-        grave = grave or severity >= Severity.LAND
-        assert grave == (severity >= Severity.LAND)
 
 
 @pytest.mark.parametrize("below_m", [0.1, 0.0])

@@ -27,13 +27,12 @@ from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
     CEILING_M,
     PROFILE,
-    READY,
     changed,
     observation,
     state_in,
     target_at,
 )
-from tests.mission.rig import BEGIN_S, Motors, at, fly, is_setpoint, times
+from tests.mission.rig import BEGIN_S, Motors, at, fly, times
 
 CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 
@@ -102,25 +101,6 @@ def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) 
     if not presses:
         assert state.outcome is Outcome.SAFETY
         assert "too heavy" in state.reason
-
-
-@pytest.mark.parametrize(
-    ("hover", "lasts_s", "row"),
-    [
-        # It hovers below its setpoint on all the thrust there is, as before on nearly all.
-        (62500.0, 1.9, ""),
-        (62500.0, 2.5, "too-weak"),
-        (56000.0, 1.0, "blocked"),
-    ],
-)
-def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
-    hover: float, lasts_s: float, row: str
-) -> None:
-    start = replace(state_in(Phase.ALIGN), hover_thrust=hover)
-    full = {"thrust": float(FULL_THRUST), "setpoint_z_m": 1.2, "aside_m": 0.2}
-    state = flown(start, lasts_s, **full)
-    assert state.row == row
-    assert row != "too-weak" or "battery too low" in state.reason
 
 
 @pytest.mark.parametrize(
@@ -218,12 +198,6 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     it = Follows(1.0, target=below)
     fly(state_in(phase), it, 8.0)
     assert min(it.sent_m) >= FLOOR_M
-
-
-def test_a_take_off_begins_on_the_ground() -> None:
-    begin = PlannerState.on_ground(observation(BEGIN_S, 0.0))
-    flight = fly(begin, at(0.0, thrust=0.0, supervisor=READY))
-    assert is_setpoint(flight.command, below_m=FLOOR_M)
 
 
 @pytest.mark.parametrize("handover_m", [0.1, 0.3])

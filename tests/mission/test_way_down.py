@@ -43,7 +43,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, Motors, at, fly, is_setpoint
+from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, at, fly, is_setpoint
 
 SINKS = (0.0, 0.0, -0.5)
 OFF: dict[str, Any] = {"thrust": 0.0, "supervisor": READY}
@@ -344,29 +344,23 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch(since_s: float, touche
     assert (after.contact is not None) is touched
 
 
-def test_what_has_left_its_contact_forgets_where_that_was() -> None:
-    state = fly(hanging(Phase.RECOVER, contact=ContactError(0.01, 0.02)), at(HANG_Z_M - 0.1)).state
+def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_recovered() -> None:
+    """Steady because it sticks there, the next attempt would begin pressed."""
+    touched = hanging(Phase.RECOVER, contact=ContactError(0.01, 0.02))
+    state = fly(touched, at(HANG_Z_M - 0.1)).state
     assert (state.contact_z_m, state.contact) == (None, None)
-
-
-def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
-    """Steady because it sticks there: the next attempt would begin pressed."""
-    assert fly(hanging(Phase.RECOVER), at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
+    assert fly(touched, at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
 
 
 # --- The release -----------------------------------------------------------------------
-
-
-def mid_release(**changes: Any) -> PlannerState:
-    """Half a second into the release, the motors on their way down to still."""
-    return hanging(Phase.COMPLETE, **{"entered_s": 8.0, "released_s": 9.5, "t_s": 9.98, **changes})
 
 
 def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
     """Still motors would be a stop without a proof: what the magnet lets go of meanwhile is
     on the floor before the link counts as lost. Seen again, it begins anew."""
     look = at(HANG_Z_M, thrust=1000.0)
-    state, command = step_mission(mid_release(), look(10.0), PROFILE)
+    half_way = hanging(Phase.COMPLETE, entered_s=8.0, released_s=9.5, t_s=9.98)
+    state, command = step_mission(half_way, look(10.0), PROFILE)
     assert isinstance(command, RawThrust)
     state, command = step_mission(state, replace(look(10.0), t_s=10.2), PROFILE)
     assert is_setpoint(command, above_m=HANG_Z_M)
@@ -415,48 +409,30 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     assert flight.state.phase is not Phase.PERCHED
 
 
-def slipped(**changes: Any) -> PlannerState:
-    """A slip that is being caught."""
-    below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
-    caught = {"row": "slipped", "caught": False, "catch_above_m": 1.0, "setpoint": below}
-    return landing(HANG_Z_M, Phase.RECOVER, **{**caught, **changes})
-
-
-FALLS: dict[str, Any] = {"velocity_mps": SINKS, "thrust": 1000.0, "acc_z_g": 0.2}
-
-
 def test_nothing_is_caught_on_an_old_speed() -> None:
     """Two seconds of full thrust on a speed of long ago would end far above."""
-    late = at(HANG_Z_M - 0.1, age_s=0.2, **FALLS)
-    _, command = step_mission(slipped(), late(10.08), PROFILE)
+    below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
+    slipped = landing(HANG_Z_M, Phase.RECOVER, caught=False, catch_above_m=1.0, setpoint=below)
+    late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
+    _, command = step_mission(slipped, late(10.08), PROFILE)
     assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
 
 
 # --- A step of the estimate -------------------------------------------------------------
 
 
-@pytest.mark.parametrize("step_m", [-0.6, 0.7])
-def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) -> None:
-    """The vehicle has not moved: held where it is, over a ground that is as far below."""
-    before = fly(landing(1.0, Phase.ALIGN), at(), 0.06).state
-    state, command = step_mission(before, at(1.0 + step_m, obs={"jumped": True})(10.08), PROFILE)
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m == pytest.approx(1.0 + step_m, abs=0.02)
-    assert before.ground_m is not None
-    assert state.ground_m is not None
-    assert state.ground_m[2] == pytest.approx(before.ground_m[2] + step_m, abs=0.02)
-
-
 @pytest.mark.parametrize(
     ("gap_s", "moves"), [(0.02, True), (0.1, True), (0.3, False), (5.0, False)]
 )
 def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves: bool) -> None:
-    """It was at rest before the silence and is at rest after it: on the floor."""
+    """It was at rest before the silence and is at rest after it: on the floor. Else what is
+    remembered moves with the estimate."""
     state = landing(1.0, last=telemetry(10.0, 1.0))
     new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
     assert state.ground_m is not None
     assert new.ground_m is not None
     assert new.ground_m[2] - state.ground_m[2] == pytest.approx(-0.98 if moves else 0.0)
+    assert not moves or new.entry_m[2] == pytest.approx(0.02)  # it has not moved: held where it is
 
 
 def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
@@ -475,53 +451,39 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
 
 # --- Its own landing -----------------------------------------------------------------
 
-CUT: dict[str, Any] = {"thrust": 0.0, "acc_z_g": 0.02}
-"""Motors that stand still in a fall."""
+
+def cut(z_m: float, climb_mps: float, **obs: Any) -> Look:
+    """Motors that stand still in a fall."""
+    return at(z_m, obs=obs, thrust=0.0, acc_z_g=0.02, velocity_mps=(0.0, 0.0, climb_mps))
+
+
+OVERDUE = landing(3.0, entered_s=10.0 - 0.6 * PROFILE.planner.landing.timeout_s)
+ORDERED, LOW = landing(1.5, orders=1, ordered_s=9.5), landing(1.5, orders=3, ordered_s=5.0)
+HIGH = landing(1.8, orders=3, ordered_s=5.0)
 
 
 @pytest.mark.parametrize(
     ("begin", "look", "again"),
     [
         # At the time's end nothing is sent any more, and setpoints that end are cut.
-        (
-            landing(3.0, entered_s=10.0 - 0.6 * PROFILE.planner.landing.timeout_s),
-            at(3.0, obs={"target": None}), True,
-        ),
+        (OVERDUE, at(3.0, obs={"target": None}), True),
         # Orders lost, their notify not: cut in the air, and told to land again.
-        (
-            landing(1.5, orders=1, ordered_s=9.5),
-            at(1.4, **CUT, velocity_mps=(0.0, 0.0, -0.4)), True,
-        ),
-        (landing(1.5, orders=1, ordered_s=9.5), at(0.02, thrust=0.0), False),
+        (ORDERED, cut(1.4, -0.4), True),
+        (ORDERED, at(0.02, thrust=0.0), False),
         # It falls for a moment, a hand above the floor. Another order would start the motors once
         # more there, each time by an estimate that has gone further astray; a real fall is braked.
-        (
-            landing(1.5, orders=3, ordered_s=5.0),
-            at(0.0, **CUT, velocity_mps=(0.0, 0.0, -0.4)), False,
-        ),
-        (
-            landing(1.5, orders=3, ordered_s=5.0),
-            at(0.0, **CUT, velocity_mps=(0.0, 0.0, -1.2)), True,
-        ),
+        (LOW, cut(0.0, -0.4), False),
+        (LOW, cut(0.0, -1.2), True),
         # The motors stop far above the floor: that is no landing's end, unless no position tells
         # how far above.
-        (
-            landing(1.8, orders=3, ordered_s=5.0),
-            at(1.5, **CUT, velocity_mps=(0.0, 0.0, -0.3)), True,
-        ),
-        (
-            landing(1.8, orders=3, ordered_s=5.0),
-            at(0.3, **CUT, velocity_mps=(0.0, 0.0, -0.3)), False,
-        ),
-        (
-            landing(1.8, orders=3, ordered_s=5.0),
-            at(1.5, obs={"position_age_s": 2.0}, **CUT, velocity_mps=(0.0, 0.0, -0.3)), False,
-        ),
+        (HIGH, cut(1.5, -0.3), True),
+        (HIGH, cut(0.3, -0.3), False),
+        (HIGH, cut(1.5, -0.3, position_age_s=2.0), False),
     ],
     ids=["overdue", "cut", "stands", "drops", "falls", "cut high", "cut low", "cut unplaced"],
-)  # fmt: skip
+)
 def test_a_landing_of_its_own_is_ordered_while_it_is_in_the_air(
-    begin: PlannerState, look: Any, again: bool
+    begin: PlannerState, look: Look, again: bool
 ) -> None:
     command = fly(begin, look).command
     assert isinstance(command, Land if again else Idle | StopMotors)

@@ -162,47 +162,24 @@ def test_bodies_that_come_one_by_one_do_not_hide_each_other(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fault", ["stalls", "hangs"])
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
-def test_it_ends_with_a_parent_that_was_killed(
-    faulty: Callable[..., MotionCapture], fault: str
-) -> None:
-    """Also where the library lets no thread of the process have a turn."""
+def test_it_ends_with_a_parent_that_was_killed(faulty: Callable[..., MotionCapture]) -> None:
     code = (
-        "import subprocess, sys, threading, time\n"
-        f"sys.path.append({str(ROOT)!r})\n"
+        "import time\n"
+        f"import sys; sys.path.append({str(ROOT)!r})\n"
         "from perchctl.positioning import capture\n"
-        "spawn = capture.spawn\n"
-        "def told(code, output):\n"
-        "    pair = spawn(code, output); print(pair[0].pid, flush=True); return pair\n"
-        "capture.spawn = told\n"
         "from perchctl.profile.positioning import PositioningConfig\n"
-        f"one = capture.open_capture(PositioningConfig(by='mocap', host={fault!r}, body='cf'))\n"
-        "print('open', flush=True); time.sleep(60)\n"
+        "one = capture.open_capture(PositioningConfig(by='mocap', host='stalls', body='cf'))\n"
+        "print(one._child.pid, flush=True); time.sleep(60)\n"
     )
-    if fault == "hangs":
-        code = code.replace("body='cf'", "body='cf', connect_timeout_s=0.9")
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     pid = int(parent.stdout.readline())
-    if fault == "hangs":
-        until(lambda: Path(f"/proc/{pid}").exists())
-        time.sleep(0.3)
-    else:
-        assert parent.stdout.readline() == "open\n"
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     parent.stdout.close()
-    until(lambda: not _runs(pid))
-
-
-def _runs(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
     stat = Path(f"/proc/{pid}/stat")
-    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
+    until(lambda: not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z")
 
 
 def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,9 +195,7 @@ def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.Mon
 @pytest.mark.parametrize(("system", "host", "options"), [
     ("qualisys", "lab:22223", {"hostname": "lab", "port": "22223"}),
     ("optitrack", "10.0.0.2:1511", {"hostname": "10.0.0.2", "port_command": "1511"}),
-    ("vrpn", "lab:3884", {"hostname": "lab:3884"}),
     ("vicon", "lab:801", {"hostname": "lab:801"}),
-    ("qualisys", "lab", {"hostname": "lab"}),
 ])  # fmt: skip
 def test_a_port_goes_where_the_library_wants_it(
     system: str, host: str, options: dict[str, str]
@@ -264,15 +239,6 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.M
     assert ended.wait(5.0)
     thread.join()
     channel.close()
-
-
-def test_a_host_that_cannot_be_resolved_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def resolve(name: str) -> str:
-        raise socket.gaierror(-2, "Name or service not known")
-
-    monkeypatch.setattr(capture.socket, "gethostbyname", resolve)
-    with pytest.raises(ConnectionFailed, match=r"'lab' cannot be resolved.*service not known"):
-        capture._by_address(CaptureSetup("optitrack", {"hostname": "lab"}))
 
 
 class Clock:

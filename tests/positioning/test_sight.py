@@ -155,17 +155,6 @@ def test_a_place_is_carried_to_now_by_the_estimates_own_motion(
     assert it.status(then_s + late_s).age_s == pytest.approx(late_s)
 
 
-@pytest.mark.parametrize("again_s", [5.0, 4.9])
-def test_the_same_exposure_or_an_older_one_is_sent_no_second_time(again_s: float) -> None:
-    sent = Sent()
-    it = flying(sent)
-    shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.05)
-    assert len(sent.places) == 1
-    shown(it, attitude(again_s, (0.0, 0.0, 1.0)), 5.05 + 2 * PERIOD_S)
-    assert len(sent.places) == 1
-    assert it.status(5.2).age_s == pytest.approx(0.2)
-
-
 @given(off_m=st.floats(0.0, 3.0), silent_s=st.floats(0.05, 3.0))
 def test_what_estimate_and_blindness_cannot_explain_is_not_sent(
     off_m: float, silent_s: float
@@ -197,21 +186,15 @@ def test_an_old_vague_or_endless_pose_is_not_sent(
     assert words in (it.status(6.0).problem or "")
 
 
-def test_no_more_are_sent_than_the_rate_allows_and_none_waits() -> None:
-    sent = Sent()
-    it = flying(sent)
-    for i in range(100):  # 100 Hz for a second
-        shown(it, attitude(5.0 + 0.01 * i, (0.001 * i, 0.0, 1.0)), 5.05 + 0.01 * i)
-    assert 0.8 * 30 <= len(sent.places) <= 31
-    assert it.status(6.05).rate_hz == pytest.approx(30.0, abs=5.0)
-
-
-def test_what_the_link_did_not_take_leaves_the_age_growing() -> None:
+@pytest.mark.parametrize(("again_s", "busy"), [(5.0, False), (4.9, False), (5.2, True)])
+def test_what_is_not_new_or_not_taken_leaves_the_age_growing(again_s: float, busy: bool) -> None:
+    """The same exposure, an older one, or a link that is busy."""
     sent = Sent()
     it = flying(sent)
     shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.05)
-    sent.busy = True
-    shown(it, attitude(5.2, (0.0, 0.0, 1.0)), 5.25)
+    sent.busy = busy
+    shown(it, attitude(again_s, (0.0, 0.0, 1.0)), 5.05 + 6 * PERIOD_S)
+    assert len(sent.places) == 1
     assert it.status(5.3).age_s == pytest.approx(0.3)
     assert it.status(5.0 + TARGET_ONLY.positioning.hold_s + 0.1).problem
 

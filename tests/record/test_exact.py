@@ -25,7 +25,6 @@ from perchctl.mission import (
     SentCommand,
     Turn,
     TurnInputs,
-    TurnTiming,
 )
 from perchctl.mission.state import Condition
 from perchctl.record import from_exact, to_exact
@@ -127,7 +126,7 @@ def whole_turn() -> Turn:
         {"joint": PoseSeen(0.9, np.ones(3), 0.1)},
         Observation(1.3, sample, synthetic.target(1.0, 1.0)), Land(0.0, 2.0),
         Phase.LANDING, "fence", True, 2, ExternalPositions(0.1, None, 3, 99.0, None),
-        TurnTiming(0.01, 0.001, 0.0001, 0.02), Outcome.SAFETY, "beyond the fence", "KeyError",
+        Outcome.SAFETY, "beyond the fence", "KeyError",
     )  # fmt: skip
 
 
