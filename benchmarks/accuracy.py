@@ -29,7 +29,7 @@ from common import (
 )
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
+from perchctl.profile import DetectorConfig, MergeConfig
 from perchctl.vision import (
     CameraModel,
     Frame,
@@ -74,7 +74,6 @@ def report(title: str, views: Iterator[View], camera: CameraModel) -> None:
     paper = setup_with(
         camera,
         detector=DetectorConfig(refinement="none", window=False),
-        pose=PoseConfig(solver="epnp", refine=False),
         merge=MergeConfig(method="weights"),
     )
     errors: dict[str, list[Array]] = defaultdict(list)

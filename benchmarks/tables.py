@@ -20,7 +20,7 @@ from common import (
 )
 
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
+from perchctl.profile import DetectorConfig, MergeConfig
 from perchctl.sim import Renderer
 from perchctl.vision import Frame, Pipeline, PipelineState, step
 
@@ -85,7 +85,6 @@ def main() -> None:
     ours = setup_with()
     paper = setup_with(
         detector=DetectorConfig(refinement="none", window=False),
-        pose=PoseConfig(solver="epnp", refine=False),
         merge=MergeConfig(method="weights"),
     )
     limit_deg = math.degrees(math.atan(CAMERA.size_px[0] / 2.0 / float(CAMERA.K[0, 0])))

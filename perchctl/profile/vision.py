@@ -289,10 +289,8 @@ class DetectorConfig(Section):
 class PoseConfig(Section):
     """The profile's `pose`: how a pose is solved from corners."""
 
-    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = key(
-        "sqpnp", "OpenCV's solver for the first guess"
-    )
-    refine: bool = key(True, "least squares on the corners after it")
+    solver: ClassVar[str] = "sqpnp"  # OpenCV's, for the first guess
+    refine: ClassVar[bool] = True  # by least squares on the corners after it
     max_reprojection_px: float = key(3.0, "no pose above this RMS", gt=0)
     each_marker: bool = key(False, "beside the joint pose also each marker's own, for the log")
 

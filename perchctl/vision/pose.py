@@ -103,10 +103,9 @@ def estimate_pose(
         prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_RAD)
     else:
         prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
-    solution = _continued(points, start, prior, setup.config) or _solved(
-        points, prior, setup.config
-    )
-    if solution is None:
+    most_px = setup.config.max_reprojection_px
+    solution = _continued(points, start, prior, most_px) or solve(points, prior)
+    if solution is None or not solution.rms_px <= most_px:
         return None
     source = "joint" if len(detections) > 1 else detections[0].marker
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
@@ -116,7 +115,7 @@ def estimate_pose(
         return pose  # sides between interpolated rows look curled
     # No flat sheet has both markers where they are. One that curls may, or the corners err.
     points = replace(points, curled=True)
-    settled = _continued(points, solution, prior, setup.config)
+    settled = _continued(points, solution, prior, most_px)
     if settled is None:
         return pose
     bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
@@ -138,29 +137,14 @@ def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
 
 
 def _continued(
-    points: Points, start: PoseCandidate | None, prior: TiltPrior, config: PoseConfig
+    points: Points, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> Scored | None:
-    """Return the solution next to a start; None where there is none that fits."""
-    if start is None or not config.refine:
-        return None
-    solution = gauss_newton(points, start)
-    if solution is None or not _fits(solution, config) or prior.contradicts(solution):
+    """Return the solution next to a start; None where there is none that leaves `most_px` at most,
+    RMS."""
+    solution = None if start is None else gauss_newton(points, start)
+    if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
     return solution
-
-
-def _solved(points: Points, prior: TiltPrior, config: PoseConfig) -> Scored | None:
-    """Return the solution without a start; None where none fits."""
-    solution = solve(points, config.solver, config.refine, prior)
-    if not _fits(solution, config) and config.solver != "sqpnp":
-        # EPnP and IPPE fail on exactly frontal views, which is where hovering happens.
-        solution = solve(points, "sqpnp", config.refine, prior)
-    return solution if _fits(solution, config) else None
-
-
-def _fits(solution: Scored | None, config: PoseConfig) -> bool:
-    """Return True if there is a solution that leaves no more than the profile allows."""
-    return solution is not None and solution.rms_px <= config.max_reprojection_px
 
 
 def _level_pose(
@@ -227,17 +211,10 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
 
-# --- Rotation and translation from corners: closed forms, then least squares in which each ---
+# --- Rotation and translation from corners: a closed form, then least squares in which each ---
 # corner counts as it was measured.
 
 
-_FLAGS = {
-    "sqpnp": cv2.SOLVEPNP_SQPNP,
-    "iterative": cv2.SOLVEPNP_ITERATIVE,
-    "epnp": cv2.SOLVEPNP_EPNP,
-    "ippe": cv2.SOLVEPNP_IPPE,
-    "ippe_square": cv2.SOLVEPNP_IPPE_SQUARE,
-}
 _MIN_FLIP_RAD = math.radians(2.0)  # closer solutions are one
 _MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can show
 _MAX_STEPS = 8
@@ -287,24 +264,17 @@ class TiltPrior:
         )
 
 
-def solve(points: Points, solver: str, refine: bool, prior: TiltPrior) -> Scored | None:
-    """Return the better of both tilts; None without a finite one in front of the camera, or where a
-    solver other than ``sqpnp`` gives a start from which nothing settles."""
-    candidates = _closed_form(points, solver)
-    if refine:
-        candidates = [_refined(points, c) for c in candidates]
+def solve(points: Points, prior: TiltPrior) -> Scored | None:
+    """Return the better of both tilts; None without a finite one in front of the camera."""
+    candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
         return None
     best = _likeliest(scored, points, prior)
-    if not refine:
-        return best
     if prior.normal_cam is None or prior.contradicts(best):
         best = _likeliest([best, *_other_tilt(best, points)], points, prior)
-    # The unweighted optimum is near enough for errors to be linear; where they are not,
-    # a weaker solver than SQPnP has led astray.
-    settled = gauss_newton(points, best)
-    return best if settled is None and solver == "sqpnp" else settled
+    # The unweighted optimum is near enough for errors to be linear.
+    return gauss_newton(points, best) or best
 
 
 def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
@@ -419,16 +389,15 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: Points, solver: str) -> list[PoseCandidate]:
-    """Return the candidates of OpenCV's solver; none of corners all on one line or point."""
-    if solver == "ippe_square" and len(points.object_m) != 4:
-        solver = "ippe"
+def _closed_form(points: Points) -> list[PoseCandidate]:
+    """Return the candidates of OpenCV's SQPNP, which solves exactly frontal views too; none of
+    corners all on one line or point."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            points.object_m, points.image_px, points.K, None, flags=_FLAGS[solver]
+            points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
         )
     except cv2.error:
-        return []  # degenerate corners: all on one line, or on one point
+        return []
     candidates = [PoseCandidate(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
     return [candidate for candidate in candidates if _usable(candidate)]
 
