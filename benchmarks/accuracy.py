@@ -73,7 +73,7 @@ def report(title: str, views: Iterator[View], camera: CameraModel) -> None:
     ours = setup_with(camera)
     paper = setup_with(
         camera,
-        detector=DetectorConfig(refinement="none", window=False),
+        detector=DetectorConfig(refinement="subpix"),
         merge=MergeConfig(method="weights"),
     )
     errors: dict[str, list[Array]] = defaultdict(list)

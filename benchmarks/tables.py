@@ -84,7 +84,7 @@ def main() -> None:
     scene = renderer(seed=21, camera_noise_sigma=NOISE_SIGMA)
     ours = setup_with()
     paper = setup_with(
-        detector=DetectorConfig(refinement="none", window=False),
+        detector=DetectorConfig(refinement="subpix"),
         merge=MergeConfig(method="weights"),
     )
     limit_deg = math.degrees(math.atan(CAMERA.size_px[0] / 2.0 / float(CAMERA.K[0, 0])))

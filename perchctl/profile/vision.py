@@ -271,19 +271,14 @@ class TargetConfig(Section):
 class DetectorConfig(Section):
     """The profile's `detector`: how markers are searched and measured."""
 
-    refinement: Literal["none", "subpix", "line"] = key(
-        "line", "of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
+    refinement: Literal["subpix", "line"] = key(
+        "line", "of corners: lines, and all that builds on them, or OpenCV's sub-pixel"
     )
-    window: bool = key(True, "look around the last pose first")
-    blurred: bool = key(True, "look once more where blur may hide the target")
-    blurred_every: int = key(
-        4, "... so in every Nth picture of a stream without it, not for a sharp one", ge=1, le=100
-    )
-    cut: bool = key(
-        True, "measure by what is left of the drawing where the picture cuts both markers"
-    )
+    blurred: ClassVar[bool] = True  # with lines: looked for where blur may hide the target
+    blurred_every: ClassVar[int] = 4  # ... in so many pictures of a stream without it
+    cut: ClassVar[bool] = True  # with lines: measured where the picture cuts both markers
     correction_bits_large: ClassVar[int] = 0  # wrong cells that are corrected
-    correction_bits_small: int = key(1, "wrong cells that are corrected", ge=0, le=3)
+    correction_bits_small: ClassVar[int] = 1
 
 
 class PoseConfig(Section):

@@ -86,7 +86,7 @@ def make_pipeline(
     detector = make_aruco_detector(
         profile.detector, profile.target, _mask(profile, camera, covered)
     )
-    if detector.cut:
+    if detector.by_lines:
         prepare_cut_markers(detector.patterns, camera)
     target = profile.target
     own = OwnTargetPlace(profile.planner.approach_xy_m)  # where the vehicle is sent to look for it

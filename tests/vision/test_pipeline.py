@@ -23,7 +23,6 @@ from perchctl.geometry import (
 )
 from perchctl.profile import (
     CameraConfig,
-    DetectorConfig,
     KalmanConfig,
     MarkerConfig,
     MergeConfig,
@@ -261,14 +260,14 @@ def test_a_stream_without_the_target_is_looked_at_thoroughly_every_nth_frame(bui
     """What only the thorough look finds: a target run together by blur."""
     sharp = render(*pose_of(0.1, 0.05, 2.3, 0.4)).astype(np.float32)
     hidden = np.clip(np.rint(cv2.GaussianBlur(sharp, (0, 0), 3.0)), 0, 255).astype(np.uint8)
-    setup = build(detector=DetectorConfig(blurred_every=3))
+    setup = build()
     _, first = step(PipelineState(), Frame(7, 0.0, hidden), None, setup)
     assert first.detections.large is not None
     state, found = PipelineState(), []
-    for k in range(4):
+    for k in range(5):
         state, output = step(state, Frame(k, k / 30, EMPTY if k == 0 else hidden), None, setup)
         found.append(output.detections.large is not None)
-    assert found == [False, False, False, True]
+    assert found == [False, False, False, False, True]
     assert state.empty_frames == 0
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.profile import DetectorConfig
 from perchctl.values import replace
 from perchctl.vision.fields import halves, interpolated_sigma_px
 from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in_blur
@@ -29,6 +30,7 @@ from perchctl.vision.markers.corners import (
     known_from,
     mean_side_px,
     nested,
+    refine_each,
     shortest_side_px,
     side_lengths_px,
     with_missing_marker,
@@ -88,13 +90,13 @@ def detect_markers(
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     both = with_missing_marker(expected, setup.ratio, camera)
-    look = _look(empty_frames, bool(expected), setup)
+    look = _look(empty_frames, bool(expected), setup.by_lines)
     turn = None
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
     lately = measured_lately(previous, frame.t_s)
     was_cut = False
-    if previous is not None and lately and setup.cut:
+    if previous is not None and lately and setup.by_lines:
         last = {each.marker: each.corners_px for each in previous.markers}
         was_cut = not may_be_whole(last, frame.image.shape)
     shift = known_from(None if previous is None else previous.edge_shift)
@@ -105,9 +107,9 @@ def detect_markers(
         image = frame.image if hidden is None else filled(frame.image, hidden)
         picture, found = Picture(image, hidden, setup, camera), Found()
         seen: _Seen = {}
-        if look != "fits" and setup.config.window and both and setup.by_lines:
+        if look != "fits" and both and setup.by_lines:
             seen, found = _followed(picture, both, shift)
-        if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
+        if not seen and lately and setup.by_lines and is_cut(both, image.shape, hidden):
             seen = cut_markers(image, expected, setup.patterns, camera, hidden)
         findable = not was_cut or may_be_whole(both, image.shape)
         if look not in ("blurred", "fits") and (
@@ -116,7 +118,7 @@ def detect_markers(
             found = search(image, expected, setup, look, own)
             if len(found.corners_px) >= len(seen):
                 seen = _refined(picture, found)
-        if not seen and look not in ("sharp", "window") and setup.blurred:
+        if not seen and look not in ("sharp", "window") and setup.by_lines:
             seen = _in_blur(picture, expected, turn)
         shifts = (r.edge_shift for r in seen.values())
         return Detections(
@@ -163,26 +165,22 @@ class Picture:
         return nested(corners_px, ratio, self.camera)
 
 
-def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
+def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
     """Return how to search this frame. After a loss the place where the target should be and the
     whole picture take turns, and there the search and the fits of a blurred target do; later a
     sharp target and, in every Nth frame, a blurred one. The first frame without it may only be
     blurred: that has both."""
     if empty_frames is None:
         return "all"
-    fits = setup.blurred
-    if expected and setup.config.window:
-        if empty_frames % 2:
-            return "sharp"
-        if empty_frames == 0 or not fits:
+    if not by_lines or (expected and empty_frames % 2):
+        return "sharp"
+    if expected:
+        if empty_frames == 0:
             return "near"
         return "fits" if empty_frames % 4 else "window"
-    if not fits:
-        return "sharp"
-    if setup.config.blurred_every == 1:
-        return "all"
     # At 0 something was seen, though not where the target should be.
-    return "blurred" if empty_frames and empty_frames % setup.config.blurred_every == 0 else "sharp"
+    every = DetectorConfig.blurred_every
+    return "blurred" if empty_frames and empty_frames % every == 0 else "sharp"
 
 
 def _followed(
@@ -222,11 +220,13 @@ def _refined(picture: Picture, found: Found) -> _Seen:
     image, setup = picture.image, picture.setup
     names = [name for name in MARKERS if name in found.corners_px]
     raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
-    rims = [setup.patterns[name].rim for name in names]
-    refined = refine(image, raw, rims, picture.camera, setup.config.refinement)
-    seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
-        return seen
+        return {
+            name: refine_each(image, corners, setup.patterns[name].rim.cells)
+            for name, corners in zip(names, raw, strict=True)
+        }
+    rims = [setup.patterns[name].rim for name in names]
+    seen = dict(zip(names, refine(image, raw, rims, picture.camera), strict=True))
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
         if r.refined and wholly_seen(r, image.shape, picture.hidden):

@@ -40,29 +40,15 @@ class DetectorSetup:
     `dictionaries` are the large and the small marker's, each with the marker and, behind it
     (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
     itself; `patterns` is how each marker looks, `ratio` the small marker's side over the
-    large one's, `mask` what the vehicle covers; `config` is the profile's.
+    large one's, `mask` what the vehicle covers. `by_lines`: lines are fitted to the sides; else
+    there are no other fits either, and no place is looked at first.
     """
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
     ratio: float
-    config: DetectorConfig
+    by_lines: bool
     mask: GearMask | None = None
-
-    @property
-    def by_lines(self) -> bool:
-        """True if lines are fitted to the sides; else there are no other fits either."""
-        return self.config.refinement == "line"
-
-    @property
-    def cut(self) -> bool:
-        """True if a target is measured of which the picture cuts both markers."""
-        return self.config.cut and self.by_lines
-
-    @property
-    def blurred(self) -> bool:
-        """True if drawings are laid over pictures that show no edges."""
-        return self.config.blurred and self.by_lines
 
 
 def make_aruco_detector(
@@ -87,7 +73,7 @@ def make_aruco_detector(
             ),
         },
         ratio=ratio,
-        config=config,
+        by_lines=config.refinement == "line",
         mask=mask,
     )
 

@@ -29,7 +29,6 @@ from perchctl.vision.markers.corners import (
     BEFORE,
     NEXT,
     OUT,
-    RAW_SIGMA_PX,
     UNIT,
     RefinedCorners,
     doubled_area,
@@ -158,24 +157,15 @@ def refine(
     corners_px: Array,
     rims: Sequence[Rim],
     camera: CameraModel,
-    method: str,
 ) -> list[RefinedCorners]:
-    """Refine the corners of m markers.
-
-    Args:
-        image: grey picture (h, w).
-        corners_px: raw corners (m, 4, 2), in order around each marker.
-        rims: for each marker what lies inside of its border.
-        method: ``line``, ``subpix`` or ``none`` (the profile's `detector.refinement`).
-    """
-    corners_px = np.asarray(corners_px, dtype=np.float64).reshape(-1, 4, 2)
-    if method == "none":
-        return [RefinedCorners(raw, RAW_SIGMA_PX, False) for raw in corners_px]
-    by_lines: list[RefinedCorners | None] = [None] * len(corners_px)
-    if method == "line" and len(corners_px):
-        by_lines = refine_lines(image, corners_px, rims, camera)
+    """Refine the raw corners (m, 4, 2) of m markers in a grey picture (h, w): by lines, or each by
+    its own neighbourhood where a marker's sides are none. `rims` is what lies inside of the border
+    of each."""
+    if len(corners_px) == 0:
+        return []
+    by_lines = refine_lines(image, corners_px, rims, camera)
     return [
-        result if result is not None else refine_each(image, raw, rim.cells)
+        result or refine_each(image, raw, rim.cells)
         for result, raw, rim in zip(by_lines, corners_px, rims, strict=True)
     ]
 

@@ -67,7 +67,7 @@ def search(
     half the size first: all that may be whole in the picture is enough. `own` chooses among several
     where none is expected."""
     whole = _whole(image)
-    if setup.config.window and expected and look != "sharp":
+    if setup.by_lines and expected and look != "sharp":
         quickly = search_halved(image, expected, setup, own)
         if quickly is not None:
             return quickly

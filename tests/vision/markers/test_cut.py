@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig
 from perchctl.vision import (
     Attitude,
     Frame,
@@ -269,11 +268,9 @@ NEAREST_M = {"width": 0.025, "height": 0.033, "under": 0.012}
 STEP_M = 0.003
 
 
-def ascent(
-    build: Any, along: str, with_attitude: bool, cut: bool = True
-) -> list[tuple[float, PipelineOutput]]:
+def ascent(build: Any, along: str, with_attitude: bool) -> list[tuple[float, PipelineOutput]]:
     """The camera's distance, and what its picture gave."""
-    setup = build(detector=DetectorConfig(cut=cut))
+    setup = build()
     x, y = SIDEWAYS[along]
     state, out = PipelineState(), []
     for k, z in enumerate(np.arange(0.075, NEAREST_M[along], -STEP_M)):
