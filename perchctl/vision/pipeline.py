@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
+from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import FieldsMode, classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
-from perchctl.vision.merge import Joint, Merged, MergePrior, MergeStrategy, Weights, stage_of
+from perchctl.vision.merge import Merged, measure_markers, merge_tracks, stage_of, track_names
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
@@ -60,7 +60,7 @@ class Pipeline:
 
     detector: DetectorSetup
     pose: PoseSetup
-    strategy: MergeStrategy
+    merge: MergeConfig
     tracks: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
@@ -81,8 +81,6 @@ def make_pipeline(
         camera=camera,
         readout_s=profile.camera.readout_s,
     )
-    way = Joint if profile.merge.method == "joint" else Weights
-    strategy = way(profile.merge, pose)
     detector = make_aruco_detector(
         profile.detector, profile.target, _mask(profile, camera, covered)
     )
@@ -95,11 +93,11 @@ def make_pipeline(
     return Pipeline(
         detector=detector,
         pose=pose,
-        strategy=strategy,
+        merge=profile.merge,
         tracks=TrackSetup(
             level=make_filter(profile.kalman, in_world=False),
             world=make_filter(profile.kalman, in_world=True),
-            names=strategy.tracks,
+            names=track_names(profile.merge),
             pose=pose,
             gate=profile.kalman.gate,
             own=own,
@@ -189,7 +187,7 @@ def _followed(
     """Measure, track and estimate what the detections show; `near` is the pose that is expected."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
-    measured = pipeline.strategy.measure(detections, MergePrior(attitude, near, normal))
+    measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
 
     in_world = pipeline.kalman.frame == "world" and attitude is not None
     followed = update_tracks(state, measured, t_s, attitude, in_world, pipeline.tracks)
@@ -269,7 +267,7 @@ def estimate(
         return _carried(target, t_s, attitude, pipeline)
     world = pipeline.tracks.world
     tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
-    merged = pipeline.strategy.merge(tracks, state.measured.fed)
+    merged = merge_tracks(tracks, state.measured.fed, pipeline.merge.weights)
     assert merged is not None
     return replace(target, t_s=t_s, **_seen_in_world(merged, attitude, pipeline, spread))
 
@@ -288,7 +286,7 @@ def _at_frame(
     """Return the target at the newest frame's time; None without a track. `before` is the last
     one."""
     fed, tracks = followed.measured.fed, followed.tracks
-    merged = pipeline.strategy.merge(tracks, fed)
+    merged = merge_tracks(tracks, fed, pipeline.merge.weights)
     if merged is None:
         return None
     measured = any(n in tracks and tracks[n].t_s == t_s for n in fed)

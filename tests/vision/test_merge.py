@@ -20,9 +20,9 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.merge import (
-    choose_stage,
     disagree,
     merge_pair,
+    stage_by_range,
     stage_of,
     weight_matrix,
 )
@@ -91,18 +91,19 @@ SEEN = {
 }
 
 
-@pytest.mark.parametrize("z_m", [2.0, 0.26, 0.25, 0.13, 0.12, 0.05, None])
-def test_the_stage_is_what_is_seen_or_what_the_range_asks_for_of_it(z_m: float | None) -> None:
+@pytest.mark.parametrize(
+    ("z_m", "stage"),
+    [
+        *((z_m, Stage.LARGE) for z_m in (2.0, 0.26)),
+        *((z_m, Stage.BOTH) for z_m in (0.25, 0.13)),
+        *((z_m, Stage.SMALL) for z_m in (0.12, 0.05)),
+    ],
+)
+def test_the_stage_is_what_is_seen_or_what_the_range_asks_for(z_m: float, stage: Stage) -> None:
     """Equations 4, 6 and 11."""
-    for (large, small), stage in SEEN.items():
-        assert stage_of(large, small) is stage
-        assert choose_stage(large, small, z_m, MergeConfig()) is stage
-        asked = choose_stage(large, small, z_m, MergeConfig(stages="range"))
-        if stage is Stage.BOTH and z_m is not None:
-            far, near = z_m > 0.25, z_m <= 0.12
-            assert asked is (Stage.LARGE if far else Stage.SMALL if near else Stage.BOTH)
-        else:
-            assert asked is stage
+    assert stage_by_range(z_m, MergeConfig(stages="range")) is stage
+    for (large, small), seen in SEEN.items():
+        assert stage_of(large, small) is seen
 
 
 def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:
