@@ -268,7 +268,10 @@ def predict_track(
 def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
     """Return the measurement that the track predicts for a later time, with what it leaves open for
     its R: the part of `predict_track` that is measured."""
-    dt_s, x = _ahead(track, t_s, setup)
+    dt_s = max(min(t_s - track.t_s, MAX_PREDICTION_S), 0.0)
+    x = _drifting(track.x, setup) if dt_s > 0.0 else track.x
+    z = x[MEASURED] + dt_s * x[RATES]
+    z[0] = wrap_rad(float(z[0]))
     P, noise = track.P, setup.process
     R = P[MEASURED, MEASURED] + dt_s * (P[MEASURED, RATES] + P[RATES, MEASURED])
     R += dt_s * dt_s * P[RATES, RATES]
@@ -279,21 +282,7 @@ def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
         if noise.wanders:
             R += _WANDER * dt_s
     bias = track.bias[MEASURED] + dt_s * track.bias[RATES]
-    return Measurement(foreseen_z(track, t_s, setup), R, bias)
-
-
-def foreseen_z(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Array:
-    """Return the z (4,) of `foreseen` alone."""
-    dt_s, x = _ahead(track, t_s, setup)
-    z = x[MEASURED] + dt_s * x[RATES]
-    z[0] = wrap_rad(float(z[0]))
-    return np.asarray(z)
-
-
-def _ahead(track: MarkerTrack, t_s: float, setup: FilterSetup) -> tuple[float, Array]:
-    """Return for how long to predict, and from which state."""
-    dt_s = max(min(t_s - track.t_s, MAX_PREDICTION_S), 0.0)
-    return dt_s, _drifting(track.x, setup) if dt_s > 0.0 else track.x
+    return Measurement(z, R, bias)
 
 
 def _drifting(x: Array, setup: FilterSetup) -> Array:

@@ -23,7 +23,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.values import replace
 from perchctl.vision.lens import undistort_px
-from perchctl.vision.types import MARKERS, Attitude, CameraModel, Detection, MarkerName, MarkerPose
+from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
@@ -46,26 +46,17 @@ class PoseSetup:
     readout_s: float | None = 0.0
 
     @cached_property
-    def object_points(self) -> dict[MarkerName, Array]:
-        """Each marker's corners in its own axes, (4, 3) m, in the order of a detection's."""
-        large, small = self.target.large.side_m, self.target.small.side_m
-        return {"large": square_corners(large), "small": square_corners(small)}
+    def corners_m(self) -> dict[_Source, Array]:
+        """The corners of each marker (4, 3) in its own axes, in the order of a detection's, and
+        ``joint`` (8, 3) those of both, the large one's first."""
+        large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
+        return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
-    def all_points(self) -> Array:
-        """Both markers' points, the large one's first, (8, 3)."""
-        return np.concatenate([self.object_points[name] for name in MARKERS])
-
-    @cached_property
-    def lift(self) -> dict[MarkerName, Array]:
-        """How far each marker's corners are out of the plane of a sheet that curls (`lift_of`)."""
+    def lift(self) -> dict[_Source, Array]:
+        """How far these corners are out of the plane of a sheet that curls (`lift_of`)."""
         curl = self.target.curl_per_m
-        return {n: lift_of(points, curl) for n, points in self.object_points.items()}
-
-    @cached_property
-    def all_lift(self) -> Array:
-        """The same for both markers' corners, the large one's first."""
-        return lift_of(self.all_points, self.target.curl_per_m)
+        return {source: lift_of(corners, curl) for source, corners in self.corners_m.items()}
 
 
 def square_corners(side_m: float) -> Array:
@@ -94,9 +85,12 @@ def estimate_pose(
     None where the corners give no pose: no finite solution in front of the camera, or
     a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
     """
-    points = _points(detections, setup)
-    if points is None:
-        return None
+    source: _Source = "joint" if len(detections) > 1 else detections[0].marker
+    image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
+    if not finite(image_px):
+        return None  # the lens cannot have imaged them
+    K, lift = setup.camera.K, setup.lift[source]
+    points = make_points(detections, setup.corners_m[source], image_px, K, lift)
     R_level_body = level_rotation(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
@@ -107,7 +101,6 @@ def estimate_pose(
     solution = _continued(points, start, prior, most_px) or solve(points, prior)
     if solution is None or not solution.rms_px <= most_px:
         return None
-    source = "joint" if len(detections) > 1 else detections[0].marker
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
     if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
@@ -120,20 +113,6 @@ def estimate_pose(
         return pose
     bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
     return replace(bent, chi2=pose.chi2) if bent.chi2 < _EXPLAINED * pose.chi2 else pose
-
-
-def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
-    """Return the corners through a pinhole; None where the lens cannot have imaged them."""
-    if len(detections) > 1:
-        object_m, lift = setup.all_points, setup.all_lift
-        raw_px = np.concatenate([d.corners_px for d in detections])
-    else:
-        marker, raw_px = detections[0].marker, detections[0].corners_px
-        object_m, lift = setup.object_points[marker], setup.lift[marker]
-    image_px = undistort_px(raw_px, setup.camera)
-    if not finite(image_px):
-        return None
-    return make_points(detections, object_m, image_px, setup.camera.K, lift)
 
 
 def _continued(
@@ -349,8 +328,6 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 def _curl(points: Points, scored: Scored) -> Array:
     """Return what one standard deviation of each kind of curl does to the whitened errors."""
-    if points.lift is None:
-        return np.zeros((len(points.whitening), 2))
     normal_cam = cv2.Rodrigues(scored.rvec)[0][:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.lift
@@ -360,22 +337,15 @@ def _curl(points: Points, scored: Scored) -> Array:
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
     """Return the rotation vector of the other tilt, whose normal is mirrored at the line of sight;
     None where both agree."""
-    R = cv2.Rodrigues(rvec)[0]
+    R = rotation_matrix(rvec)
     normal, sight = R[:, 2], tvec / np.linalg.norm(tvec)
     other = 2.0 * float(normal @ sight) * sight - normal
-    axis = np.array(  # normal x other
-        [
-            normal[1] * other[2] - normal[2] * other[1],
-            normal[2] * other[0] - normal[0] * other[2],
-            normal[0] * other[1] - normal[1] * other[0],
-        ]
-    )
+    axis = np.cross(normal, other)
     sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
     angle = math.atan2(sine, cosine)
     if angle < _MIN_FLIP_RAD or sine < 1e-9:
         return None
-    turn = cv2.Rodrigues(axis / sine * angle)[0]
-    return flat(cv2.Rodrigues(turn @ R)[0])
+    return rotation_vector(rotation_matrix(axis / sine * angle) @ R)
 
 
 def flat(values: Any) -> Array:
@@ -507,7 +477,7 @@ class Points:
     whitening: Array
     shift: Array
     K: Array
-    lift: Array | None = None
+    lift: Array
     curled: bool = False
 
 
@@ -516,7 +486,7 @@ def make_points(
     object_m: Array,
     image_px: Array,
     K: Array,
-    lift: Array | None = None,
+    lift: Array,
 ) -> Points:
     """Return the corners of one or both detections with what each is worth; `lift` as of
     `PoseSetup`."""
@@ -567,10 +537,7 @@ def _outward_normals(corners: Array) -> Array:
 def _whitened(cov_px2: Array) -> Array:
     """Return the matrix (8, 8) that makes errors of that covariance independent and of unit
     spread."""
-    try:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.diag(1.0 / np.sqrt(np.maximum(np.diagonal(cov_px2), 1e-6)))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from perchctl.vision.filter import (
     FilterSetup,
     Measurement,
     foreseen,
-    foreseen_z,
     start_track,
     step_track,
 )
@@ -201,17 +201,12 @@ def judged(
         return Verdict(taken=True)
     if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
         return Verdict(taken=False, stranger=stranger)
-    if stranger is None and _clearly(lock.track, sight, constants):
-        return Verdict(taken=True)
-    wanted = _expected(lock.track, sight.t_s, constants)
-    fit = _misfit(wanted, sight, constants)
-    other = None
-    if stranger is not None:
-        other = _misfit(_expected(stranger.track, sight.t_s, constants), sight, constants)
+    fit = _misfit(lock.track, sight, constants)
+    other = None if stranger is None else _misfit(stranger.track, sight, constants)
     theirs = other is not None and other.squared <= _GATE
     if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
         return Verdict(taken=True, stranger=stranger)
-    if not theirs and _goes_on(lock, sight, fit):
+    if not theirs and _goes_on(lock, sight, fit.off):
         return Verdict(taken=True, afresh=True, same=True, text=_JUMPED)
     seen = _watched(stranger if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
@@ -255,62 +250,42 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """By how much it is off (4,); its square in units of its spread S (4, 4); how far away (m),
-    how far turned, how much farther up (m), and whether that alone is too much."""
+    """By how much a pose is off in (yaw, x, y, z), (4,), and the spread S (4, 4) of that."""
 
     off: Array
-    squared: float
     S: Array
-    away_m: float
-    turned_rad: float
-    farther_m: float
-    another_range: bool
+
+    @cached_property
+    def squared(self) -> float:
+        """The square of what is off, in units of its spread."""
+        return float(self.off @ np.linalg.solve(self.S, self.off))
 
     @property
     def cost(self) -> float:
         """The squared distance, with what a vaguer claim costs."""
         return self.squared + float(np.linalg.slogdet(self.S)[1])
 
-
-def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> Measurement:
-    """Return the measurement that is expected at a later time, however late: what is not measured
-    drifts."""
-    ahead = foreseen(track, t_s, constants)
-    # The most that it drifts counts as three standard deviations.
-    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(t_s - track.t_s, 0.0)
-    assert ahead.R is not None
-    return replace(ahead, R=ahead.R + drift_m**2 * _PLACE)
+    @property
+    def away_m(self) -> float:
+        """How far away the pose is."""
+        return float(np.linalg.norm(self.off[1:]))
 
 
-def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
-    """Return by how much the pose is off from the one that is `wanted`."""
-    measured = sight.measured
+def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
+    """Return by how much the pose is off from the one that a track foresees, however late: what is
+    not measured drifts."""
+    wanted, measured = foreseen(track, sight.t_s, constants), sight.measured
     assert wanted.R is not None
     assert wanted.bias is not None
+    # The most that it drifts counts as three standard deviations.
+    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
     off = measured.z - wanted.z
     off[0] = wrap_rad(float(off[0]))
     # A constant error moves both.
     bias = wanted.bias if measured.bias is None else measured.bias - wanted.bias
     R = constants.R if measured.R is None else measured.R
-    S = wanted.R + R + bias @ bias.T + np.diag(_unclaimed(_range_m(sight)) ** 2)
-    return _Fit(
-        off=off,
-        squared=float(off @ np.linalg.solve(S, off)),
-        S=S,
-        away_m=float(np.linalg.norm(off[1:])),
-        turned_rad=abs(float(off[0])),
-        farther_m=float(off[3]),
-        another_range=bool(off[3] ** 2 > _SAME_RANGE**2 * S[3, 3]),
-    )
-
-
-def _clearly(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
-    """Return True if what no pose claims explains all that the pose is off, as in most frames: no
-    other spread can make that too little."""
-    off = sight.measured.z - foreseen_z(track, sight.t_s, constants)
-    off[0] = wrap_rad(float(off[0]))
-    off /= _unclaimed(_range_m(sight))
-    return float(off @ off) <= _GATE
+    S = wanted.R + drift_m**2 * _PLACE + R + bias @ bias.T
+    return _Fit(off, S + np.diag(_unclaimed(_range_m(sight)) ** 2))
 
 
 def _range_m(sight: Sight) -> float:
@@ -324,9 +299,9 @@ def _unclaimed(range_m: float) -> Array:
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
+def _goes_on(lock: Lock, sight: Sight, off_in_world: Array) -> bool:
     """Return True if the pose goes on from the last one as seen from the vehicle, much better than
-    in the world (`fit`): what is off in both did not come about by the estimate."""
+    in the world: what is off in both did not come about by the estimate."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
@@ -336,7 +311,7 @@ def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
     unclaimed = _unclaimed(range_m)
-    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, fit.off))
+    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, off_in_world))
     calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
     return calm and seen < _EXPLAINED * jumped
 
@@ -351,11 +326,13 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
         assert track is not None
         whole = before.whole + int(sight.whole)
         return replace(before, track=track, frames=before.frames + 1, whole=whole)
+    turned_rad, farther_m = abs(float(fit.off[0])), float(fit.off[3])
+    another_range = farther_m**2 > _SAME_RANGE**2 * float(fit.S[3, 3])
     where = f"{fit.away_m:.2f} m away from it"
-    if fit.turned_rad > _TURNED_RAD:
-        where += f" and turned by {math.degrees(fit.turned_rad):.0f} deg"
-    if fit.another_range:
-        where = f"{abs(fit.farther_m):.2f} m {'above' if fit.farther_m > 0.0 else 'below'} it"
+    if turned_rad > _TURNED_RAD:
+        where += f" and turned by {math.degrees(turned_rad):.0f} deg"
+    if another_range:
+        where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or of another size"
     return Stranger(
         track=start_track(sight.measured, sight.t_s, constants),
@@ -363,7 +340,7 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
         since_s=sight.t_s,
         frames=1,
         whole=int(sight.whole),
-        another_range=fit.another_range,
+        another_range=another_range,
         text=where,
     )
 
@@ -421,7 +398,7 @@ def expected_corners(
     if tvec[2] <= 0.0:
         return None, None
     rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
-    corners = project(setup.all_points, rvec, tvec, setup.camera)
+    corners = project(setup.corners_m["joint"], rvec, tvec, setup.camera)
     moved = PoseCandidate(rvec, tvec)
     if not finite(corners):
         return None, moved

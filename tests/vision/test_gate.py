@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.profile import KalmanConfig, MergeConfig
 from perchctl.vision import (
     Attitude,
-    MarkerPose,
     Pipeline,
     PipelineOutput,
     PipelineState,
 )
-from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.pipeline import follow
-from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
-from perchctl.vision.types import Detections, Lock, MarkerTrack, Stranger
+from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S
+from perchctl.vision.types import Detections
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -101,34 +96,6 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
     (back,) = watch.show(1)
     assert measured([back]) == [True]
     assert back.lock_note == ""
-
-
-@settings(max_examples=80)
-@given(
-    off_m=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
-    off_rad=st.floats(-0.6, 0.6),
-    sigma_m=st.floats(1e-4, 0.1),
-    range_m=st.floats(0.05, 2.0),
-)
-def test_what_is_clearly_the_targets_is_so_by_every_spread(
-    off_m: tuple[float, float, float], off_rad: float, sigma_m: float, range_m: float
-) -> None:
-    constants = make_filter(KalmanConfig(), in_world=True)
-    track = MarkerTrack(t_s=0.0, x=np.zeros(8), P=np.eye(8) * sigma_m**2)
-    z = np.array([off_rad, *off_m])
-    pose = MarkerPose(
-        source="joint", t_s=0.03, rvec_rad=np.zeros(3), tvec_m=np.array([0.0, 0.0, range_m]),
-        e_m=np.zeros(3), e_yaw_rad=0.0, sigma_m=np.ones(3), sigma_yaw_rad=1.0,
-        reprojection_px=0.0, chi2=1.0, cov=np.eye(4),
-    )  # fmt: skip
-    sight = Sight(0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True)
-    spread = np.array([math.radians(4.0), *[0.01 + 0.015 * range_m] * 2, 0.01 + 0.02 * range_m])
-    if float(((z / spread) ** 2).sum()) < 25.0 - 1e-6:
-        lock = Lock(track=track, pose=pose, in_world=True, frames=9, whole=True)
-        assert judged(lock, None, sight, constants).taken
-        stranger = Stranger(track, True, 0.0, 1, 1, False, "")
-        far = replace(stranger, track=replace(track, x=np.full(8, 5.0)))
-        assert judged(lock, far, sight, constants).taken  # by way of all spreads
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:

@@ -339,7 +339,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
             )
         if sight is not None:
             expected, _ = expected_corners(sight, pose.t_s, attitude, SETUP)
-            points = SETUP.object_points["large"]
+            points = SETUP.corners_m["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())
         sight = update_sight(sight, pose, attitude, SETUP)
