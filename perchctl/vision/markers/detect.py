@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig
@@ -29,7 +27,6 @@ from perchctl.vision.markers.corners import (
     RefinedCorners,
     known_from,
     mean_side_px,
-    nested,
     refine_each,
     shortest_side_px,
     side_lengths_px,
@@ -42,7 +39,7 @@ from perchctl.vision.markers.cut import (
     may_be_whole,
     measured_lately,
 )
-from perchctl.vision.markers.detector import Covered, DetectorSetup, filled, hidden_in, hides
+from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_in, hides
 from perchctl.vision.markers.edge_fit import refine, refine_lines
 from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen
 from perchctl.vision.markers.pattern import (
@@ -137,34 +134,6 @@ def detect_markers(
     return with_motion(detected(frame), previous)
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
-    where something else is before the target; None: nowhere."""
-
-    image: NDArray[np.uint8]
-    hidden: Covered | None
-    setup: DetectorSetup
-    camera: CameraModel
-
-    def seen_partly(
-        self,
-        name: MarkerName,
-        start_px: Array,
-        known_by: KnownBy,
-        shift: EdgeShift | None = None,
-    ) -> RefinedCorners | None:
-        """Return the marker near to `start_px` (4, 2) by what is seen of it
-        (`partial.seen_partly`)."""
-        pattern = self.setup.patterns[name]
-        return seen_partly(self.image, start_px, pattern, self.camera, known_by, self.hidden, shift)
-
-    def nested(self, corners_px: Array, name: MarkerName) -> Array:
-        """Return where the other marker's corners (4, 2) put those of this one."""
-        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
-        return nested(corners_px, ratio, self.camera)
-
-
 def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
     """Return how to search this frame. After a loss the place where the target should be and the
     whole picture take turns, and there the search and the fits of a blurred target do; later a
@@ -229,13 +198,13 @@ def _refined(picture: Picture, found: Found) -> _Seen:
     seen = dict(zip(names, refine(image, raw, rims, picture.camera), strict=True))
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
-        if r.refined and wholly_seen(r, image.shape, picture.hidden):
+        if r.refined and wholly_seen(picture, r):
             continue
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
             starts.insert(0, picture.nested(small.corners_px, "large"))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        tried = (picture.seen_partly(name, start, known_by) for start in starts)
+        tried = (seen_partly(picture, name, start, known_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
@@ -427,7 +396,7 @@ def follow(
         name: result
         for name, result in zip(names, fitted, strict=True)
         if result is not None
-        and wholly_seen(result, image.shape, picture.hidden)
+        and wholly_seen(picture, result)
         and cells_agree(image, result.corners_px, patterns[name])
     }
 
@@ -446,7 +415,7 @@ def follow_partly(
         places["large"] = picture.nested(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = picture.seen_partly(name, places[name], "track", shift)
+            partly = seen_partly(picture, name, places[name], "track", shift)
             if partly is not None:
                 seen[name] = partly
     if "large" in seen and "small" not in seen:
@@ -483,12 +452,12 @@ def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
             start = found.corners_px
         if (
             found is not None
-            and wholly_seen(found, image.shape, picture.hidden)
+            and wholly_seen(picture, found)
             and is_centred(found)
             and cells_mostly_agree(image, found.corners_px, pattern)
         ):
             return found
-    partly = picture.seen_partly("large", start, "other")
+    partly = seen_partly(picture, "large", start, "other")
     return partly if partly and is_centred(partly) else None
 
 

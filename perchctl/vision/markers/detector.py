@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.vision.markers.corners import nested
 from perchctl.vision.markers.pattern import Pattern, drawing_of, pattern_of, rim_of_bits
-from perchctl.vision.types import Frame, MarkerName
+from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
 _PRINT_M = 1e-6  # of an edge: over its hundreds of dots what each errs by averages out
@@ -198,3 +199,19 @@ def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) 
     inside = np.zeros(part.shape, np.uint8)
     cv2.fillConvexPoly(inside, np.rint(wide - low).astype(np.int32), 1)
     return bool((part & (inside > 0)).any())
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
+    where something else is before the target; None: nowhere."""
+
+    image: NDArray[np.uint8]
+    hidden: Covered | None
+    setup: DetectorSetup
+    camera: CameraModel
+
+    def nested(self, corners_px: Array, name: MarkerName) -> Array:
+        """Return where the other marker's corners (4, 2) put those of this one."""
+        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
+        return nested(corners_px, ratio, self.camera)

@@ -219,7 +219,7 @@ def _refined_once(
         if not finite(corners):
             return found
         shift = _measured_shift(markers, sides, inner, lines, residual_px, corners)
-    applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
+    applied = shift or EdgeShift(0.0, shift_prior_px(float(sides.grey[:, :, -1].mean())))
     if applied.shift_px != 0.0:
         lines = lines.copy()
         lines[:, 2] += _outwards(markers, lines) * (applied.shift_px / markers.px_per_unit)
@@ -283,11 +283,10 @@ def _intersect(lines: Array) -> Array:
     return corners
 
 
-def _shift_prior_px(sides: Samples) -> float:
-    """Return how far edges are shifted before that is measured: by white as the camera sees it
-    beyond the sides."""
-    clipped = float(sides.grey[:, :, -1].mean()) > CLIPPED_GREY
-    return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
+def shift_prior_px(white_grey: float) -> float:
+    """Return the spread of the shift that all edges share, before it is measured, by how white the
+    camera sees the paper."""
+    return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
 def _measured_shift(
@@ -306,7 +305,7 @@ def _measured_shift(
     """
     if inner is None:
         return None
-    k, prior_px = markers.widest, _shift_prior_px(sides)
+    k, prior_px = markers.widest, shift_prior_px(float(sides.grey[:, :, -1].mean()))
     rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
     r = 1.0 - 2.0 / rim.cells
     own = mapped(to_unit(corners[k]), inner.points)
@@ -364,42 +363,22 @@ def _outwards(markers: Markers, lines: Array) -> Array:
 
 def _accepted(
     markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
-) -> list[bool]:
+) -> NDArray[np.bool_]:
     """Return which of the m markers have lines for sides, near to where they were expected."""
-    inliers = (sides.weight > 0.0).dot(_ONES32)
+    inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
-    sharp = sides.blur_px < 0.9 * sides.near_px
-    good = [
-        residual < _MAX_RESIDUAL_PX
-        and count >= _MIN_INLIERS * PROFILES
-        and grey > _MIN_CONTRAST * PROFILES
-        and is_sharp
-        for residual, count, grey, is_sharp in zip(
-            residual_px.tolist(),
-            inliers.tolist(),
-            contrast.tolist(),
-            sharp.tolist(),
-            strict=True,
-        )
-    ]
-    return [
-        cell_px > _MIN_CELL_PX
-        and all(good[4 * i : 4 * i + 4])
-        # False for NaN.
-        and all(math.dist(a, b) < max(1.6, 0.6 * cell_px) for a, b in zip(*both, strict=True))
-        for i, (cell_px, *both) in enumerate(
-            zip(markers.cell_px.tolist(), corners_px.tolist(), markers.raw_px.tolist(), strict=True)
-        )
-    ]
+    lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIERS * PROFILES)
+    lines &= (contrast > _MIN_CONTRAST * PROFILES) & (sides.blur_px < 0.9 * sides.near_px)
+    way = corners_px - markers.raw_px
+    moved_px = np.hypot(way[..., 0], way[..., 1]).max(axis=1)
+    good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
+    return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
 
 
 def _clipped(sides: Samples) -> Array:
     """Return the share of the profiles of the m markers that end in clipped white, (m,)."""
-    ends = sides.grey[:, :, -1]
-    if ends.max() <= CLIPPED_GREY:
-        return np.zeros(len(ends) // 4)
-    glaring = np.count_nonzero(ends > CLIPPED_GREY, axis=1) / PROFILES
+    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
     return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
 
 
@@ -528,23 +507,16 @@ def measure(
     normal *= sign[:, None, None]
     near_px, half_px = (each[of] for each in reaches_px(markers.cell_px))
     grey = sample(image, origin, normal, half_px)
-    edges = locate(grey, half_px, near_px, surroundings(s, markers.rims, rim, depth_px.ravel()))
-    points = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
-    points = points.reshape(-1, PROFILES, 2)
-    if not finite(points):
-        points = np.nan_to_num(points)
-
-    def part(chosen: slice) -> Samples:
-        return Samples(
-            grey=grey[chosen],
-            near_px=near_px[chosen],
-            points=points[chosen],
-            weight=edges.weight[chosen],
-            blur_px=edges.blur_px[chosen],
-        )
-
+    around = surroundings(s, markers.rims, rim, depth_px.ravel())
+    offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
+    points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
+    points = np.nan_to_num(points.reshape(-1, PROFILES, 2))
     n = 4 * len(markers.raw_px)
-    return part(slice(0, n)), part(slice(n, None)) if with_inner else None
+    sides, inner_edges = (
+        Samples(grey[part], near_px[part], points[part], weight[part], blur_px[part])
+        for part in (slice(0, n), slice(n, None))
+    )
+    return sides, inner_edges if with_inner else None
 
 
 def reaches_px(cell_px: Array) -> tuple[Array, Array]:
@@ -633,19 +605,13 @@ class Surroundings:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """offset_px: an edge's place along the profile's normal, (rows, n). weight: of the
-    profiles, 0 for outliers, (rows, n). blur_px: of each row, a standard deviation, (rows,).
-    """
+def locate(
+    grey: Floats, half_px: Array, near_px: Array, around: Surroundings
+) -> tuple[Array, Array, Array]:
+    """Return where on each profile the edge is that rises along it.
 
-    offset_px: Array
-    weight: Array
-    blur_px: Array
-
-
-def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> Edges:
-    """Return the place of an edge that rises along the profile.
+    These are its place along the profile's normal, px (rows, n), the weight of the profiles, 0 for
+    outliers (rows, n), and each row's blur, a standard deviation, px (rows,).
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
@@ -660,16 +626,11 @@ def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -
         if k == 1 and moved_px < _ONE_ROUND_PX:
             continue
         edge, usable, blur2 = profiles.narrow(line, blur2)
-        rounds = 2 if k == _ROUNDS - 1 else 1
-        centre, weight = _robust_line(edge, usable, rounds)
+        centre, weight = _robust_line(edge, usable, 2 if k == _ROUNDS - 1 else 1)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break
-    return Edges(
-        offset_px=edge.astype(np.float64),
-        weight=weight.astype(np.float64),
-        blur_px=np.sqrt(blur2).astype(np.float64),
-    )
+    return edge.astype(np.float64), weight.astype(np.float64), np.sqrt(blur2).astype(np.float64)
 
 
 class _Profiles:

@@ -33,8 +33,9 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
     within,
 )
-from perchctl.vision.markers.detector import hides
+from perchctl.vision.markers.detector import Picture, hides
 from perchctl.vision.markers.edge_fit import (
+    MIN_LINE_SIGMA_PX,
     PROFILES,
     STEPS,
     Floats,
@@ -42,52 +43,53 @@ from perchctl.vision.markers.edge_fit import (
     places,
     reaches_px,
     sample,
+    shift_prior_px,
     side_profiles,
     surroundings,
 )
 from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELLS, Pattern
-from perchctl.vision.types import CameraModel, EdgeShift
+from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 LEAST_CELL_PX = 4.0  # smaller cells leave no part of a side that would show anything
 _ROUNDS, _STILL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR = 0.9  # of the window
 _MAX_SIGMA = 0.02  # of the side: vaguer corners are no measurement
-_MIN_SIGMA_PX, _LEAST_SHIFT_SIGMA_PX = 0.015, 0.01
-_SHIFT_PRIOR_PX, _CLIPPED_PRIOR_PX, _CLIPPED_GREY = 0.15, 0.4, 248.0
+_LEAST_SHIFT_SIGMA_PX = 0.01
 _TAILS = 1.3  # what robust weights take away from a residual's square
 _MAX_STEP = 0.5
 _MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
 
 
-def fit_partly(
-    image: NDArray[np.uint8],
+def seen_partly(
+    picture: Picture,
+    name: MarkerName,
     start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None = None,
+    known_by: KnownBy,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
     """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
 
-    `hidden` (h, w) is where pixels show something else. None where what is seen does not determine
-    the corners. The marker's cells are not looked at.
+    `known` is the shift of all edges, where it was measured before. None where what is seen does
+    not determine the corners, or the cells that are seen are not the marker's.
     """
-    if not _large_enough(start_px, pattern):
+    pattern, camera = picture.setup.patterns[name], picture.camera
+    if not mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX:
+        return None
+    # So many cells have to be in the picture, wherever the fit may lead.
+    spots = _within(_spots_px(start_px, pattern, camera), picture.image.shape, _MOST_OFF_PX)
+    if not _enough(_known(spots, pattern), pattern, known_by):
         return None
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H = from_unit(start)
     for k in range(_ROUNDS):
-        seen = seen_edges(image, H, pattern, camera, hidden)
+        seen = seen_edges(picture, H, pattern)
         if seen is None:
             return None
-        A, N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
-        try:
-            step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            return None
+        A, N, g = _equations(seen, known or EdgeShift(0.0, shift_prior_px(seen.white)))
+        step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
@@ -96,48 +98,19 @@ def fit_partly(
             break
     assert seen is not None
     left_px = seen.far_px - (step @ A).reshape(seen.far_px.shape)
-    return _corners(H, seen, left_px, N, pattern, camera)
-
-
-def seen_partly(
-    image: NDArray[np.uint8],
-    start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    known_by: KnownBy,
-    hidden: NDArray[np.bool_] | None = None,
-    known: EdgeShift | None = None,
-) -> RefinedCorners | None:
-    """Return the result of `fit_partly`, if the cells that are seen are the marker's."""
-    if not _large_enough(start_px, pattern):
+    found = _corners(H, seen, left_px, N, pattern, camera)
+    if found is None or not _cells_agree(picture, found.corners_px, pattern, known_by):
         return None
-    if not may_show_enough(start_px, image.shape, pattern, camera, known_by, _MOST_OFF_PX):
-        return None
-    found = fit_partly(image, start_px, pattern, camera, hidden, known)
-    if found is None:
-        return None
-    agree = visible_cells_agree(image, found.corners_px, pattern, camera, hidden, known_by)
-    return found if agree else None
+    return found
 
 
-def _large_enough(start_px: Array, pattern: Pattern) -> bool:
-    """Return True if a part of a side may show anything."""
-    return mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX
-
-
-def wholly_seen(
-    found: RefinedCorners, shape: tuple[int, ...], hidden: NDArray[np.bool_] | None
-) -> bool:
+def wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
     """Return True if nothing of the marker is hidden, and the picture's edge too far away to take
     anything from the sides' blur."""
-    return within(found.corners_px, shape, ROOM_PX + found.blur_px) and not hides(
-        hidden, found.corners_px
+    room_px = ROOM_PX + found.blur_px
+    return within(found.corners_px, picture.image.shape, room_px) and not hides(
+        picture.hidden, found.corners_px
     )
-
-
-def _prior_px(seen: SeenEdges) -> float:
-    """Return the spread, px, of the shift that all edges share, before it is measured."""
-    return _CLIPPED_PRIOR_PX if seen.white > _CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
@@ -167,24 +140,32 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 
 
 def _corners(
-    H: Array, seen: SeenEdges, left_px: Array, N: Array, pattern: Pattern, camera: CameraModel
+    H: Array, seen: SeenEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
     """Return the corners and covariance of the square H (3, 3), unit to pinhole px, after the last
     round, by what that leaves over of its edges, px (rows, n), and by its normal matrix (9, 9);
-    None where they are not determined."""
-    spread = _spread(seen, left_px)
-    if spread is None:
+    None where they are not determined, or the edges are those of no square."""
+    w = seen.weight
+    mass = w.sum(axis=1)
+    used = mass > 0.0
+    if not used.any() or (seen.blur[used] > _MAX_BLUR).any():
         return None
-    residual2, growth = spread
+    if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
+        return None
+    # What is left within rows; and by how much rows contradict each other beyond it.
+    mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
+    scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
+    chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
+    freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
+    noise2 = max(_TAILS * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
     pinhole = mapped(H, UNIT)
     corners_px = distort(mapped(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.rim.cells
-    noise2 = max(_TAILS * residual2 * growth, _MIN_SIGMA_PX**2)
     # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
     J = corner_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
-    floor2 = _MIN_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
+    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
     if not (vaguest_px < _MAX_SIGMA * side_px and np.isfinite(corners_px).all()):
@@ -194,26 +175,9 @@ def _corners(
         corners_px=corners_px,
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
         refined=True,
-        shift_sigma_px=min(max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), _prior_px(seen)),
+        shift_sigma_px=min(max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), shift_prior_px(seen.white)),
         cov_px2=cov_px2,
     )
-
-
-def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
-    """Return the mean square of what the fit leaves over within rows, px^2, and by how much rows
-    contradict each other beyond it; None where these are no edges of a square."""
-    w = seen.weight
-    mass = w.sum(axis=1)
-    used = mass > 0.0
-    if not used.any() or (seen.blur[used] > _MAX_BLUR).any():
-        return None
-    if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
-        return None
-    mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
-    scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
-    chi2 = float((mean**2 * mass).sum()) / max(scatter, _MIN_SIGMA_PX**2)
-    freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
-    return scatter, max(chi2 / freedom, 1.0)
 
 
 # --- Which marker it is, by the cells that are seen of it -------------
@@ -228,19 +192,13 @@ _UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords d
 _INVERTED_PX = 0.5  # the lens model holds where its inverse is one
 
 
-def visible_cells_agree(
-    image: NDArray[np.uint8],
-    corners_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None,
-    known_by: KnownBy,
-) -> bool:
+def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
     """Return True if the cells that are seen have their colour: not those beyond the picture's
-    edge, behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
-    what else says which marker it is."""
+    edge, behind what is hidden, or in light that glares. How many that must be depends on what
+    else says which marker it is."""
+    image, hidden = picture.image, picture.hidden
     h, w = image.shape
-    at = _spots_px(corners_px, pattern, camera)
+    at = _spots_px(corners_px, pattern, picture.camera)
     near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
     seen = _within(at, image.shape, 0.0)
     if hidden is not None:
@@ -259,28 +217,13 @@ def visible_cells_agree(
         seen &= grey < _BRIGHTEST_GREY
     count = np.bincount(pattern.owner, weights=seen)
     means = np.bincount(pattern.owner, weights=grey * seen) / np.maximum(count, 1.0)
-    known = count >= 0.5 * pattern.spots_per_cell
+    known = _known(seen, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.white, 1.0, -1.0)
     wrong = np.count_nonzero(known & (share < CELL_MARGIN))
     most_wrong = 0
     if known_by == "other":
         most_wrong = math.floor((1.0 - MOST_CELLS) * np.count_nonzero(known & pattern.inner))
     return bool(wrong <= most_wrong) and _enough(known, pattern, known_by)
-
-
-def may_show_enough(
-    start_px: Array,
-    shape: tuple[int, ...],
-    pattern: Pattern,
-    camera: CameraModel,
-    known_by: KnownBy,
-    off_px: float,
-) -> bool:
-    """Return True if so many cells may be in the picture as `visible_cells_agree` asks for, of a
-    marker that is within `off_px` of corners (4, 2)."""
-    seen = _within(_spots_px(start_px, pattern, camera), shape, off_px)
-    count = np.bincount(pattern.owner, weights=seen)
-    return _enough(count >= 0.5 * pattern.spots_per_cell, pattern, known_by)
 
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
@@ -301,6 +244,14 @@ def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.
     h, w = shape[:2]
     inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
     return np.asarray(inside.all(axis=1))
+
+
+def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
+    """Return which cells (cells,) show half of their spots (n,) or more."""
+    known: NDArray[np.bool_] = (
+        np.bincount(pattern.owner, weights=seen) >= 0.5 * pattern.spots_per_cell
+    )
+    return known
 
 
 def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
@@ -363,15 +314,10 @@ class SeenEdges:
     white: float
 
 
-def seen_edges(
-    image: NDArray[np.uint8],
-    H: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None,
-) -> SeenEdges | None:
+def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
     """Return the edges near to where the square H has them; None where too few are seen. Sides of
     which nothing is seen are left out."""
+    camera = picture.camera
     rows = _rows(H, pattern, camera)
     if rows is None:
         return None
@@ -383,22 +329,23 @@ def seen_edges(
     near_px, half_px = reaches_px(np.full(len(rows.at), rows.cell_px))
     depth_px = 2.0 * rows.scale_px / pattern.rim.cells
     around = surroundings(s, [pattern.rim], pattern.rim, depth_px)
-    free = around.possible & _in_view(image.shape, hidden, origin, normal, near_px)
+    free = around.possible & _in_view(picture, origin, normal, near_px)
     kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
     if len(kept) < _LEAST_EDGES:
         return None
     rows, around = rows.only(kept), around.only(kept)
     origin, normal, free = origin[kept], normal[kept], free[kept]
     near_px, half_px = near_px[kept], half_px[kept]
-    grey = sample(image, origin, normal, half_px)
+    grey = sample(picture.image, origin, normal, half_px)
     lit = _unspoilt(grey, free, near_px, half_px)
     if lit is None:
         return None
     good, white = lit
-    edges = locate(grey, half_px, near_px, replace(around, possible=good))
-    weight = np.where(good, edges.weight, 0.0)
+    around = replace(around, possible=good)
+    offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
+    weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
-    found = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
+    found = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
     if not np.isfinite(own).all():
         return None
@@ -408,7 +355,7 @@ def seen_edges(
         far_px=far * rows.scale_px[:, None],
         weight=weight,
         rows=rows,
-        blur=edges.blur_px / near_px,
+        blur=blur_px / near_px,
         white=white,
     )
 
@@ -439,15 +386,9 @@ def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
     )
 
 
-def _in_view(
-    shape: tuple[int, ...],
-    hidden: NDArray[np.bool_] | None,
-    origin: Array,
-    normal: Array,
-    near_px: Array,
-) -> NDArray[np.bool_]:
+def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> NDArray[np.bool_]:
     """Return which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
-    h, w = shape[:2]
+    hidden, (h, w) = picture.hidden, picture.image.shape
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
     x_and_y = (origin - reach >= ROOM_PX) & (origin + reach <= last)

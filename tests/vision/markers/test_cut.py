@@ -32,6 +32,7 @@ from perchctl.vision.markers.cut import (
     outline_of,
 )
 from perchctl.vision.markers.detect import between, detect_markers
+from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners, frame
@@ -256,7 +257,8 @@ def test_two_fields_of_it_are_surer_than_one() -> None:
 def test_a_square_beyond_all_lenses_shows_no_edges(side_px: float) -> None:
     """Where a lens model throws a near target's far corners overflows a picture's coordinates."""
     square_px = np.array([[side_px, 0.0, 320.0], [0.0, side_px, 240.0], [0.0, 0.0, 1.0]])
-    assert seen_edges(picture("height"), square_px, SETUP.patterns["large"], CAMERA, None) is None
+    seen = Picture(picture("height"), None, SETUP, CAMERA)
+    assert seen_edges(seen, square_px, SETUP.patterns["large"]) is None
 
 
 # --- The pipeline on the way to contact --------------------------------------------------------

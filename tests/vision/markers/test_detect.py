@@ -9,13 +9,12 @@ import pytest
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import project, square_corners
 from perchctl.vision.markers.detect import (
-    Picture,
     around,
     between,
     detect_markers,
     follow,
 )
-from perchctl.vision.markers.detector import MIRROR_INDEX, make_aruco_detector
+from perchctl.vision.markers.detector import MIRROR_INDEX, Picture, make_aruco_detector
 from perchctl.vision.markers.search import misfit
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste

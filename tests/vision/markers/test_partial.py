@@ -16,9 +16,10 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, make_pipeline
 from perchctl.vision.fields import field_picture
-from perchctl.vision.markers.corners import from_unit, mapped
+from perchctl.vision.markers.corners import RefinedCorners, from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
+    Picture,
     hidden_in,
     hides,
     make_aruco_detector,
@@ -36,6 +37,13 @@ from tests.helpers.target_picture import CAMERA, pose_of, render
 Grey = NDArray[np.uint8]
 W, H = CAMERA.size_px
 LARGE = SETUP.patterns["large"]
+
+
+def partly(
+    image: Grey, start_px: Array, known_by: KnownBy, hidden: NDArray[np.bool_] | None = None
+) -> RefinedCorners | None:
+    """The large marker by what is seen of it."""
+    return seen_partly(Picture(image, hidden, SETUP, CAMERA), "large", start_px, known_by)
 
 
 def beyond(pose: tuple[Array, Array], name: MarkerName = "large") -> float:
@@ -119,7 +127,7 @@ def test_a_side_along_the_edge_of_the_picture_is_not_drawn_inwards(share: float)
     first = detect_markers(frame(image), None, SETUP, CAMERA)
     for found in (first, detect_markers(frame(image, 1), first, SETUP, CAMERA)):
         assert np.abs(found.large.corners_px - true).max() < 0.03
-    seen = seen_partly(image, true + 1.0, LARGE, CAMERA, "bits")
+    seen = partly(image, true + 1.0, "bits")
     assert np.abs(seen.corners_px - true).max() < 0.03
 
 
@@ -178,10 +186,10 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     spots = mapped(from_unit(true), LARGE.spots[LARGE.owner == black])
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
-    found = seen_partly(bright, true, LARGE, CAMERA, "track")
+    found = partly(bright, true, "track")
     assert np.abs(found.corners_px - true).max() < 0.1
     grey = np.where(bright > image + 20, 200, image).astype(np.uint8)  # white paper instead
-    assert seen_partly(grey, true, LARGE, CAMERA, "track") is None
+    assert partly(grey, true, "track") is None
 
 
 def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
@@ -189,11 +197,11 @@ def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
     image = render(*pose, markers=(("DICT_4X4_1000", 16, 0.150),))
     ways: tuple[KnownBy, ...] = ("bits", "track", "other")
     for known_by in ways:
-        assert seen_partly(image, corners("large", pose), LARGE, CAMERA, known_by) is None
+        assert partly(image, corners("large", pose), known_by) is None
     turned = np.roll(corners("large", pose), 1, axis=0)
     right = render(*pose)
-    assert seen_partly(right, turned, LARGE, CAMERA, "other") is None
-    assert seen_partly(right, corners("large", pose), LARGE, CAMERA, "bits") is not None
+    assert partly(right, turned, "other") is None
+    assert partly(right, corners("large", pose), "bits") is not None
 
 
 def test_a_code_that_may_be_another_one_is_not_told_by_its_bits_alone() -> None:
@@ -204,8 +212,8 @@ def test_a_code_that_may_be_another_one_is_not_told_by_its_bits_alone() -> None:
     cell = float(np.linalg.norm(true[1] - true[0])) / 6.0
     x, y = true[0] + 1.05 * cell
     covered[round(y) : round(y + 0.9 * cell), round(x) : round(x + 1.9 * cell)] = True
-    assert seen_partly(image, true, LARGE, CAMERA, "bits", covered) is None
-    assert seen_partly(image, true, LARGE, CAMERA, "track", covered) is not None
+    assert partly(image, true, "bits", covered) is None
+    assert partly(image, true, "track", covered) is not None
 
 
 # --- The vehicle's own gear in the picture: `camera.mask`, from the file to the corners --------
