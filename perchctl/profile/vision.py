@@ -139,9 +139,7 @@ class CameraConfig(Section):
     start_timeout_s: float = key(8.0, "wait for the first good picture", gt=0, le=60)
     mirrored: bool = key(False, "flip each picture before use")
     mask: str | None = key(None, "picture of what the vehicle itself covers, white")
-    fields: Literal["auto", "top", "bottom", "progressive"] = key(
-        "auto", "interlaced pictures: found by measure, or which field is earlier, or never"
-    )
+    fields: ClassVar[str] = "auto"  # of interlaced pictures: found by measure
     readout_s: float | None = key(
         0.0, "rolling shutter: from the first row to the last; none: not known", ge=0, le=0.05
     )

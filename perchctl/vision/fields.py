@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from statistics import mean, median
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -29,7 +28,6 @@ from numpy.typing import NDArray
 from perchctl.values import replace
 from perchctl.vision.types import FieldState, Frame
 
-FieldsMode = Literal["auto", "top", "bottom", "progressive"]
 Grey = NDArray[np.uint8]
 
 _COMBED = 1.4
@@ -115,14 +113,11 @@ def interpolated_sigma_px(blur_px: float) -> float:
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
-def classify_fields(frame: Frame, mode: FieldsMode) -> Frame:
+def classify_fields(frame: Frame) -> Frame:
     """Return the frame with `fields` set to what it is."""
     if frame.fields is not None:
         return frame
-    if mode == "progressive":
-        return replace(frame, fields="whole")
-    combed = mode != "auto" or is_combed(frame.image)
-    return replace(frame, fields="woven" if combed else "whole")
+    return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
 def halves(frame: Frame) -> tuple[Frame, Frame]:
@@ -133,19 +128,14 @@ def halves(frame: Frame) -> tuple[Frame, Frame]:
     )
 
 
-def separate_fields(
-    state: FieldState, frame: Frame, mode: FieldsMode
-) -> tuple[FieldState, tuple[Frame, ...]]:
+def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
     """Return the pictures of a stream's frame, in their order of time: one, or two fields.
 
-    The frame's time is the middle between its fields. `mode`: ``auto`` finds all by measure,
-    ``top`` and ``bottom`` say that every frame is woven and which field is earlier,
-    ``progressive`` that none is. In a stream in which none was seen yet, every third frame
-    is looked at.
+    The frame's time is the middle between its fields. In a stream in which none was seen yet,
+    every third frame is looked at.
     """
-    skip = frame.fields is None and mode == "auto" and state.kind == "whole"
-    skip = skip and state.skipped + 1 < _EVERY
-    frame = replace(frame, fields="whole") if skip else classify_fields(frame, mode)
+    skip = frame.fields is None and state.kind == "whole" and state.skipped + 1 < _EVERY
+    frame = replace(frame, fields="whole") if skip else classify_fields(frame)
     skipped = state.skipped + 1 if skip else 0
     # A stream of fields stays one.
     kind = state.kind if state.kind == "woven" else frame.fields
@@ -153,11 +143,7 @@ def separate_fields(
     if frame.fields == "whole":
         new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
         return new, (frame,)
-    state = replace(state, kind=kind, skipped=skipped, periods_s=periods_s)
-    if mode in ("top", "bottom"):
-        state = replace(state, last_s=frame.t_s, top_first=mode == "top")
-    else:
-        state = _voted(state, frame)
+    state = _voted(replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame)
     if frame.fields != "woven" or state.top_first is None:
         return state, (frame,)
     top, bottom = halves(frame)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import FieldsMode, classify_fields, separate_fields
+from perchctl.vision.fields import classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
@@ -64,7 +64,6 @@ class Pipeline:
     tracks: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
-    fields: FieldsMode = "auto"
 
 
 def make_pipeline(
@@ -104,7 +103,6 @@ def make_pipeline(
         ),
         kalman=profile.kalman,
         camera=camera,
-        fields=profile.camera.fields,
     )
 
 
@@ -139,7 +137,7 @@ def pictures(
     """Return the new memory and what a stream's frame holds, each for a `step` of its own: one
     picture, or the two fields of an interlaced camera in their order of time, each with its own
     time."""
-    fields, found = separate_fields(state.fields, frame, pipeline.fields)
+    fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
 
@@ -156,7 +154,7 @@ def step(
     What runs in each tracked frame multiplies its matrices by `dot`: `@` takes twice as long for
     a few numbers, and a frame has a hundred such products.
     """
-    frame = classify_fields(frame, pipeline.fields)
+    frame = classify_fields(frame)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
@@ -212,7 +210,6 @@ def _followed(
         tracks=followed.tracks,
         in_world=in_world,
         measured=measured,
-        attitude=attitude,
         target=target or state.target,
         last=last,
         sighting=sighting if sees or followed.tracks else None,

@@ -23,7 +23,7 @@ from perchctl.vision import (
     pictures,
     step,
 )
-from perchctl.vision.fields import FieldsMode, combing, field_picture, is_combed, separate_fields
+from perchctl.vision.fields import combing, field_picture, is_combed, separate_fields
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
@@ -94,10 +94,10 @@ def test_no_shared_whole_picture_is_taken_for_two(folder: str) -> None:
 # --- Order and time ----------------------------------------------------------------------------
 
 
-def kinds(state: FieldState, frames: list[Frame], mode: FieldsMode = "auto") -> list[Any]:
+def kinds(state: FieldState, frames: list[Frame]) -> list[Any]:
     found = []
     for frame in frames:
-        state, parts = separate_fields(state, frame, mode)
+        state, parts = separate_fields(state, frame)
         found.append(tuple(part.fields for part in parts))
     return found
 
@@ -134,7 +134,7 @@ def test_a_standing_picture_says_nothing_of_the_order() -> None:
     state = FieldState()
     for k in range(8):
         again = replace(frame, t_s=frame.t_s + k * PAL_S)
-        state, parts = separate_fields(state, again, "auto")
+        state, parts = separate_fields(state, again)
         assert [part.fields for part in parts] == ["woven"]
     assert abs(state.votes) < 0.1
 
@@ -156,25 +156,15 @@ def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None
     """Found from times that jitter, of frames of which some are lost."""
     rng = np.random.default_rng(6)
     _, frames = woven_frames(3)
-    state = FieldState()
+    state = FieldState(top_first=True)
     index = 0
     for k in range(40):
         index += 1 + (rng.random() < 0.1)
         t_s = index * period_s + rng.normal(0.0, 0.03 * period_s)
-        state, parts = separate_fields(state, replace(frames[k % 3], t_s=t_s), "top")
+        state, parts = separate_fields(state, replace(frames[k % 3], t_s=t_s))
     early, late = parts
     assert (early.t_s + late.t_s) / 2.0 == pytest.approx(t_s)
     assert late.t_s - early.t_s == pytest.approx(apart_s, rel=0.03)
-
-
-def test_the_profile_may_know_better() -> None:
-    _, frames = woven_frames(2, "top")
-    assert kinds(FieldState(), frames, "bottom") == [("bottom", "top")] * 2
-    assert kinds(FieldState(), frames, "top") == [("top", "bottom")] * 2
-    assert kinds(FieldState(), frames, "progressive") == [("whole",)] * 2
-    still = list(Pass().frames(2))
-    assert kinds(FieldState(), still, "auto") == [("whole",)] * 2
-    assert kinds(FieldState(), still, "top") == [("top", "bottom")] * 2
 
 
 # --- The target --------------------------------------------------------------------------------
