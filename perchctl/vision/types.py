@@ -111,7 +111,6 @@ class Detections:
     t_s: float
     large: Detection | None = None
     small: Detection | None = None
-    full_frame: bool = True  # False: found in the predicted window
     mirrored: bool = False  # a marker decoded as its mirror image
     targets: int = 0  # whole targets, both markers, that a search saw
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
@@ -348,7 +347,6 @@ class PipelineState:
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
     measured: MeasuredMarkers = MeasuredMarkers()  # of the newest frame
-    attitude: Attitude | None = None  # at the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last: Detections | None = None
     sighting: Sighting | None = None  # the last

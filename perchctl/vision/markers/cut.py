@@ -26,7 +26,7 @@ from perchctl.vision.markers.detector import Covered, hides, make_aruco_detector
 from perchctl.vision.markers.edge_fit import MIDDLES, sample
 from perchctl.vision.markers.pattern import Drawing, Pattern, drawn
 from perchctl.vision.markers.photometric_fit import likeness, make_grid
-from perchctl.vision.types import CameraModel, Detections, MarkerName
+from perchctl.vision.types import CameraModel, MarkerName
 
 MOST_AGE_S = 0.5
 """Since the target was last measured; after that what shows a part of it is no evidence."""
@@ -68,14 +68,6 @@ def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -
     h, w = shape[:2]
     outer = (h + 2 * _EDGE_PX, w + 2 * _EDGE_PX)
     return any(within(corners + _EDGE_PX, outer) for corners in expected.values())
-
-
-def measured_lately(previous: Detections | None, t_s: float) -> bool:
-    """Return True if the target was measured so short a time ago that a part of it is known
-    again."""
-    if previous is None or not previous.markers:
-        return False
-    return 0.0 < t_s - previous.t_s <= MOST_AGE_S
 
 
 def cut_markers(
@@ -158,14 +150,10 @@ def _start(
         return None
     half = ratio if name == "small" else 1.0
     H = cv2.getPerspectiveTransform((half * UNIT).astype(np.float32), rays.astype(np.float32))
-    if not np.isfinite(H).all():
-        return None
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
-    if scale < 1e-9:
+    if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
         return None
     H = np.asarray(H, dtype=np.float64) / math.copysign(scale, H[2, 2])
-    if H[2, 2] <= 0.0:
-        return None
     U, _, V = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
     R = np.asarray(U @ V, dtype=np.float64)
     return RigidPose(R, np.asarray(H[:, 2])) if np.linalg.det(R) > 0.0 else None
@@ -198,10 +186,17 @@ def _trusted(found: Visible) -> bool:
 def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
     """Return the corners of the marker of that half side; None where the lens model does not reach
     as far."""
-    found_at = corners_of(found.pose, half, camera)
-    if found_at is None:
-        return None
-    x, J = found_at
+    r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
+    X = r + found.pose.t
+    if X[:, 2].min() <= 0.0:
+        return None  # one is beside or behind the camera
+    x = X[:, :2] / X[:, 2:]
+    J = np.zeros((8, 6))  # pixels of a pinhole, with turn and move
+    for k in range(4):
+        P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
+        P = camera.K[:2, :2] @ P
+        J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
+        J[2 * k : 2 * k + 2, 3:] = P
     corners_px = distort(x, camera)
     if not np.abs(undistort(corners_px, camera) - x).max() < _INVERTED:
         return None
@@ -363,10 +358,7 @@ def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
-    gain = float(light[3])
-    if not math.isfinite(gain):
-        return 0.0, 0.0
-    return likeness(grey, grey - A @ light), gain
+    return likeness(grey, grey - A @ light), float(light[3])
 
 
 # --- The drawing of the whole target: its edges between black and white, and its picture ---
@@ -673,13 +665,8 @@ def _solved(
             return None
         variance = max(_TAILS * float(weight @ error**2) / mass, 1e-3)
         N = (J * weight[:, None]).T @ J / variance + np.diag(prior)
-        try:
-            inverse = np.linalg.inv(N)
-        except np.linalg.LinAlgError:
-            return None
+        inverse = np.linalg.inv(N)
         step = inverse @ (J.T @ (weight * offset_px) / variance + pull)
-        if not np.isfinite(step).all():
-            return None
     return _Round(step, inverse, weight, J, variance)
 
 
@@ -705,20 +692,3 @@ def _visible(
         small=int(np.count_nonzero(shown & outline.small[places.index])),
         residual_px=math.sqrt(variance),
     )
-
-
-def corners_of(pose: RigidPose, half: float, camera: CameraModel) -> tuple[Array, Array] | None:
-    """Return the corners (4, 2) of the square of that half side, normalised, and their changes (8,
-    6) with turn and move, pixels of a pinhole; None where one is beside or behind the camera."""
-    r = np.column_stack([half * UNIT, np.zeros(4)]) @ pose.R.T
-    X = r + pose.t
-    if X[:, 2].min() <= 0.0:
-        return None
-    x = X[:, :2] / X[:, 2:]
-    J = np.zeros((8, 6))
-    for k in range(4):
-        P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
-        P = camera.K[:2, :2] @ P
-        J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
-        J[2 * k : 2 * k + 2, 3:] = P
-    return x, J

@@ -34,10 +34,10 @@ from perchctl.vision.markers.corners import (
     within,
 )
 from perchctl.vision.markers.cut import (
+    MOST_AGE_S,
     cut_markers,
     is_cut,
     may_be_whole,
-    measured_lately,
 )
 from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_in, hides
 from perchctl.vision.markers.edge_fit import refine, refine_lines
@@ -91,11 +91,11 @@ def detect_markers(
     turn = None
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
-    lately = measured_lately(previous, frame.t_s)
-    was_cut = False
-    if previous is not None and lately and setup.by_lines:
-        last = {each.marker: each.corners_px for each in previous.markers}
-        was_cut = not may_be_whole(last, frame.image.shape)
+    # A part of the target is known again where it was measured a short time ago.
+    last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
+    lately = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
+    lately = lately and setup.by_lines and bool(last)
+    was_cut = lately and not may_be_whole(last, frame.image.shape)
     shift = known_from(None if previous is None else previous.edge_shift)
 
     def detected(frame: Frame) -> Detections:
@@ -106,7 +106,7 @@ def detect_markers(
         seen: _Seen = {}
         if look != "fits" and both and setup.by_lines:
             seen, found = _followed(picture, both, shift)
-        if not seen and lately and setup.by_lines and is_cut(both, image.shape, hidden):
+        if not seen and lately and is_cut(both, image.shape, hidden):
             seen = cut_markers(image, expected, setup.patterns, camera, hidden)
         findable = not was_cut or may_be_whole(both, image.shape)
         if look not in ("blurred", "fits") and (
@@ -123,7 +123,6 @@ def detect_markers(
             t_s=frame.t_s,
             large=_detection("large", seen, frame.fields),
             small=_detection("small", seen, frame.fields),
-            full_frame=found.full_frame,
             mirrored=found.mirrored and not seen,
             targets=found.targets,
             edge_shift=next((each for each in shifts if each is not None), None),

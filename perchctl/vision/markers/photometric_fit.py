@@ -71,7 +71,7 @@ class Alignment:
         cell_departure: largest mean departure of a cell, in units of the gain.
         flip, flip_sigma: by how much the cell that is most against it has the other colour, 0
             (drawn as it is seen) to 1 (the bit is wrong), and the least certain cell's spread.
-        blur_px, gain: the blur's sigma, and grey levels from black to white.
+        blur_px: the blur's sigma.
         moved_px: how far the corner that moved most is from its start.
     """
 
@@ -84,7 +84,6 @@ class Alignment:
     flip: float
     flip_sigma: float
     blur_px: float
-    gain: float
     moved_px: float
 
 
@@ -131,7 +130,7 @@ def align(
     around, first = patch
 
     def drawn(blur_px: float) -> Rendered:
-        return rendered(drawing, n, blur_px / node_px)
+        return rendered(drawing, n, round(math.log(blur_px / node_px) / _STEP))
 
     def possible_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
@@ -147,10 +146,7 @@ def align(
             return None
         if k == _HOPE_ROUNDS and likeness(grey, equations.error) < _LEAST_HOPE:
             return None
-        try:
-            step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            return None
+        step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
         p = step[_SHAPE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
             return None
@@ -186,7 +182,6 @@ def align(
         flip=flip,
         flip_sigma=flip_sigma,
         blur_px=seen.sigma * node_px,
-        gain=gain,
         moved_px=float(np.abs(corners_px - start_px).max()),
     )
 
@@ -197,11 +192,11 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
     rows, products = seen.light
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
-    light = np.asarray(np.linalg.solve(A, _onto(rows, grey)), np.float64)
+    light = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
     gain = float(light[GAIN])
     if gain < _MIN_GAIN:
         return None
-    error = grey - _mixed(rows, light)
+    error = grey - np.einsum("kn,k->n", rows, light)
     J = np.concatenate([_lit_jacobian(seen, light), rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
     products = gram(J) / noise
@@ -255,9 +250,9 @@ def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, f
     rows, products = drawing.plain
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.light[0][GAIN], grey
-    b = np.stack([_onto(rows, each) for each in both], axis=1)
-    shares = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-    bits, seen = (each - _mixed(rows, shares[:, k]) for k, each in enumerate(both))
+    b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
+    shares = np.linalg.solve(A, b)
+    bits, seen = (each - np.einsum("kn,k->n", rows, shares[:, k]) for k, each in enumerate(both))
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
     scale = math.sqrt(energy * float((seen * seen).sum()))
     if scale < 1e-9:
@@ -287,7 +282,7 @@ def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
     """Return each node's number of its cell, behind the last one's around the marker, and how many
     nodes each cell has."""
-    x, y = ((g + 1.0) * 0.5 * n_cells for g in (grid.u, grid.v))
+    x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
     own = y.astype(np.intp) * n_cells + x.astype(np.intp)
     index = np.where(inside, own, n_cells**2)
@@ -303,10 +298,10 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
     """Return the changes (9, n * n) of the grey values with the homography's increment and the
     blur's square, in this light (7 or 8,)."""
-    gain, grid = float(light[GAIN]), drawing.grid
+    gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
     bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
-    slope = gain + light[GAIN_U] * grid.u + light[GAIN_V] * grid.v
+    slope = gain + light[GAIN_U] * u + light[GAIN_V] * v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
     for (_, more), height in zip(others, light[BEYOND:], strict=True):
@@ -322,23 +317,11 @@ _FEW = 9  # a side
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """n by n nodes, `axis` (n,) in both directions; u, v and 1 of each node, (3, n * n)."""
+    """n by n nodes, `axis` (n,) in both directions; u (across), v (down), 1 of each, (3, n * n)."""
 
     n: int
     axis: Array
     uv1: Array
-
-    @property
-    def u(self) -> Array:
-        """Across, (n * n,)."""
-        u: Array = self.uv1[0]
-        return u
-
-    @property
-    def v(self) -> Array:
-        """Down, (n * n,)."""
-        v: Array = self.uv1[1]
-        return v
 
 
 @lru_cache(maxsize=64)
@@ -434,16 +417,6 @@ def gram(rows: Array) -> Array:
     return np.asarray(total + rest.dot(rest.T))
 
 
-def _onto(rows: Array, values: Array) -> Array:
-    """Return the products (k,) of the rows (k, n) with values (n,)."""
-    return np.asarray(np.einsum("kn,n->k", rows, values))
-
-
-def _mixed(rows: Array, coefficients: Array) -> Array:
-    """Return the sum of the rows (k, n), each times its coefficient, (n,)."""
-    return np.asarray(np.einsum("kn,k->n", rows, coefficients))
-
-
 # --- A marker's drawing at the nodes of a grid, blurred, with all that follows from that alone ---
 # From picture to picture a marker's size and blur hardly change, so blur comes in steps, finer than
 # anything that a fit can tell, and what belongs to one is kept.
@@ -473,9 +446,9 @@ class Rendered:
     def light(self) -> tuple[Array, Array]:
         """What light makes of the drawing: rows (7 or 8, n * n), the last one only with a
         sheet's end, and their products."""
-        u, v = self.grid.u, self.grid.v
+        u, v, one = self.grid.uv1
         (white, _), *others = self.sheets
-        rows = [np.ones_like(u), u, v, white, white * u, white * v, white * (1.0 - white)]
+        rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])
         return stacked, gram(stacked)
 
@@ -496,13 +469,9 @@ class Rendered:
         return soft_cells(self.drawing, self.grid.axis, half_node, self.sigma)
 
 
-def rendered(drawing: Drawing, n: int, sigma: float) -> Rendered:
-    """Return the drawing at n by n nodes over its reach, blurred by about `sigma` nodes."""
-    return _rendered_at_step(drawing, n, round(math.log(sigma) / _STEP))
-
-
 @lru_cache(maxsize=16)
-def _rendered_at_step(drawing: Drawing, n: int, step: int) -> Rendered:
+def rendered(drawing: Drawing, n: int, step: int) -> Rendered:
+    """Return the drawing at n by n nodes over its reach, blurred by that step."""
     return Rendered(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 

@@ -46,12 +46,10 @@ Window = tuple[slice, slice]
 @dataclass(frozen=True, eq=False)
 class Found:
     """Raw corners (4, 2) px of at most one of each marker, whether the small marker's
-    mirror image is there, whether it was looked for in the whole picture, and how many whole
-    targets, both markers, there were to choose from."""
+    mirror image is there, and how many whole targets, both markers, there were to choose from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     mirrored: bool = False
-    full_frame: bool = False
     targets: int = 0
 
 
@@ -144,13 +142,12 @@ def _pass(
     """Return what one pass of OpenCV's detector over the window gives, or over that at half its
     size."""
     part = image[window]
-    full_frame = part.shape == image.shape
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
-        return Found(full_frame=full_frame)
+        return Found()
     rows, columns = window
     first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
@@ -165,7 +162,7 @@ def _pass(
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_wholes(candidates, setup.ratio))
     chosen = choose(candidates, expected, setup.ratio, own)
-    return Found(chosen, mirrored, full_frame, targets)
+    return Found(chosen, mirrored, targets)
 
 
 def choose(
@@ -183,13 +180,19 @@ def choose(
     nearest; without it the evidence is too thin to take any of several lone ones.
     """
     if own is not None and not expected:
-        candidates = _possible(candidates, own)
+        candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
     wholes = _wholes(candidates, ratio)
     near_large = _nearest("large", large, expected, ratio)
     near_small = _nearest("small", small, expected, ratio)
     if wholes:
-        _, i, j = _chosen(wholes, large, expected, own)
+        _, i, j = wholes[0]
+        if expected:
+            centre = next(iter(expected.values())).mean(axis=0)
+            away_px = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
+            _, i, j = wholes[int(np.argmin(away_px))]
+        elif own is not None:
+            _, i, j = min(wholes, key=lambda whole: whole[1])
         elsewhere = _nearest("large", [large[i]], expected, ratio) is None
         if not (elsewhere and (near_large is not None or near_small is not None)):
             return {"large": large[i], "small": small[j]}
@@ -198,7 +201,7 @@ def choose(
     if near_small is not None:
         return {"small": near_small}
     if own is not None and not expected:
-        large, small = (_least_aside(name, candidates[name], own) for name in MARKERS)
+        large, small = large[:1], small[:1]
     # A small marker beside a whole large one is not the target's.
     if len(large) == 1:
         return {"large": large[0]}
@@ -207,44 +210,19 @@ def choose(
     return {}
 
 
-def _chosen(
-    wholes: list[tuple[float, int, int]],
-    large: list[Array],
-    expected: Mapping[MarkerName, Array],
-    own: TargetSelector | None,
-) -> tuple[float, int, int]:
-    """Return the one that counts of several whole targets."""
-    if len(wholes) == 1 or not (expected or own):
-        return wholes[0]
-    if expected:
-        centre = next(iter(expected.values())).mean(axis=0)
-        away = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
-    else:
-        assert own is not None
-        away = [own.aside_m("large", large[i]) for _, i, _ in wholes]
-    return wholes[int(np.argmin(away))]
-
-
-def _possible(
+def _nearest_first(
     candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates without the markers that are too far aside. A lone one is left to the
-    pipeline, which says why it is not taken."""
-    if not own.refuses or sum(map(len, candidates.values())) < 2:
+    """Return the candidates that are least far aside first, without those that are too far: of
+    several, since a lone one is left to the pipeline, which says why it is not taken."""
+    if sum(map(len, candidates.values())) < 2:
         return candidates
-    kept: dict[MarkerName, list[Array]] = {
-        name: [quad for quad in quads if math.isfinite(own.aside_m(name, quad))]
-        for name, quads in candidates.items()
-    }
+    kept: dict[MarkerName, list[Array]] = {}
+    for name, quads in candidates.items():
+        away_m = [own.aside_m(name, quad) for quad in quads]
+        order = np.argsort(away_m, kind="stable").tolist()
+        kept[name] = [quads[k] for k in order if math.isfinite(away_m[k]) or not own.refuses]
     return kept if any(kept.values()) else candidates
-
-
-def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> list[Array]:
-    """Return the quadrilateral that `own` has nearest, of several."""
-    if len(quads) < 2:
-        return quads
-    away = [own.aside_m(name, quad) for quad in quads]
-    return [quads[int(np.argmin(away))]]
 
 
 def _wholes(

@@ -24,7 +24,6 @@ from tests.helpers.target_picture import CAMERA, pose_of, render
 def test_finds_both_markers_at_their_corners() -> None:
     rvec, tvec = pose_of(0.03, -0.02, 0.4, 0.7, 0.05, -0.1)
     found = detect_markers(frame(render(rvec, tvec)), None, SETUP, CAMERA)
-    assert found.full_frame
     assert not found.mirrored
     for name, side in (("large", 0.150), ("small", 0.025)):
         detection = found.get(name)
@@ -58,11 +57,9 @@ def test_a_mirrored_picture_is_recognised_and_not_measured(
 def test_tracks_in_a_window_and_falls_back_within_the_same_frame() -> None:
     first = detect_markers(frame(render(*pose_of(0.0, 0.0, 0.5))), None, SETUP, CAMERA)
     near = detect_markers(frame(render(*pose_of(0.01, 0.0, 0.5)), 1), first, SETUP, CAMERA)
-    assert not near.full_frame
     assert near.large is not None
     assert near.velocity_px_s[0] == pytest.approx(0.01 / 0.5 * 400 * 30, rel=0.05)
     far = detect_markers(frame(render(*pose_of(-0.25, 0.15, 0.5)), 2), near, SETUP, CAMERA)
-    assert far.full_frame
     assert far.large is not None
     assert far.small is not None
 

@@ -85,7 +85,6 @@ def test_corners_of_small_and_blurred_markers(
         error = found.corners_px - true
         squares.append((error**2).mean())
         assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
-        assert found.gain == pytest.approx(175.0, rel=0.2)
     assert math.sqrt(np.mean(squares)) < allowed_px
 
 
