@@ -41,6 +41,10 @@ class History:
     def newest(self) -> Telemetry | None:
         return self.samples[-1] if self.samples else None
 
+    def battery_age_s(self, now_s: float) -> float:
+        """Seconds since the battery's last new reading; 0 before there is telemetry."""
+        return 0.0 if self.battery_changed_s is None else now_s - self.battery_changed_s
+
 
 def add_samples(
     history: History, new: list[Telemetry], safety: SafetyConfig, late: bool = False
@@ -53,8 +57,6 @@ def add_samples(
     are no numbers, they are those of the sample before, and older by that.
     """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
-    if not new:
-        return replace(history, jumped=jumped, turned_rad=turned_rad)
     samples, imu = list(history.samples), history.imu
     changed_s, battery_v = history.battery_changed_s, history.battery_v
     for sample in new:
@@ -72,16 +74,9 @@ def add_samples(
         imu = imu.with_sample(samples[-1] if samples else None, sample)
         samples.append(sample)
     if samples:
-        oldest = samples[-1].t_s - KEEP_S
-        first = bisect.bisect_left(samples, oldest, key=_time_s)
-        samples = samples[first:]
+        oldest_s = samples[-1].t_s - KEEP_S
+        samples = samples[bisect.bisect_left(samples, oldest_s, key=_time_s) :]
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
-
-
-def battery_age_s(history: History, now_s: float) -> float:
-    """Seconds since the battery's last new reading; 0 before there is telemetry."""
-    changed_s = history.battery_changed_s
-    return 0.0 if changed_s is None else now_s - changed_s
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:
@@ -118,11 +113,9 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
     """The velocity in world axes by the first sample from `t_s` on, or by the newest; zero without
     a sample."""
-    samples = history.samples
-    if not samples:
-        return 0.0, 0.0, 0.0
-    i = bisect.bisect_left(samples, t_s, key=_time_s)
-    return samples[min(i, len(samples) - 1)].velocity_mps
+    later = bisect.bisect_left(history.samples, t_s, key=_time_s)
+    found = history.samples[later : later + 1] or history.samples[-1:]
+    return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
 
 
 def _time_s(sample: Telemetry) -> float:

@@ -55,41 +55,25 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture of the target. `t_s` is its arrival less the
-    profile's latency."""
-    new = _learned(old, t_s, pose, history, setup, attitude_sigma_rad)
-    if camera.latency_s != "measured":
-        return new
-    return replace(new, seen_s=t_s, used_s=_slewed(new, camera, t_s - old.seen_s))
-
-
-def _learned(
-    old: OnlineCalibration,
-    t_s: float,
-    pose: MarkerPose,
-    history: History,
-    setup: PoseSetup,
-    attitude_sigma_rad: float,
-) -> OnlineCalibration:
-    """Return the estimate with the picture's target in its sums, and once a second with their
-    solution; unchanged by a pose that is no number or too near, or where the attitude of its time
-    is not known."""
-    if pose.cov is None or not finite(pose.cov) or float(pose.tvec_m[2]) < LEAST_RANGE_M:
-        return old
-    likely = old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
+    """Return the estimate with one more picture of the target in its sums, and once a second with
+    their solution. `t_s` is its arrival less the profile's latency. Nothing is learned of a pose
+    that is no number or too near, or where the attitude of its time is not known."""
+    new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
     before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
     after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
-    if before is None or after is None:
-        return old
-    velocity_mps = velocity_at(history, t_s - delay_s)
-    moment = consistency_moment(pose, before, after, velocity_mps, delay_s, setup)
-    new = replace(old, sums=add_moment(old.sums, t_s, *moment))
-    if t_s - old.solved_s >= SOLVE_EVERY_S:
-        newest = solve_consistency(new.sums, attitude_sigma_rad)
-        new = replace(new, newest=newest, solved_s=t_s)
-    return new
+    is_measured = pose.cov is not None and finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
+    if is_measured and before is not None and after is not None:
+        velocity_mps = velocity_at(history, t_s - delay_s)
+        moment = consistency_moment(pose, before, after, velocity_mps, delay_s, setup)
+        new = replace(old, sums=add_moment(old.sums, t_s, *moment))
+        if t_s - old.solved_s >= SOLVE_EVERY_S:
+            newest = solve_consistency(new.sums, attitude_sigma_rad)
+            new = replace(new, newest=newest, solved_s=t_s)
+    if camera.latency_s != "measured":
+        return new
+    return replace(new, seen_s=t_s, used_s=_slewed(new, camera, t_s - old.seen_s))
 
 
 def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
@@ -113,9 +97,8 @@ def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
 #
 # The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
 # each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
-# through the same one as the target's place, and what is summed are the innovations: that is
-# the generalized least squares of the whole flight with a few numbers of memory (de Jong 1991, "The
-# diffuse Kalman filter"). Nothing is solved until somebody asks (`solve_consistency`).
+# through the same one, and what is summed are the innovations: the generalized least squares of the
+# whole flight with a few numbers of memory (de Jong 1991, "The diffuse Kalman filter").
 
 
 X, Y, HEADING = range(3)
@@ -280,16 +263,13 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consi
     # More scatter than claimed widens what is claimed, less of it narrows nothing.
     covariance *= max(1.0, left / sums.rows)
     sigma = np.sqrt(np.diagonal(covariance))
-    by = {column: column - 1 for column in (DELAY, TILT_X, TILT_Y, TURN, SCALE)}
-    tilts = [math.hypot(float(sigma[by[c]]), attitude_sigma_rad) for c in (TILT_X, TILT_Y)]
-    turn = math.atan2(float(found[by[TURN]]), 1.0 - float(found[by[SCALE]]))
+    tilt_x, tilt_y = (
+        math.hypot(sigma[column - 1], attitude_sigma_rad) for column in (TILT_X, TILT_Y)
+    )
+    turn = math.atan2(found[TURN - 1], 1.0 - found[SCALE - 1])
     return Consistency(
-        delay_s=float(found[by[DELAY]]),
-        delay_sigma_s=math.hypot(float(sigma[by[DELAY]]), STAMPS_S),
-        turn_rad=(float(found[by[TILT_X]]), float(found[by[TILT_Y]]), turn),
-        turn_sigma_rad=(
-            tilts[0],
-            tilts[1],
-            math.hypot(float(sigma[by[TURN]]), LARGE_TURN * turn),
-        ),
+        delay_s=float(found[DELAY - 1]),
+        delay_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
+        turn_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
+        turn_sigma_rad=(tilt_x, tilt_y, math.hypot(sigma[TURN - 1], LARGE_TURN * turn)),
     )

@@ -75,9 +75,10 @@ def estimate_motion(
         return new
     wanders_m, velocity_mps, bias_mps2 = motion_by_hypothesis(new.sights, samples, offset_g)
     if old.mismatch is None:  # else it stays
-        found = _found(wanders_m)
-        agrees = found is not None and old.found is not None and _alike(found, old.found)
-        agreed = 0 if found is None else old.agreed + 1 if agrees else 1
+        found, before = _found(wanders_m), old.found
+        agreed = 0 if found is None else 1
+        if found is not None and before is not None and found.turn_rad == before.turn_rad:
+            agreed += old.agreed if abs(found.later_s - before.later_s) <= ALIKE_S else 0
         new = replace(new, found=found, found_s=t_s, agreed=agreed)
     i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
@@ -87,16 +88,6 @@ def estimate_motion(
             new, motion=VisualInertialMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps)
         )
     return replace(new, judged_s=t_s)
-
-
-def _alike(a: Mismatch, b: Mismatch) -> bool:
-    return a.turn_rad == b.turn_rad and abs(a.later_s - b.later_s) <= ALIKE_S
-
-
-def _nearest(mismatch: Mismatch) -> int:
-    """The index of a mismatch among those that are tried."""
-    later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
-    return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
 
 
 def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
@@ -110,7 +101,7 @@ def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
 def _found(wanders_m: Array) -> Mismatch | None:
     """The mismatch that explains the pictures; None if the profile does."""
     best = int(np.argmin(wanders_m))
-    as_it_is = float(wanders_m[_nearest(Mismatch())])
+    as_it_is = float(wanders_m[np.argmin(np.abs(LATER_S) + np.abs(TURNS_RAD))])
     if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
         return None
     found = Mismatch(float(LATER_S[best]), float(TURNS_RAD[best]))
