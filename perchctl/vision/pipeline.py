@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import classify_fields, separate_fields
@@ -249,6 +248,12 @@ def estimate(
     target = state.target
     if target is None or attitude is None or target.world_m is None:
         return target
+    if state.tracks and state.in_world:
+        world = pipeline.tracks.world
+        tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
+        merged = merge_tracks(tracks, state.measured.fed, pipeline.merge.weights)
+        assert merged is not None
+        return replace(target, t_s=t_s, **_placed(merged, attitude, True, pipeline, spread))
     if not state.tracks:
         nothing = np.zeros(3)
         target = replace(
@@ -259,14 +264,10 @@ def estimate(
             velocity_mps=nothing,
             world_velocity_mps=nothing,
         )
-        return _carried(target, t_s, attitude, pipeline)
-    if not state.in_world:
-        return _carried(target, t_s, attitude, pipeline)
-    world = pipeline.tracks.world
-    tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
-    merged = merge_tracks(tracks, state.measured.fed, pipeline.merge.weights)
-    assert merged is not None
-    return replace(target, t_s=t_s, **_seen_in_world(merged, attitude, pipeline, spread))
+    assert target.world_m is not None
+    assert target.world_yaw_rad is not None
+    e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
+    return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
 # --- from the tracks to the target ------------------------------------
@@ -289,10 +290,6 @@ def _at_frame(
     measured = any(n in tracks and tracks[n].t_s == t_s for n in fed)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
-    if attitude is not None and in_world:
-        place = _seen_in_world(merged, attitude, pipeline)
-    else:
-        place = _seen_in_level(merged, attitude, pipeline)
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,
@@ -301,65 +298,38 @@ def _at_frame(
         measured=measured,
         tracked=True,
         unseen=merged.unseen,
-        **place,
+        **_placed(merged, attitude, in_world, pipeline),
     )
 
 
-def _carried(
-    target: TargetEstimate, t_s: float, attitude: Attitude, pipeline: Pipeline
-) -> TargetEstimate:
-    """Return the same place in the world, seen from the vehicle at `attitude`."""
-    assert target.world_m is not None
-    assert target.world_yaw_rad is not None
-    e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
-    return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
-
-
-# --- What merged tracks say of the target, as a `TargetEstimate` has it ---
-
-
-def _seen_in_level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:
-    """Return place, motion and spread of tracks in the level frame."""
-    e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    world_m, world_yaw_rad = None, None
-    if attitude is not None:
-        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, pipeline.pose)
-    return {
-        "e_m": e_m,
-        "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": merged.velocity_mps,
-        "world_m": world_m,
-        "world_yaw_rad": world_yaw_rad,
-        **_spread(merged, merged.cov_m2, merged.bias_m),
-    }
-
-
-def _seen_in_world(
-    merged: Merged, attitude: Attitude, pipeline: Pipeline, spread: bool = True
+def _placed(
+    merged: Merged,
+    attitude: Attitude | None,
+    in_world: bool,
+    pipeline: Pipeline,
+    spread: bool = True,
 ) -> dict[str, Any]:
-    """Return place, motion and, on request, spread of tracks in the world, as seen from the
-    vehicle at `attitude`."""
-    world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
-    turn = attitude.R_world_level.T
-    seen = {
-        "e_m": e_m,
-        "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": turn.dot(merged.velocity_mps),
-        "world_m": world_m,
-        "world_yaw_rad": world_yaw_rad,
-        "world_velocity_mps": merged.velocity_mps,
-    }
-    if not spread:
-        return seen
-    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
-    return seen | _spread(merged, turn.dot(merged.cov_m2).dot(turn.T), bias_m)
-
-
-def _spread(merged: Merged, cov_m2: Array, bias_m: Array) -> dict[str, Any]:
-    """Return the standard deviations of a place with that covariance and constant errors."""
-    variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
-    return {
-        "sigma_m": np.asarray(np.sqrt(np.maximum(variance, 0.0))),
-        "sigma_yaw_rad": math.sqrt(max(merged.var_yaw_rad2, 0.0)),
-    }
+    """Return place, motion and, on request, spread of merged tracks in the world or in the level
+    frame, as a `TargetEstimate` has them for the vehicle at `attitude`."""
+    place_m, yaw_rad = merged.vector[:3], float(merged.vector[3])
+    cov_m2, bias_m = merged.cov_m2, merged.bias_m
+    seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}
+    if attitude is not None and in_world:
+        turn = attitude.R_world_level.T
+        seen["world_m"], seen["world_yaw_rad"] = place_m, yaw_rad
+        seen["e_m"], seen["e_yaw_rad"] = to_level(place_m, yaw_rad, attitude, pipeline.pose)
+        seen["velocity_mps"] = turn.dot(merged.velocity_mps)
+        seen["world_velocity_mps"] = merged.velocity_mps
+        if spread:
+            cov_m2 = turn.dot(cov_m2).dot(turn.T)
+            bias_m = seen_from(bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+    else:
+        seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
+        if attitude is not None:
+            world = to_world(place_m, yaw_rad, attitude, pipeline.pose)
+            seen["world_m"], seen["world_yaw_rad"] = world
+    if spread:
+        variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
+        seen["sigma_m"] = np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        seen["sigma_yaw_rad"] = math.sqrt(max(merged.var_yaw_rad2, 0.0))
+    return seen
