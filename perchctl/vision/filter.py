@@ -265,26 +265,6 @@ def predict_track(
     return replace(track, t_s=t_s, x=x)
 
 
-def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
-    """Return the measurement that the track predicts for a later time, with what it leaves open for
-    its R: the part of `predict_track` that is measured."""
-    dt_s = max(min(t_s - track.t_s, MAX_PREDICTION_S), 0.0)
-    x = _drifting(track.x, setup) if dt_s > 0.0 else track.x
-    z = x[MEASURED] + dt_s * x[RATES]
-    z[0] = wrap_rad(float(z[0]))
-    P, noise = track.P, setup.process
-    R = P[MEASURED, MEASURED] + dt_s * (P[MEASURED, RATES] + P[RATES, MEASURED])
-    R += dt_s * dt_s * P[RATES, RATES]
-    if noise is None:
-        R += setup.Q[MEASURED, MEASURED] * (dt_s > 0.0)
-    else:
-        R += _pushed(noise, x[POSITION]) * (dt_s**3 / 3.0)
-        if noise.wanders:
-            R += _WANDER * dt_s
-    bias = track.bias[MEASURED] + dt_s * track.bias[RATES]
-    return Measurement(z, R, bias)
-
-
 def _drifting(x: Array, setup: FilterSetup) -> Array:
     """Return the state with its speed limited to the frame's drift."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())

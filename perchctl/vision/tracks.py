@@ -12,10 +12,11 @@ from perchctl.geometry import Array, finite, wrap_rad
 from perchctl.values import replace
 from perchctl.vision.filter import (
     MAX_TRACK_GAP_S,
+    MEASURED,
     POSITION,
     FilterSetup,
     Measurement,
-    foreseen,
+    predict_track,
     start_track,
     step_track,
 )
@@ -274,17 +275,15 @@ class _Fit:
 def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
     """Return by how much the pose is off from the one that a track foresees, however late: what is
     not measured drifts."""
-    wanted, measured = foreseen(track, sight.t_s, constants), sight.measured
-    assert wanted.R is not None
-    assert wanted.bias is not None
+    wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The most that it drifts counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
-    off = measured.z - wanted.z
+    off = measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
     # A constant error moves both.
-    bias = wanted.bias if measured.bias is None else measured.bias - wanted.bias
+    bias = wanted.bias[MEASURED] if measured.bias is None else measured.bias - wanted.bias[MEASURED]
     R = constants.R if measured.R is None else measured.R
-    S = wanted.R + drift_m**2 * _PLACE + R + bias @ bias.T
+    S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _PLACE + R + bias @ bias.T
     return _Fit(off, S + np.diag(_unclaimed(_range_m(sight)) ** 2))
 
 
