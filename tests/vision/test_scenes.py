@@ -83,13 +83,3 @@ def test_found_rates(truth: dict[str, Any], build: Any) -> None:
                 found[name] += output.detections.get(name) is not None
     assert found["large"] >= 0.95 * visible["large"]
     assert found["small"] >= 0.85 * visible["small"]
-
-
-def test_a_mirrored_scene_is_recognised(truth: dict[str, Any], build: Any) -> None:
-    entry = entries(truth, "table1")[0]
-    image = cv2.imread(str(truth["folder"] / entry["file"]), cv2.IMREAD_GRAYSCALE)
-    setup = build(camera=truth["camera"])
-    flipped = np.ascontiguousarray(image[:, ::-1])
-    output = step(PipelineState(), Frame(0, 0.0, flipped), None, setup)[1]
-    assert output.detections.mirrored
-    assert output.target is None

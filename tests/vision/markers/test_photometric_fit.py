@@ -13,26 +13,20 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, square_corners
-from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.blurred import (
     expected_in_blur,
     hidden_in_blur,
     told_apart,
     verified,
 )
-from perchctl.vision.markers.corners import from_unit
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.pattern import Drawing, drawing_of
 from perchctl.vision.markers.photometric_fit import (
     Alignment,
     align,
-    lens_shift_px,
-    make_grid,
-    projected,
-    through_lens,
 )
 from perchctl.vision.types import Detection, Detections
-from tests.helpers.markers import SETUP, blurry, box, frame
+from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)
@@ -227,20 +221,6 @@ def test_a_blurred_marker_of_another_codeword_is_not_taken(wrong: list[tuple[int
     assert detect_markers(frame(image), None, SETUP, PINHOLE).small is None
     own, _ = picture(CELLS, 4.0, 2.0, 2.0, seed=1)
     assert detect_markers(frame(own), None, SETUP, PINHOLE).small is not None
-
-
-# --- What the lens does to a marker's nodes, from a few of them --------------------------------
-
-
-def _exact(uv1: Array, H: Array) -> Array:
-    pin = projected(H, uv1)
-    return np.asarray(through_lens(pin, CAMERA) - pin)
-
-
-@given(st.floats(20.0, 620.0), st.floats(20.0, 460.0), st.floats(8.0, 60.0))
-def test_a_small_marker_anywhere(cx: float, cy: float, side_px: float) -> None:
-    grid, H = make_grid(30, 1.2), from_unit(undistort_px(box(cx, cy, side_px), CAMERA))
-    assert np.abs(_exact(grid.uv1, H) - lens_shift_px(grid, H, CAMERA)).max() < 1e-4
 
 
 # --- Blur that hides the target ----------------------------------------------------------------
