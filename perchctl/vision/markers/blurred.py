@@ -24,11 +24,11 @@ from perchctl.vision.markers.corners import (
     to_unit,
     within,
 )
-from perchctl.vision.markers.detector import DetectorSetup, make_quadrilateral_finder
+from perchctl.vision.markers.detector import Picture, make_quadrilateral_finder
 from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
 from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
 from perchctl.vision.markers.photometric_fit import Alignment, align
-from perchctl.vision.types import MARKERS, CameraModel, MarkerName
+from perchctl.vision.types import MARKERS, MarkerName
 
 _BLURS_PX, _BLUR_PX = (1.5, 3.0), 2.0  # to start with
 _SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # how far a prediction may be off
@@ -42,14 +42,11 @@ _SHEET = 1.3  # half sides of a marker that are surely paper
 
 
 def expected_in_blur(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    turn: int | None = None,
+    picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
     """Return the first of the markers that is near to where it is expected (4, 2) px. Fits that
     begin with little and with much blur take turns; without a `turn`, both are tried."""
+    image, patterns = picture.image, picture.setup.patterns
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
         corners = expected.get(name)
@@ -61,21 +58,20 @@ def expected_in_blur(
         if resemblance(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
             continue
         for blur_px in blurs_px:
-            seen = aligned(image, start, patterns[name], camera, blur_px=blur_px)
+            seen = aligned(picture, name, start, blur_px=blur_px)
             if seen is not None:
                 return {name: seen}
     return {}
 
 
-def hidden_in_blur(
-    image: NDArray[np.uint8], setup: DetectorSetup, camera: CameraModel
-) -> dict[MarkerName, RefinedCorners]:
+def hidden_in_blur(picture: Picture) -> dict[MarkerName, RefinedCorners]:
     """Find a marker anywhere in the picture: of all its quadrilaterals, those whose grey values go
     best with a marker's cells are verified."""
+    image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _best(image, quads, setup.patterns):
-        seen = aligned(image, corners_px, setup.patterns[name], camera, blur_px=_BLUR_PX)
+        seen = aligned(picture, name, corners_px, blur_px=_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
@@ -170,10 +166,9 @@ _MIN_EVENNESS = 0.6  # shortest side over the longest
 
 
 def aligned(
-    image: NDArray[np.uint8],
+    picture: Picture,
+    name: MarkerName,
     start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
     reach: float = 0.6,
     blur_px: float = 1.5,
     max_sigma: float = _MAX_SIGMA,
@@ -188,7 +183,8 @@ def aligned(
     side_px = mean_side_px(start_px)
     if not side_px >= LEAST_SIDE_PX:
         return None
-    found = align(image, start_px, pattern.drawing, camera, blur_px)
+    image, drawing = picture.image, picture.setup.patterns[name].drawing
+    found = align(image, start_px, drawing, picture.camera, blur_px)
     if (
         found is None
         or not verified(found, max_sigma)

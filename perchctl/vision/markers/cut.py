@@ -22,7 +22,7 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import UNIT, RefinedCorners, mapped, within
-from perchctl.vision.markers.detector import Covered, hides, make_aruco_detector
+from perchctl.vision.markers.detector import Covered, Picture, hides, make_aruco_detector
 from perchctl.vision.markers.edge_fit import MIDDLES, sample
 from perchctl.vision.markers.pattern import Drawing, Pattern, drawn
 from perchctl.vision.markers.photometric_fit import likeness, make_grid
@@ -71,17 +71,11 @@ def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -
 
 
 def cut_markers(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    hidden: Covered | None = None,
+    picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker that what is in view of the target stands for, or none.
-
-    `expected` are corners (4, 2) px, of one marker at least; `hidden` (h, w) is where the vehicle's
-    own gear covers the picture.
-    """
+    """Return the marker that what is in view of the target stands for, or none; `expected` are
+    corners (4, 2) px, of one marker at least."""
+    image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
     start = _start(expected, ratio, camera)
@@ -89,7 +83,7 @@ def cut_markers(
         return {}
     if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_CELL_PX:
         return {}
-    covered = None if hidden is None else hidden.astype(np.uint8)
+    covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
     view = overview_of(image, camera, covered)
     outline, texture = outline_of(drawing), texture_of(drawing)
     near = _moved_near(start, texture, view)
@@ -206,8 +200,6 @@ def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners
 
 
 # --- A picture at a glance: small, through a pinhole, beside what a drawing would look like there
-# It tells how far a prediction is off, and whether the picture looks like the drawing, where
-# too little of a marker is in view for its corners.
 
 
 Grey = NDArray[np.float32]
@@ -362,8 +354,6 @@ def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float
 
 
 # --- The drawing of the whole target: its edges between black and white, and its picture ---
-# Both markers share a centre and a plane, so their cells make one drawing, in the large marker's
-# own coordinates (see `perchctl.vision.markers.corners`).
 
 
 PAPER = 1.25  # half sides of the large marker that are surely paper
@@ -448,13 +438,10 @@ def _edges(
 
 
 # --- The target's pose from the edges that are in view, where its markers are cut by the picture
-# The drawing of both markers is laid over the picture: at
-# places along its edges the edge of the picture is looked for across them, and Gauss-Newton
-# turns and moves the drawing until both agree. Its unknowns are those of a rigid body, not those
-# of a homography: a part of a drawing does not show eight of them. What it does not show of the
-# tilt is taken from the prediction, with that one's spread.
-#
-# Lengths are in units of the large marker's half side.
+# At places along the drawing's edges the edge of the picture is looked for across them, and
+# Gauss-Newton turns and moves the drawing until both agree. Its unknowns are a rigid body's: a part
+# of a drawing does not show the eight of a homography, and what it does not show of the tilt is
+# taken from the prediction. Lengths are in units of the large marker's half side.
 
 
 # Of the profiles, by rounds. An ascent blurs edges near the picture's rim by several pixels.

@@ -107,12 +107,12 @@ def detect_markers(
         if look != "fits" and both and setup.by_lines:
             seen, found = _followed(picture, both, shift)
         if not seen and lately and is_cut(both, image.shape, hidden):
-            seen = cut_markers(image, expected, setup.patterns, camera, hidden)
+            seen = cut_markers(picture, expected)
         findable = not was_cut or may_be_whole(both, image.shape)
         if look not in ("blurred", "fits") and (
             (not seen and findable) or _missing(picture, seen, expected)
         ):
-            found = search(image, expected, setup, look, own)
+            found = search(picture, expected, look, own)
             if len(found.corners_px) >= len(seen):
                 seen = _refined(picture, found)
         if not seen and look not in ("sharp", "window") and setup.by_lines:
@@ -159,7 +159,7 @@ def _followed(
     what may be seen of it in the old place."""
     seen = follow(picture, expected, shift)
     if not seen:
-        found = search_halved(picture.image, expected, picture.setup)
+        found = search_halved(picture, expected)
         again = {} if found is None else _refined(picture, found)
         if found is not None and again:
             return again, found
@@ -216,11 +216,7 @@ def _refined(picture: Picture, found: Found) -> _Seen:
 
 def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None) -> _Seen:
     """Return what only the drawing shows: near to where it is expected, or anywhere."""
-    image, setup, camera = picture.image, picture.setup, picture.camera
-    if expected:
-        seen = expected_in_blur(image, expected, setup.patterns, camera, turn)
-    else:
-        seen = hidden_in_blur(image, setup, camera)
+    seen = expected_in_blur(picture, expected, turn) if expected else hidden_in_blur(picture)
     return improved(replace(picture, hidden=None), seen)
 
 
@@ -320,16 +316,8 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
             continue
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
-        exact = aligned(
-            image,
-            start,
-            patterns[name],
-            picture.camera,
-            _REACH,
-            _blur_px(better.get(name)),
-            max_sigma=max_sigma,
-            alone=alone,
-        )
+        blur_px = _blur_px(better.get(name))
+        exact = aligned(picture, name, start, _REACH, blur_px, max_sigma, alone)
         if exact is not None:
             better[name] = exact
         elif alone and searched:
@@ -364,9 +352,6 @@ def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
 
 
 # --- Markers where they are expected: no search, only verification ----
-# Sides are fitted at the predicted corners, and every cell is read through the result's
-# homography: a strict check (all cells right, none nearly wrong) at a tenth of the price of
-# a search.
 
 
 _LEAST_CELL_PX = 2.5  # for lines

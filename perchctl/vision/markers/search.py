@@ -11,7 +11,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import mean_side_px, nested, within
@@ -19,7 +18,7 @@ from perchctl.vision.markers.detector import (
     MIRROR_INDEX,
     OPENCV_THRESHOLDS,
     QUICK_THRESHOLDS,
-    DetectorSetup,
+    Picture,
     Thresholds,
     make_marker_decoder,
 )
@@ -54,9 +53,8 @@ class Found:
 
 
 def search(
-    image: NDArray[np.uint8],
+    picture: Picture,
     expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
     look: Look = "all",
     own: TargetSelector | None = None,
 ) -> Found:
@@ -64,43 +62,38 @@ def search(
     one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
     half the size first: all that may be whole in the picture is enough. `own` chooses among several
     where none is expected."""
-    whole = _whole(image)
+    setup, shape = picture.setup, picture.image.shape
+    whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.by_lines and expected and look != "sharp":
-        quickly = search_halved(image, expected, setup, own)
+        quickly = search_halved(picture, expected, own)
         if quickly is not None:
             return quickly
-        window = search_window(expected, setup.ratio, image.shape) or whole
+        window = search_window(expected, setup.ratio, shape) or whole
         found = Found()
         if len(expected) == 2:
-            found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own)
+            found = _pass(picture, window, expected, QUICK_THRESHOLDS, own)
         if len(found.corners_px) < 2 and window != whole:
-            found = _pass(image, window, expected, setup, OPENCV_THRESHOLDS, own)
+            found = _pass(picture, window, expected, OPENCV_THRESHOLDS, own)
         if len(found.corners_px) >= (2 if window == whole else 1) or (
             look in ("near", "window") and window != whole
         ):
             return found
-    return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS, own)
+    return _pass(picture, whole, expected, OPENCV_THRESHOLDS, own)
 
 
 def search_halved(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    own: TargetSelector | None = None,
+    picture: Picture, expected: Mapping[MarkerName, Array], own: TargetSelector | None = None
 ) -> Found | None:
     """Search the window at half the size: a millisecond. None where that did not show all that
     should be whole in the picture, or where that is too small for it."""
-    in_view = [quad for quad in expected.values() if within(quad, image.shape)]
+    shape = picture.image.shape
+    in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
         return None
-    window = search_window(expected, setup.ratio, image.shape) or _whole(image)
-    found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own, halved=True)
+    window = search_window(expected, picture.setup.ratio, shape)
+    window = window or (slice(0, shape[0]), slice(0, shape[1]))
+    found = _pass(picture, window, expected, QUICK_THRESHOLDS, own, halved=True)
     return found if len(found.corners_px) >= len(in_view) else None
-
-
-def _whole(image: NDArray[np.uint8]) -> Window:
-    """Return the whole picture as a window."""
-    return slice(0, image.shape[0]), slice(0, image.shape[1])
 
 
 def search_window(
@@ -131,17 +124,16 @@ def search_window(
 
 
 def _pass(
-    image: NDArray[np.uint8],
+    picture: Picture,
     window: Window,
     expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
     thresholds: Thresholds,
     own: TargetSelector | None,
     halved: bool = False,
 ) -> Found:
     """Return what one pass of OpenCV's detector over the window gives, or over that at half its
     size."""
-    part = image[window]
+    setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)

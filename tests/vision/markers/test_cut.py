@@ -172,7 +172,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     found = fitted(image, _pose("line"), outline, 0.0 * outline.cell, plain)
     assert found.shown == found.in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
-    assert cut_markers(image, expected, SETUP.patterns, plain) == {}
+    assert cut_markers(Picture(image, None, SETUP, plain), expected) == {}
 
 
 @pytest.mark.parametrize("name", ["height", "width"])
@@ -197,12 +197,12 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     image, mask = gear(picture("height"))
     true = corners("small", BESIDE_HEIGHT)
     expected = both(BESIDE_HEIGHT, 10.0)
-    assert cut_markers(image, expected, SETUP.patterns, CAMERA) == {}
+    assert cut_markers(Picture(image, None, SETUP, CAMERA), expected) == {}
     outline = outline_of(SETUP.patterns["large"].drawing)
     own = mask.astype(np.uint8)
     fit = fitted(image, _pose("height"), outline, 0.0 * outline.cell, CAMERA, own)
     assert fit.shown == fit.in_view
-    found = cut_markers(image, expected, SETUP.patterns, CAMERA, mask)["small"]
+    found = cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
 
@@ -235,14 +235,14 @@ def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
     found = fitted(image, _pose("corner"), outline, 0.0 * outline.cell, CAMERA)
     assert found.small == 0
-    assert cut_markers(image, both(POSES["corner"]), SETUP.patterns, CAMERA) == {}
+    assert cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
 
 
 def test_a_prediction_may_be_off_in_range() -> None:
     rvec, tvec = BESIDE_HEIGHT
     for growth in (0.93, 1.07):
         expected = both((rvec, tvec * (1.0, 1.0, growth)))
-        assert "small" in cut_markers(picture("height"), expected, SETUP.patterns, CAMERA)
+        assert "small" in cut_markers(Picture(picture("height"), None, SETUP, CAMERA), expected)
 
 
 def test_two_fields_of_it_are_surer_than_one() -> None:

@@ -135,7 +135,7 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     """Both markers decoded, but the large one does not look as it should."""
     pose = cut(0.03, 0)
     image = render(*pose, noise=2.0)
-    assert set(search(image, {}, SETUP).corners_px) == {"large", "small"}
+    assert set(search(Picture(image, None, SETUP, CAMERA), {}).corners_px) == {"large", "small"}
     large = MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150)
     other = make_aruco_detector(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
     setup = replace(SETUP, patterns={**SETUP.patterns, "large": other})

@@ -20,6 +20,7 @@ from perchctl.vision.markers.blurred import (
     verified,
 )
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.pattern import Drawing, drawing_of
 from perchctl.vision.markers.photometric_fit import (
     Alignment,
@@ -234,7 +235,7 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
     image, true = blurry(26.0, 3.0, seed)
     ids = ARUCO.detectMarkers(image)[1]
     assert ids is None or 997 not in ids
-    still = hidden_in_blur(image, SETUP, CAMERA)
+    still = hidden_in_blur(Picture(image, None, SETUP, CAMERA))
     assert np.abs(still["large"].corners_px - true).max() < 0.5
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
@@ -244,7 +245,7 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
 def test_in_blur_the_target_is_found_beside_where_it_is_expected(seed: int) -> None:
     image, true = blurry(24.0, 3.0, seed)
     way = np.random.default_rng(seed).uniform(-8.0, 8.0, 2)
-    seen = expected_in_blur(image, {"large": true + way}, SETUP.patterns, CAMERA)
+    seen = expected_in_blur(Picture(image, None, SETUP, CAMERA), {"large": true + way})
     assert np.abs(seen["large"].corners_px - true).max() < 0.5
     before = Detections(0, 0.0, Detection("large", true + way, 0.1, True))
     found = detect_markers(frame(image, 1), before, SETUP, CAMERA)
@@ -262,5 +263,5 @@ def test_in_blur_nothing_is_taken_for_the_target() -> None:
             image[y : y + side, x : x + side] = 30
             image[y + side // 5 : y + 4 * side // 5, x + side // 5 : x + 4 * side // 5] = 210
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
-        assert hidden_in_blur(image, SETUP, CAMERA) == {}
-        assert expected_in_blur(image, expected, SETUP.patterns, CAMERA) == {}
+        assert hidden_in_blur(Picture(image, None, SETUP, CAMERA)) == {}
+        assert expected_in_blur(Picture(image, None, SETUP, CAMERA), expected) == {}
