@@ -88,12 +88,10 @@ def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
 
 
 # --- What a flight tells about the latency and the mounting -----------
-# The target stands still in the world. Where the pictures are later than the profile says by d,
-# it is placed as the vehicle was d earlier: beside its place by d times the speed at which the
-# vehicle's motion and turning sweep the line of sight. Where the camera is turned from what the
-# profile says, it is placed beside by the turn times the way to it. So the place of the target in
-# the estimate's world, frame by frame, is linear in the delay and the turn, with what the vehicle
-# did as known factors, and one least squares over a flight gives both.
+# Where the pictures are later than the profile says by d, the target is placed beside its place by
+# d times the speed at which the vehicle's motion and turning sweep the line of sight; where the
+# camera is turned, by the turn times the way to it. So its place in the estimate's world is linear
+# in the delay and the turn, and one least squares over a flight gives both.
 #
 # The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
 # each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors

@@ -157,10 +157,9 @@ def _usable(
 
 
 # --- Corners of a rolling shutter at one moment -----------------------
-# The rows of such a picture are exposed one after the other within the read-out time, and what
-# moves is sheared, stretched or squeezed: at 20 ms and 0.3 m/s by as much as the target moves in
-# a few milliseconds. A frame's time is its middle row's. Each corner is moved back along
-# its own motion in the picture, by the time that its row was exposed later.
+# Its rows are exposed one after the other within the read-out time, and a frame's time is its
+# middle row's: each corner is moved back along its own motion, by the time that its row was
+# exposed later.
 
 
 UNKNOWN_READOUT_S = 0.012

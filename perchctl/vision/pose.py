@@ -444,13 +444,11 @@ def weight_with(curl: Array) -> Array:
 
 
 # --- Corners as a pose is solved from them: where they are, and what each is worth ---
-# Corners that are intersections of fitted lines do not err on their own: a line is off
-# by an offset and a tilt, and moves the corners at both of its ends. Its two ends have
-# errors across it of variance s^2 with a correlation of -1/2, so half the line's offset
-# is known to s/2 and its tilt to s sqrt(3)/2. `whitening` turns corner errors into these
-# independent ones. A shift of all edges by the same number of pixels (clipped white, ink)
-# is left out of the fit, where small markers' own faults would feed it, but not out of the
-# covariance.
+# A fitted line is off by an offset and a tilt, and moves the corners at both of its ends. These
+# have errors across it of variance s^2 with a correlation of -1/2, so half the line's offset is
+# known to s/2 and its tilt to s sqrt(3)/2: `whitening` turns corner errors into these independent
+# ones. A shift that all edges share (clipped white, ink) is left out of the fit, where small
+# markers' own faults would feed it, but not out of the covariance.
 
 
 _EACH = np.eye(8)

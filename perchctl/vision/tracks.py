@@ -125,25 +125,17 @@ def _verdict(
 
 
 # --- Whether a pose is the target's that was locked on ----------------
-# Something else can look like the target: one more of it, a smaller one, or one of its markers,
-# lone and of another size. In a picture it cannot be told from the target, but the target does not
-# jump. A pose that contradicts the lock by more than noise, motion and drift explain is a
-# stranger's and feeds no filter; the planner then sees a target that is not measured. The stranger
-# is watched: as long as it goes on it stays one, however vague the lock becomes meanwhile.
+# Another target, or a marker of another size, cannot be told from the target in a picture, but the
+# target does not jump. A pose that contradicts the lock by more than noise, motion and drift
+# explain is a stranger's and feeds no filter. It is watched, and stays one however vague the lock
+# becomes.
 #
-# The lock goes over to a stranger explicitly: to one that rests on both markers, at once if the
-# lock never did, or, if it is as far away as the target was, after `REACQUIRE_S` in which the
-# target was not seen, though its place is in the picture; and to any that was seen more often than
-# a lock that is hardly begun. A lock that nothing has confirmed for `FORGET_S` is forgotten.
+# The lock goes over to a stranger that rests on both markers: at once if the lock never did, or, if
+# it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
+# picture; and to any that was seen more often than a lock that is hardly begun.
 #
-# One pose a picture is judged. While something is seen where the lock is, be it a lone marker of
-# the size that is expected, the search (`perchctl.vision.markers.search.choose`) hands on that, and
-# no whole target beside it: with or without `detector.window`. So a lock on a lone look-alike goes
-# over to a whole target once the look-alike is out of sight, and not before.
-#
-# Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
-# a pose that goes on from the last one relative to the vehicle, though not in the world, is the
-# target's, too.
+# While something is seen where the lock is, the search hands on that and no whole target beside it.
+# Where the state estimate jumps, the target seems to jump in the world, but not in the picture.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
@@ -363,11 +355,10 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
 
 
 # --- Where the target should be in the next picture -------------------
-# The target stands still, so the vehicle's own motion predicts its place in the picture. The state
-# estimate gives that motion twice: as the difference of two positions, and as speed times time.
-# Positions step by millimetres with each fix from outside, which are many pixels near the target;
-# the noise of a speed adds up. Which is better depends on what the estimate rests on. It is learned
-# from the target's own pictures: each prediction is weighted by how little it was off of late.
+# The state estimate gives the vehicle's motion twice: as the difference of two positions, which
+# step by millimetres with each fix from outside, and as speed times time, whose noise adds up.
+# Which is better is learned from the target's own pictures: each is weighted by how little it was
+# off of late.
 
 
 _FORGOTTEN = 0.1  # of what was learned, with each picture

@@ -130,9 +130,8 @@ def _distance(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> int:
 
 
 # --- The vehicle's own gear in the picture: where it is, nothing is to be seen of a target ---
-# Legs and guards do not move in the picture, so what they cover is known (`camera.mask`). There the
-# picture is filled with what is around it, so that no threshold joins the gear to a marker's rim,
-# and no side or cell is measured.
+# The picture is filled there with what is around it, so that no threshold joins the gear to a
+# marker's rim, and no side or cell is measured.
 
 
 Covered = NDArray[np.bool_]

@@ -42,9 +42,6 @@ from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
 
 # --- Grey profiles across the sides of markers ------------------------
-# They are sampled along each side's image through the lens, so that distortion does not
-# bend the side away from the samples. All rows (a row is one side of one marker) run
-# through the same arrays.
 
 
 PROFILES = 24  # across each side
@@ -120,7 +117,7 @@ def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Arra
     return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
 
 
-# --- Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected ---
+# --- Lines fitted to a marker's sides, intersected --------------------
 
 
 MIN_LINE_SIGMA_PX = 0.015
@@ -546,12 +543,9 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
-# The edge in each profile is the gradient's windowed centroid; this is repeated with the
-# window centred on the side's own line (narrow, hence calm in noise). A blur that is equal
-# on both flanks of an edge does not move its centroid.
-#
-# All that a row (one side of one marker) shares is (rows,), what differs from profile to
-# profile (rows, n). Single precision suffices.
+# The edge in each profile is the gradient's windowed centroid, at first by a wide window, then by
+# one that is centred on the side's own line: narrow, hence calm in noise. All that a row (one side
+# of one marker) shares is (rows,), what differs from profile to profile (rows, n).
 
 
 def _single(value: float) -> Floats:

@@ -418,8 +418,6 @@ def gram(rows: Array) -> Array:
 
 
 # --- A marker's drawing at the nodes of a grid, blurred, with all that follows from that alone ---
-# From picture to picture a marker's size and blur hardly change, so blur comes in steps, finer than
-# anything that a fit can tell, and what belongs to one is kept.
 
 
 _STEP = 0.02  # of the blur
