@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision import (
-    CameraModel,
     Frame,
     PictureKind,
     Pipeline,
@@ -23,13 +19,12 @@ from perchctl.vision import (
     pictures,
     step,
 )
-from perchctl.vision.fields import combing, field_picture, is_combed, separate_fields
+from perchctl.vision.fields import field_picture, is_combed, separate_fields
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
-SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
 PAL_S = 0.04
 
 Build = Callable[..., Pipeline]
@@ -81,16 +76,6 @@ def test_noise_and_snow_and_nothing_are_not_combed() -> None:
         assert not is_combed(image)
 
 
-@pytest.mark.parametrize("folder", ["scenes", "hard/progressive", "hard/true", "hard/false"])
-def test_no_shared_whole_picture_is_taken_for_two(folder: str) -> None:
-    if not (SHARED / folder).is_dir():
-        pytest.skip(f"the shared pictures are absent ({SHARED / folder})")
-    files = [f for f in (SHARED / folder).rglob("*") if f.suffix in (".jpg", ".png")]
-    measured = {f.name: combing(np.asarray(cv2.imread(str(f), 0), np.uint8)) for f in files}
-    assert len(measured) >= 16
-    assert max(measured.values()) < 1.0  # 1.4 would be combed
-
-
 # --- Order and time ----------------------------------------------------------------------------
 
 
@@ -127,16 +112,6 @@ def test_a_stream_of_whole_pictures_is_looked_at_in_every_third() -> None:
     found = kinds(FieldState(), [replace(f, t_s=k * PAL_S) for k, f in enumerate(stream)])
     assert [len(f) == 1 and f[0] for f in found[:4]] == ["whole", "whole", "whole", "woven"]
     assert ("whole",) not in found[3:]
-
-
-def test_a_standing_picture_says_nothing_of_the_order() -> None:
-    _, (frame,) = woven_frames(1)
-    state = FieldState()
-    for k in range(8):
-        again = replace(frame, t_s=frame.t_s + k * PAL_S)
-        state, parts = separate_fields(state, again)
-        assert [part.fields for part in parts] == ["woven"]
-    assert abs(state.votes) < 0.1
 
 
 def test_a_changed_order_is_found() -> None:
@@ -227,31 +202,3 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
             squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
     assert 0.2 < np.mean(squares["claimed"]) < 2.0
     assert np.mean(squares["as elsewhere"]) > 3.0
-
-
-# --- Shared pictures ---------------------------------------------------------------------------
-
-
-def shared_errors(folder: str, build: Build) -> Array:
-    hard = SHARED / "hard"
-    if not hard.is_dir():
-        pytest.skip(f"the shared pictures are absent ({hard})")
-    storage = cv2.FileStorage(str(hard / "camera.yaml"), cv2.FILE_STORAGE_READ)
-    K, dist = (storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
-    setup = build(camera=CameraModel((640, 480), K, dist.ravel()))
-    errors = []
-    for name, truth in json.loads((hard / "truth.json").read_text()).items():
-        if not name.startswith(folder):
-            continue
-        image = np.asarray(cv2.imread(str(hard / folder / name), cv2.IMREAD_GRAYSCALE), np.uint8)
-        _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
-        errors.append((output.target.e_m - np.array(truth["t"])) * 1000.0)
-    assert len(errors) == 16
-    return np.sqrt(np.mean(np.square(errors), axis=0))
-
-
-def test_shared_woven_pictures_are_as_good_as_whole_ones(build: Build) -> None:
-    woven, whole = (shared_errors(folder, build) for folder in ("weave", "progressive"))
-    assert whole[2] < 0.02  # as their README has it
-    assert woven[2] < 2.0 * 0.02
-    assert woven[:2].max() < 0.03

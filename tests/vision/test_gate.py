@@ -129,19 +129,15 @@ def test_no_jump_locks_the_pipeline_out_for_ever(watch: Watch) -> None:
     assert any(measured(watch.show(int(0.5 * HZ), **HALF)))
 
 
-def test_what_was_unseen_for_long_may_be_anywhere_for_a_camera_in_a_hand(build: Build) -> None:
-    watch = Watch(build(), in_world=False)
+@pytest.mark.parametrize(("in_world", "unseen_s"), [(False, 1.2), (True, 4.0)])
+def test_what_was_unseen_for_long_is_where_it_was_in_flight_but_not_in_a_hand(
+    build: Build, in_world: bool, unseen_s: float
+) -> None:
+    watch = Watch(build(), in_world=in_world)
     watch.show(LOCKED)
-    watch.show(int(1.2 * HZ), markers=())
-    assert all(measured(watch.show(3, **HALF)))
-
-
-def test_what_was_unseen_for_long_is_where_it_was_in_flight(build: Build) -> None:
-    watch = Watch(build(), in_world=True)
-    watch.show(LOCKED)
-    watch.show(int(4.0 * HZ), markers=())
-    assert not any(measured(watch.show(10, **HALF)))
-    assert all(measured(watch.show(3)))
+    watch.show(int(unseen_s * HZ), markers=())
+    assert any(measured(watch.show(10, **HALF))) is not in_world
+    assert not in_world or all(measured(watch.show(3)))
 
 
 SMALL_JUMPS_M = [(0.0, 0.0, 0.08), (0.12, 0.0, 0.0)]

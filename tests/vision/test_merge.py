@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array, wrap_rad, yaw_of
-from perchctl.profile import MergeConfig, Profile, WeightsConfig
+from perchctl.profile import Profile, WeightsConfig
 from perchctl.vision import (
     MarkerPose,
     PipelineState,
@@ -22,11 +22,8 @@ from perchctl.vision import (
 from perchctl.vision.merge import (
     disagree,
     merge_pair,
-    stage_by_range,
-    stage_of,
     weight_matrix,
 )
-from perchctl.vision.types import Stage
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -81,29 +78,6 @@ def test_yaw_is_merged_on_the_circle(w: WeightsConfig, a: float, gap: float) -> 
     large, small = np.array([0, 0, 0, a]), np.array([0, 0, 0, wrap_rad(a + gap)])
     merged = merge_pair(large, small, w)[3]
     assert abs(wrap_rad(merged - (a + (1.0 - w.yaw) * gap))) < 1e-9
-
-
-SEEN = {
-    (False, False): Stage.NONE,
-    (True, False): Stage.LARGE,
-    (False, True): Stage.SMALL,
-    (True, True): Stage.BOTH,
-}
-
-
-@pytest.mark.parametrize(
-    ("z_m", "stage"),
-    [
-        *((z_m, Stage.LARGE) for z_m in (2.0, 0.26)),
-        *((z_m, Stage.BOTH) for z_m in (0.25, 0.13)),
-        *((z_m, Stage.SMALL) for z_m in (0.12, 0.05)),
-    ],
-)
-def test_the_stage_is_what_is_seen_or_what_the_range_asks_for(z_m: float, stage: Stage) -> None:
-    """Equations 4, 6 and 11."""
-    assert stage_by_range(z_m, MergeConfig(stages="range")) is stage
-    for (large, small), seen in SEEN.items():
-        assert stage_of(large, small) is seen
 
 
 def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:

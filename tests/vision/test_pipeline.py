@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -334,9 +335,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
     for k in range(frames):
         attitude, pose = flight.at(k * FRAME_S)
         if not told:
-            attitude = Attitude(
-                attitude.t_s, attitude.roll_rad, attitude.pitch_rad, 0.3, attitude.position_m
-            )
+            attitude = replace(attitude, velocity_mps=None)
         if sight is not None:
             expected, _ = expected_corners(sight, pose.t_s, attitude, SETUP)
             points = SETUP.corners_m["large"]
@@ -356,14 +355,6 @@ def test_places_that_step_are_overruled_by_speeds(seed: int) -> None:
     both = list(errors_px(Flight(seed, 2e-3, 5e-3), 90))[LEARNED:]
     places = list(errors_px(Flight(seed, 2e-3, 5e-3), 90, told=False))[LEARNED:]
     assert rms(both) < 0.4 * rms(places)
-
-
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(st.integers(0, 2**31))
-def test_speeds_that_are_wrong_are_overruled_by_places(seed: int) -> None:
-    both = list(errors_px(Flight(seed, 1e-4, 0.15), 90))[LEARNED:]
-    places = list(errors_px(Flight(seed, 1e-4, 0.15), 90, told=False))[LEARNED:]
-    assert rms(both) < 1.5 * rms(places)
 
 
 def test_a_jump_of_the_estimates_world_spoils_one_picture() -> None:

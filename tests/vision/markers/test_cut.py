@@ -31,7 +31,7 @@ from perchctl.vision.markers.cut import (
     is_cut,
     outline_of,
 )
-from perchctl.vision.markers.detect import between, detect_markers
+from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.types import Detection, Detections, MarkerName
@@ -243,14 +243,6 @@ def test_a_prediction_may_be_off_in_range() -> None:
     for growth in (0.93, 1.07):
         expected = both((rvec, tvec * (1.0, 1.0, growth)))
         assert "small" in cut_markers(Picture(picture("height"), None, SETUP, CAMERA), expected)
-
-
-def test_two_fields_of_it_are_surer_than_one() -> None:
-    a = look("height")
-    middle = between(a, replace(a, small=replace(a.small, corners_px=a.small.corners_px + 1.0)))
-    assert middle.small.cov_px2 is not None
-    assert np.allclose(middle.small.corners_px, a.small.corners_px + 0.5)
-    assert np.allclose(middle.small.cov_px2, a.small.cov_px2 / 2.0)
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])

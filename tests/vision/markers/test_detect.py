@@ -83,12 +83,6 @@ def test_foreign_markers_are_not_taken() -> None:
     assert found.small is None
 
 
-def grown(grey: np.ndarray, clipped: bool) -> np.ndarray:
-    """White that has grown over black: by a tone curve, or by all that is lost above white."""
-    tone = grey * 1.7 if clipped else 240.0 * (grey / 205.0) ** 0.5
-    return np.clip(tone, 0, 255).astype(np.uint8)
-
-
 def test_a_marker_like_its_own_mirror_image_gives_no_hint() -> None:
     target = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=0, side_m=0.025))
     usual = make_aruco_detector(DetectorConfig(), TargetConfig())
