@@ -47,8 +47,7 @@ _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
     """Make what `cut_markers` keeps of a target and a camera, before it is in a hurry."""
-    drawing = patterns["large"].drawing
-    outline_of(drawing), texture_of(drawing), lattice_of(camera)
+    _outline(patterns), texture_of(patterns["large"].drawing), lattice_of(camera)
 
 
 def is_cut(
@@ -56,18 +55,14 @@ def is_cut(
 ) -> bool:
     """Return True if none of the markers expected at corners (4, 2) px is wholly in the picture and
     free of the vehicle's gear, or may not be if the prediction is a little off."""
-    h, w = shape[:2]
-    inner = (h - 2 * _EDGE_PX, w - 2 * _EDGE_PX)
-    whole = [c for c in expected.values() if within(c - _EDGE_PX, inner)]
+    whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(hides(hidden, c) for c in whole)
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
     """Return True if one of the markers expected at corners (4, 2) px is wholly in the picture, or
     may be if the prediction is a little off: a search finds no others."""
-    h, w = shape[:2]
-    outer = (h + 2 * _EDGE_PX, w + 2 * _EDGE_PX)
-    return any(within(corners + _EDGE_PX, outer) for corners in expected.values())
+    return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
 
 
 def cut_markers(
@@ -84,12 +79,11 @@ def cut_markers(
     if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_CELL_PX:
         return {}
     covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
-    view = overview_of(image, camera, covered)
-    outline, texture = outline_of(drawing), texture_of(drawing)
+    view, texture = overview_of(image, camera, covered), texture_of(drawing)
     near = _moved_near(start, texture, view)
     if near is None:
         return {}
-    found = fitted(image, near, outline, _print_sigma(patterns), camera, covered)
+    found = fitted(image, near, _outline(patterns), camera, covered)
     if found is None or not _trusted(found):
         return {}
     like, gain = looks_like(found.pose.H, texture, view)
@@ -107,11 +101,10 @@ def shows_enough_of_target(
     marker's axes (3, 3) and centre (3,) so in the camera."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
-    drawing = patterns["large"].drawing
-    found = foreseen(pose, outline_of(drawing), _print_sigma(patterns), camera)
+    found = foreseen(pose, _outline(patterns), camera)
     if found is None or not _trusted(found):
         return False
-    half = drawing.ratio if _stands_for(found) == "small" else 1.0
+    half = patterns["large"].drawing.ratio if _stands_for(found) == "small" else 1.0
     return _corners(found, half, camera) is not None
 
 
@@ -121,11 +114,10 @@ def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
     return make_aruco_detector(DetectorConfig(), target).patterns
 
 
-def _print_sigma(patterns: Mapping[MarkerName, Pattern]) -> Array:
-    """Return how far the line at each place of the outline may be printed off its place, (n,)."""
-    outline = outline_of(patterns["large"].drawing)
-    small, large = (patterns[name].rim.tolerance for name in ("small", "large"))
-    return np.where(outline.small, small, large) * outline.cell
+def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
+    """Return the outline of both markers, of which each edge may be printed off its place."""
+    large, small = patterns["large"], patterns["small"]
+    return outline_of(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
 
 def _stands_for(found: Visible) -> MarkerName:
@@ -366,12 +358,13 @@ _TEXELS = 320
 @dataclass(frozen=True, eq=False)
 class Outline:
     """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each
-    lies on (n,), since a line is printed as a whole; the width of the cells beside it (n,); and
-    whether it is the small marker's (n,)."""
+    lies on (n,), which is printed as a whole, and how far that may be off its place (n,); the width
+    of the cells beside it (n,); and whether it is the small marker's (n,)."""
 
     at: Array
     normal: Array
     line: NDArray[np.intp]
+    print_sigma: Array
     cell: Array
     small: NDArray[np.bool_]
 
@@ -382,8 +375,9 @@ pixels."""
 
 
 @lru_cache(maxsize=8)
-def outline_of(drawing: Drawing) -> Outline:
-    """Return the outline of a large marker with the small one in its centre."""
+def outline_of(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
+    """Return the outline of a large marker with the small one in its centre, with the tolerance of
+    the place of each one's edges, in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -396,12 +390,15 @@ def outline_of(drawing: Drawing) -> Outline:
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
     places = np.array([len(each) for each in at])
+    cell = np.repeat(cells, places)
+    small = np.repeat(np.arange(len(edges)) >= large, places)
     return Outline(
         at=np.concatenate(at),
         normal=np.repeat(normals, places, axis=0),
         line=np.repeat([numbers[name] for name in names], places),
-        cell=np.repeat(cells, places),
-        small=np.repeat(np.arange(len(edges)) >= large, places),
+        print_sigma=np.where(small, small_tolerance, large_tolerance) * cell,
+        cell=cell,
+        small=small,
     )
 
 
@@ -455,7 +452,7 @@ _TAILS = 1.3  # what robust weights take away from a residual's square
 _LENS_PX = 0.02  # by which a whole line may be off, of lens and light
 _TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
 _SHIFT_PX = 0.15  # by which white may have grown over black
-_PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, _PLACE, _PLACE, _PLACE]) ** -2.0
+_PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT_PX]) ** -2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,8 +485,8 @@ class Visible:
 @dataclass(frozen=True, eq=False)
 class _Places:
     """Of an outline, in the picture: at (n, 2) px and unit normal (n, 2) from black to white,
-    changes J (n, 6) along it with turn and move, px for a unit across (n,), and which of the
-    outline's they are (n,)."""
+    changes J (n, 7) along it with turn, move and the shift of all edges (white over black), px for
+    a unit across (n,), and which of the outline's they are (n,)."""
 
     at: Array
     normal: Array
@@ -498,32 +495,21 @@ class _Places:
     index: NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class _Round:
-    """The step of all unknowns (7,), the inverse of their normal matrix, the places' weights
-    (n,) and changes J (n, 7), and the variance of one place, px^2."""
-
-    step: Array
-    inverse: Array
-    weight: Array
-    J: Array
-    variance: float
+_Round = tuple[Array, Array, Array, float]
+"""The step of all unknowns (7,), the inverse of their normal matrix, the places' weights (n,), and
+the variance of one place, px^2."""
 
 
 def fitted(
     image: NDArray[np.uint8],
     start: RigidPose,
     outline: Outline,
-    print_sigma: Array,
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> Visible | None:
-    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off.
-
-    `print_sigma` (n,) is how far each place's line may be printed off its place. None where too few
-    edges are in view, or the fit breaks down.
-    """
-    pose, total, found, moved_px = start, np.zeros(6), None, math.inf
+    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off. None
+    where too few edges are in view, or the fit breaks down."""
+    pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
         if len(places.index) < _LEAST_PLACES:
@@ -535,26 +521,26 @@ def fitted(
         found = _solved(places, offset_px, shows, total)
         if found is None:
             return None
-        turn = np.asarray(cv2.Rodrigues(found.step[:3])[0], dtype=np.float64)
-        pose, total = RigidPose(turn @ pose.R, pose.t + found.step[3:6]), total + found.step[:6]
-        moved_px = float(np.abs(places.J @ found.step[:6]).max())
+        step = found[0][:6]
+        turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
+        pose = RigidPose(turn @ pose.R, pose.t + step[3:])
+        total[:6] += step
+        moved_px = float(np.abs(places.J[:, :6] @ step).max())
         if moved_px < _STILL_PX:
             break
     if found is None or moved_px > _SETTLED_PX or pose.t[2] <= 0.0:
         return None
-    return _visible(pose, found, places, outline, print_sigma)
+    return _visible(pose, found, places, outline)
 
 
-def foreseen(
-    pose: RigidPose, outline: Outline, print_sigma: Array, camera: CameraModel
-) -> Visible | None:
+def foreseen(pose: RigidPose, outline: Outline, camera: CameraModel) -> Visible | None:
     """Return what `fitted` would make of a picture without a flaw, taken in that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
         return None
-    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(6))
-    return None if found is None else _visible(pose, found, places, outline, print_sigma)
+    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
+    return None if found is None else _visible(pose, found, places, outline)
 
 
 def _in_view(
@@ -605,13 +591,8 @@ def _in_view(
         for way in (-1.0, -0.5, 0.0, 0.5, 1.0):
             x_px, y_px = np.rint(at + way * reach_px * normal).astype(np.intp).T
             free &= mask[y_px, x_px] == 0
-    return _Places(
-        at=at[free],
-        normal=normal[free],
-        J=np.concatenate([turn, move], axis=1)[free],
-        px=np.abs(px)[free],
-        index=near[free],
-    )
+    J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
+    return _Places(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
 
 def _offsets(
@@ -635,13 +616,9 @@ def _offsets(
 def _solved(
     places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
 ) -> _Round | None:
-    """Return a robust step of turn, move and the common shift of edges (white over black)."""
-    J = np.concatenate([places.J, -np.ones((len(offset_px), 1))], axis=1)
-    prior = np.append(_PRIOR, _SHIFT_PX**-2.0)
-    pull = np.append(-_PRIOR * total, 0.0)
-    weight = shows.astype(np.float64)
-    variance = 1.0
-    step = np.zeros(7)
+    """Return a robust step of turn, move and shift, after those before, in `total` (7,)."""
+    J, weight = places.J, shows.astype(np.float64)
+    variance, step = 1.0, np.zeros(7)
     for _ in range(4):
         error = offset_px - J @ step
         size = np.abs(error)
@@ -651,25 +628,22 @@ def _solved(
         if mass < 0.5 * _LEAST_PLACES:
             return None
         variance = max(_TAILS * float(weight @ error**2) / mass, 1e-3)
-        N = (J * weight[:, None]).T @ J / variance + np.diag(prior)
-        inverse = np.linalg.inv(N)
-        step = inverse @ (J.T @ (weight * offset_px) / variance + pull)
-    return _Round(step, inverse, weight, J, variance)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(_PRIOR)
+        inverse = np.asarray(np.linalg.inv(N), np.float64)
+        step = inverse @ (J.T @ (weight * offset_px) / variance - _PRIOR * total)
+    return step, inverse, weight, variance
 
 
-def _visible(
-    pose: RigidPose, found: _Round, places: _Places, outline: Outline, print_sigma: Array
-) -> Visible:
+def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> Visible:
     """Return the pose with its covariance: of each place's own noise, of what moves a line as a
     whole, and of the prediction."""
-    J, w, variance = found.J, found.weight, found.variance
+    J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
-    common_px = np.hypot(print_sigma[places.index] * places.px, _LENS_PX)
+    common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
-    prior = np.diag(np.append(_PRIOR, _SHIFT_PX**-2.0))
-    cov = found.inverse @ (middle / variance**2 + prior) @ found.inverse
+    cov = inverse @ (middle / variance**2 + np.diag(_PRIOR)) @ inverse
     shown = w > 0.0
     return Visible(
         pose=pose,

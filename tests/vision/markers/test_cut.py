@@ -167,9 +167,9 @@ def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> Non
 def test_what_leaves_a_direction_open_is_refused() -> None:
     """With a lens through which its corners could be told."""
     plain = replace(CAMERA, dist=np.zeros(5))
-    outline = outline_of(SETUP.patterns["large"].drawing)
+    outline = outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
     image = render(*LINE, plain, noise=4.0, blur_px=1.0)
-    found = fitted(image, _pose("line"), outline, 0.0 * outline.cell, plain)
+    found = fitted(image, _pose("line"), outline, plain)
     assert found.shown == found.in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert cut_markers(Picture(image, None, SETUP, plain), expected) == {}
@@ -198,9 +198,9 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     true = corners("small", BESIDE_HEIGHT)
     expected = both(BESIDE_HEIGHT, 10.0)
     assert cut_markers(Picture(image, None, SETUP, CAMERA), expected) == {}
-    outline = outline_of(SETUP.patterns["large"].drawing)
+    outline = outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
-    fit = fitted(image, _pose("height"), outline, 0.0 * outline.cell, CAMERA, own)
+    fit = fitted(image, _pose("height"), outline, CAMERA, own)
     assert fit.shown == fit.in_view
     found = cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
@@ -230,10 +230,10 @@ def _pose(name: str) -> RigidPose:
 def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     """Of the large marker alone in view, and its far corners where the lens model has no
     inverse."""
-    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing)
+    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
     x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
-    found = fitted(image, _pose("corner"), outline, 0.0 * outline.cell, CAMERA)
+    found = fitted(image, _pose("corner"), outline, CAMERA)
     assert found.small == 0
     assert cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
 
