@@ -17,7 +17,6 @@ from perchctl.profile import MergeConfig, WeightsConfig
 from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
 from perchctl.vision.pose import PoseCandidate, PoseSetup, estimate_pose, level_rotation
 from perchctl.vision.types import (
-    MARKERS,
     Attitude,
     Detection,
     Detections,
@@ -46,11 +45,6 @@ class Merged:
     var_yaw_rad2: float
     unseen: int
     stage: Stage
-
-
-def track_names(config: MergeConfig) -> tuple[str, ...]:
-    """Return the names of the filters."""
-    return ("joint",) if config.method == "joint" else MARKERS
 
 
 def measure_markers(

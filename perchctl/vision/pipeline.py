@@ -21,8 +21,8 @@ from perchctl.vision.fields import classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
-from perchctl.vision.merge import Merged, measure_markers, merge_tracks, stage_of, track_names
+from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
+from perchctl.vision.merge import Merged, measure_markers, merge_tracks, stage_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
@@ -95,7 +95,6 @@ def make_pipeline(
         tracks=TrackSetup(
             level=make_filter(profile.kalman, in_world=False),
             world=make_filter(profile.kalman, in_world=True),
-            names=track_names(profile.merge),
             pose=pose,
             gate=profile.kalman.gate,
             own=own,
@@ -107,14 +106,14 @@ def make_pipeline(
 
 def _mask(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None
-) -> GearMask | None:
+) -> NDArray[np.bool_] | None:
     """Return what the vehicle's own gear covers; None without `camera.mask`. The file is of the
     camera's own pictures, which `camera.mirrored` has turned over since."""
     if profile.camera.mask is None:
         return None
     if covered is None:
         covered = read_mask(profile.camera.mask, camera.size_px)
-    return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
+    return covered[:, ::-1] if profile.camera.mirrored else covered
 
 
 def camera_profile(profile: Profile) -> Profile:

@@ -30,10 +30,6 @@ class OwnTargetPlace:
     within_m: float = math.inf
 
 
-NOWHERE = OwnTargetPlace()
-"""Nothing is known: the gear's axis decides."""
-
-
 @dataclass(frozen=True, eq=False)
 class TargetSelector:
     """How far aside a marker is, for a picture taken at `attitude`."""

@@ -23,7 +23,7 @@ from perchctl.vision.filter import (
 from perchctl.vision.lens import project
 from perchctl.vision.markers.cut import lattice_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import NOWHERE, OwnTargetPlace, measurement, refusal
+from perchctl.vision.target_selection import OwnTargetPlace, measurement, refusal
 from perchctl.vision.types import (
     Attitude,
     Lock,
@@ -39,15 +39,14 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in the level frame and in the world, the tracks' names,
-    whether a pose has to pass the gate, and where the own target is."""
+    """The filters' constants in the level frame and in the world, whether a pose has to pass the
+    gate, and where the own target is."""
 
     level: FilterSetup
     world: FilterSetup
-    names: tuple[str, ...]
     pose: PoseSetup
     gate: bool
-    own: OwnTargetPlace = NOWHERE
+    own: OwnTargetPlace
 
     def constants(self, in_world: bool) -> FilterSetup:
         """Return the filters' constants in the tracks' frame."""
@@ -96,7 +95,7 @@ def update_tracks(
     if not verdict.taken:
         measured, fed = replace(measured, fed={}), {}
     begun = {} if verdict.afresh else old
-    stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in setup.names}
+    stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in {**begun, **fed}}
     tracks = {n: track for n, track in stepped.items() if track is not None}
     if not setup.gate:
         return TrackedFrame(measured, tracks, verdict)

@@ -190,7 +190,14 @@ def aligned(
         or not verified(found, max_sigma)
         or (alone and not told_apart(found))
         or found.moved_px > max(reach * side_px, _MIN_REACH_PX)
-        or not _same_square(start_px, found.corners_px)
+    ):
+        return None
+    # A square is still one, of about the same size, and the same way round.
+    sides_px, areas = side_lengths_px(found.corners_px), [found.corners_px, start_px]
+    if (
+        sides_px.min() < _MIN_EVENNESS * sides_px.max()
+        or not _MIN_GROWTH < float(sides_px.mean()) / side_px < _MAX_GROWTH
+        or np.prod(doubled_area(np.stack(areas))) <= 0.0
     ):
         return None
     sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
@@ -219,15 +226,3 @@ def told_apart(found: Alignment) -> bool:
     """Return True if another codeword would look different, and this one is seen. Of 36 others that
     the gate before this one took for the marker, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA
-
-
-def _same_square(start_px: Array, corners_px: Array) -> bool:
-    """Return True if a square is still one, of about the same size, and the same way round."""
-    sides_px = side_lengths_px(corners_px)
-    growth = float(sides_px.mean()) / mean_side_px(start_px)
-    turn = float(doubled_area(corners_px[None])[0]) * float(doubled_area(start_px[None])[0])
-    return bool(
-        sides_px.min() >= _MIN_EVENNESS * sides_px.max()
-        and _MIN_GROWTH < growth < _MAX_GROWTH
-        and turn > 0.0
-    )

@@ -77,12 +77,6 @@ def mean_side_px(corners_px: Array) -> float:
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
-def shortest_side_px(corners_px: Array) -> float:
-    """Return the shortest side of one square (4, 2); NaN where a corner is."""
-    a, b, c, d = corners_px.tolist()
-    return min(math.dist(a, b), math.dist(b, c), math.dist(c, d), math.dist(d, a))
-
-
 def doubled_area(corners: Array) -> Array:
     """Return twice the area, positive for corners (m, 4, 2) that run clockwise as the picture is
     seen, (m,)."""

@@ -28,7 +28,6 @@ from perchctl.vision.markers.corners import (
     known_from,
     mean_side_px,
     refine_each,
-    shortest_side_px,
     side_lengths_px,
     with_missing_marker,
     within,
@@ -369,7 +368,7 @@ def follow(
         for name in MARKERS
         if name in expected
         and within(expected[name], image.shape, ROOM_PX)
-        and shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].rim.cells
+        and side_lengths_px(expected[name]).min() > _LEAST_CELL_PX * patterns[name].rim.cells
     ]
     if not names:
         return {}

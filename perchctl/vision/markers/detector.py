@@ -49,11 +49,11 @@ class DetectorSetup:
     patterns: dict[MarkerName, Pattern]
     ratio: float
     by_lines: bool
-    mask: GearMask | None = None
+    mask: Covered | None = None
 
 
 def make_aruco_detector(
-    config: DetectorConfig, target: TargetConfig, mask: GearMask | None = None
+    config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
 ) -> DetectorSetup:
     """Return dictionaries of just the target's ids, and how its markers look."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
@@ -142,26 +142,12 @@ _REDUCED, _SPREAD = 8, 2.0  # times smaller, and there the spread of what fills
 _TINY = 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class GearMask:
-    """Where the vehicle covers a picture (h, w), and where it has a part in one made of a
-    single field, whose missing rows are interpolated."""
-
-    whole: Covered
-    field: Covered
-
-
-def make_mask(covered: Covered) -> GearMask:
-    """Return the mask, from where the gear is in the picture (h, w)."""
-    rows = np.ones((_FIELD_ROWS, 1), np.uint8)
-    return GearMask(covered, cv2.dilate(covered.astype(np.uint8), rows) > 0)
-
-
-def hidden_in(frame: Frame, mask: GearMask | None) -> Covered | None:
-    """Return where a frame of one moment shows the vehicle."""
-    if mask is None:
-        return None
-    return mask.field if frame.fields in ("top", "bottom") else mask.whole
+def hidden_in(frame: Frame, mask: Covered | None) -> Covered | None:
+    """Return where a frame of one moment shows the vehicle, which covers `mask` (h, w) of a whole
+    picture: in one made of a single field, whose missing rows are interpolated, beside it too."""
+    if mask is None or frame.fields not in ("top", "bottom"):
+        return mask
+    return cv2.dilate(mask.astype(np.uint8), np.ones((_FIELD_ROWS, 1), np.uint8)) > 0
 
 
 def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:

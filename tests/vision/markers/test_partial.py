@@ -23,7 +23,6 @@ from perchctl.vision.markers.detector import (
     hidden_in,
     hides,
     make_aruco_detector,
-    make_mask,
 )
 from perchctl.vision.markers.partial import (
     KnownBy,
@@ -247,7 +246,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
     assert hides(covered, TRUE)
-    setup, found = replace(SETUP, mask=make_mask(covered)), []
+    setup, found = replace(SETUP, mask=covered), []
     for grey in (0, 120, 255):
         image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)
         before: Detections | None = None
@@ -262,14 +261,13 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
 
 def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
     covered = LEGS["corner"]
-    mask = make_mask(covered)
     image = np.where(covered, 0, 200).astype(np.uint8)
     for first_row, name in ((0, "top"), (1, "bottom")):
         field = field_picture(image, first_row)
-        hidden = hidden_in(Frame(0, 0.0, field, fields=name), mask)
+        hidden = hidden_in(Frame(0, 0.0, field, fields=name), covered)
         assert hidden is not None
         assert (field[~hidden] == 200).all()
-    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), mask)
+    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), covered)
     assert whole is not None
     assert np.array_equal(whole, covered)
 
@@ -292,9 +290,9 @@ def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
     drawn = np.zeros((H, W), np.uint8)
     drawn[:40, :70] = 255
     mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector.mask
-    assert np.array_equal(mask.whole, drawn > 0)
+    assert np.array_equal(mask, drawn > 0)
     turned = make_pipeline(profile_with(tmp_path, drawn, mirrored="true"), CAMERA).detector.mask
-    assert np.array_equal(turned.whole, drawn[:, ::-1] > 0)
+    assert np.array_equal(turned, drawn[:, ::-1] > 0)
     assert make_pipeline(Profile(), CAMERA).detector.mask is None
 
 
