@@ -1,19 +1,11 @@
 """Pictures of interlaced cameras: found out, taken apart, and put in their order of time; pure.
 
 An interlaced frame is two pictures, half a frame's period apart, each in every second row.
-What moved between them stands in it like a comb, and a marker so combed is not read.
-Three things about a stream are found by measure, none is configured:
-
-- whether a frame is combed: then a row is unlike the rows beside it, which are of the other
-  field, and like the rows two away, which are of its own. In a whole picture, nearer rows
-  are more alike; in noise, all are alike unlike. Strong differences only are counted, so
-  that a small target in a noisy picture is enough;
-- which field is the earlier one: of two frames in a row the later field of the first
-  is more like the earlier field of the second than the other way around;
-- how far they are apart: half the frames' period.
-
-While the order is not known yet (a first frame, a single picture) both fields are measured and
-the mean is taken, which belongs to the middle moment in either order.
+What moved between them stands in it like a comb: a row is unlike the rows beside it, which are of
+the other field, and like the rows two away. Strong differences only are counted, so that a small
+target in a noisy picture is enough. Of two frames in a row the later field of the first is more
+like the earlier field of the second than the other way around. While the order is not known yet
+both fields are measured, and their mean belongs to the middle moment in either order.
 """
 
 from __future__ import annotations

@@ -4,12 +4,10 @@ State order as in the paper: yaw, yaw rate, then position and velocity of x, y, 
 The time step is the real one: with 15 % late frames a fixed step gave 0.63 cm RMS,
 the real one 0.19 cm.
 
-The paper's constants are the same for every frame (`kalman.noise: fixed`). A pose is a tenth
-of a millimetre true near the target and centimetres far from it, so by default each brings
-its own covariance, and the process noise is what accelerates: the vehicle in the level frame,
-the state estimate's drift in the world (`measured`). Constant errors, which no average takes
-away, are carried along as consider terms: by how much the vehicle's roll and pitch, the print's
-size and its curl have moved each state. They change no gain, only what is claimed.
+The paper's constants are the same for every frame (`kalman.noise: fixed`). By default each pose
+brings its own covariance, and the process noise is what accelerates: the vehicle in the level
+frame, the state estimate's drift in the world (`measured`). Constant errors (the vehicle's roll and
+pitch, the print's size and curl) are consider terms: they change no gain, only what is claimed.
 """
 
 from __future__ import annotations

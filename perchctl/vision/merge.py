@@ -135,9 +135,8 @@ def _usable(
     config: MergeConfig,
     setup: PoseSetup,
 ) -> dict[str, MarkerPose]:
-    """Return the single markers' poses that count: of two that contradict the better; else all, or
-    (`merge.stages: range`) what the distance from the camera to the target's plane asks for
-    (equations 4, 6 and 11)."""
+    """Return the single markers' poses that count: of two that contradict the better, else all, or
+    (`merge.stages: range`) what the distance to the target asks for (equations 4, 6 and 11)."""
     if len(singles) < 2:
         return dict(singles)
     use = better_conditioned(singles["large"], singles["small"])

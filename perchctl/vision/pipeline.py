@@ -1,9 +1,8 @@
 """THE pipeline: one frame through detection, pose, filter and merge.
 
-`step` is the only way from a picture to a pose; flying, weight fitting, tracking and
-replaying (`perchctl.analysis.sense`) all call it. `estimate` carries its result to any later
+`step` is the only way from a picture to a pose, and `estimate` carries its result to any later
 moment. Neither keeps a memory of its own: what must be remembered is in `PipelineState`, which
-goes in and comes out.
+goes in and comes out. Matrices of a few numbers are multiplied by `dot`: `@` takes twice as long.
 """
 
 from __future__ import annotations
@@ -107,8 +106,7 @@ def make_pipeline(
 def _mask(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None
 ) -> NDArray[np.bool_] | None:
-    """Return what the vehicle's own gear covers; None without `camera.mask`. The file is of the
-    camera's own pictures, which `camera.mirrored` has turned over since."""
+    """Return what the vehicle's own gear covers in pictures as they are used; None without it."""
     if profile.camera.mask is None:
         return None
     if covered is None:
@@ -148,9 +146,6 @@ def step(
     Without an attitude the vehicle counts as level and at rest: the filter then works
     in the level frame, whatever `kalman.frame` says. The frame is one picture of what
     `pictures` makes of a stream's; one that was not looked at there is looked at here.
-
-    What runs in each tracked frame multiplies its matrices by `dot`: `@` takes twice as long for
-    a few numbers, and a frame has a hundred such products.
     """
     frame = classify_fields(frame)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
@@ -280,8 +275,7 @@ def _at_frame(
     in_world: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """Return the target at the newest frame's time; None without a track. `before` is the last
-    one."""
+    """Return the target at the newest frame's time; None without a track."""
     fed, tracks = followed.measured.fed, followed.tracks
     merged = merge_tracks(tracks, fed, pipeline.merge.weights)
     if merged is None:

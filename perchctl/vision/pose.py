@@ -1,11 +1,9 @@
 """From corners to the target's pose relative to the gear.
 
-All solving is done in pixels of a pinhole with the camera's `K`, from corners that
-were undistorted. A planar marker has two tilts with nearly the same picture; which
-one is true is decided by the vehicle's roll and pitch (the target lies level) or by
-the tilt of the frame before. The position comes from the camera-frame translation,
-turned level by the vehicle's roll and pitch, never from the marker's own axes: at
-1.15 m that is 0.5 mm against 40 mm.
+A planar marker has two tilts with nearly the same picture; which one is true is decided by the
+vehicle's roll and pitch (the target lies level) or by the tilt of the frame before. The position is
+turned level by the vehicle's roll and pitch, too, never by the marker's own axes: at 1.15 m that is
+0.5 mm against 40 mm.
 """
 
 from __future__ import annotations
@@ -118,8 +116,7 @@ def estimate_pose(
 def _continued(
     points: Points, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> Scored | None:
-    """Return the solution next to a start; None where there is none that leaves `most_px` at most,
-    RMS."""
+    """Return the solution next to a start, if it leaves `most_px` RMS or less; else None."""
     solution = None if start is None else gauss_newton(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
@@ -360,8 +357,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
 
 
 def _closed_form(points: Points) -> list[PoseCandidate]:
-    """Return the candidates of OpenCV's SQPNP, which solves exactly frontal views too; none of
-    corners all on one line or point."""
+    """Return the candidates of OpenCV's SQPNP; none of corners all on one line or point."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
@@ -406,8 +402,7 @@ def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
 
 
 def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored:
-    """Return the best candidate by the squared errors of corners and tilt, in units of their
-    spread."""
+    """Return the best candidate by the errors of corners and tilt in units of their spread."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -520,8 +515,7 @@ def make_points(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Return the unit normals (m, 4, 2) of the sides of m squares, whichever way round these
-    are."""
+    """Return the unit normals (m, 4, 2) of the sides of m squares, whichever way round."""
     side = corners.take(_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -533,14 +527,12 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _whitened(cov_px2: Array) -> Array:
-    """Return the matrix (8, 8) that makes errors of that covariance independent and of unit
-    spread."""
+    """Return what makes errors of that covariance independent and of unit spread, (8, 8)."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:
-    """Return the spread of the sides, (4,): the more of a side lies along the rows, the worse. Over
-    several rows errors of interpolation cancel out."""
+    """Return the spread of the sides, (4,): the more of one lies along the rows, the worse."""
     way = corners.take(_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(way[:, 1])
@@ -548,8 +540,8 @@ def _lying_px(d: Detection, corners: Array) -> Array:
 
 
 def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
-    """Return the whitening of the corners of four fitted lines with normals (4, 2), by the offset
-    and the tilt of each, at `_SIDES`; `sigma_px` is of all or of each, (4,)."""
+    """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
+    `_SIDES`; `sigma_px` is of all or of each, (4,)."""
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT
     return np.concatenate([across, across, -tilt, tilt])

@@ -1,9 +1,8 @@
 """Which of several targets is the vehicle's own, where their markers are the same.
 
-Several vehicles may hang under one ceiling, each with its target. Where ids do not tell these
-apart, the place does: the one counts that is nearest to where the profile says that the own one
-is, in the world of the state estimate, or else to the upward axis through the gear. That
-decides once; from then on the lock (`perchctl.vision.tracks`) stays with the one that was chosen.
+The one counts that is nearest to where the profile says that the own one is, in the world of the
+state estimate, or else to the upward axis through the gear. That decides once; from then on the
+lock (`perchctl.vision.tracks`) stays with the one that was chosen.
 """
 
 from __future__ import annotations

@@ -264,8 +264,7 @@ class _Fit:
 
 
 def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
-    """Return by how much the pose is off from the one that a track foresees, however late: what is
-    not measured drifts."""
+    """Return by how much the pose is off from the one that a track foresees, however late."""
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The most that it drifts counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
@@ -291,7 +290,7 @@ def _unclaimed(range_m: float) -> Array:
 
 def _goes_on(lock: Lock, sight: Sight, off_in_world: Array) -> bool:
     """Return True if the pose goes on from the last one as seen from the vehicle, much better than
-    in the world: what is off in both did not come about by the estimate."""
+    in the world."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
@@ -429,8 +428,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 
 def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """Return the camera's way in the world (3,) m, by the state estimate's places and by its
-    speeds."""
+    """Return the camera's way (3,) in the world, by the estimate's places and by its speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:

@@ -81,8 +81,7 @@ def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
     """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in the turn in
-    which they do; the most alike first, and each place once: several thresholds find the same
-    quadrilateral."""
+    which they do; the most alike first, and each place once."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -107,8 +106,8 @@ def _best(
 
 
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the expected corners moved to where the marker's drawing, as it would look there,
-    correlates best with the picture."""
+    """Return the expected corners moved to where the marker's drawing goes best with the
+    picture."""
     side_px = mean_side_px(corners_px)
     # Large markers are found on a picture reduced to what the search needs.
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
@@ -136,8 +135,7 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
 
 
 def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
-    """Return the drawing at points (n, n, 2) of the marker's own coordinates, softened; grey where
-    there may be anything."""
+    """Return the drawing at own coordinates (n, n, 2), softened; grey where anything may be."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)

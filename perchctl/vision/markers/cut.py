@@ -1,10 +1,9 @@
 """The target so near, or so far aside, that no marker is wholly in the picture.
 
 What is left of the drawing is aligned from where the target is expected, and one marker's
-corners follow, of which some are outside of the picture: with the covariance of what was seen,
-since some directions may be hardly known. A part of a drawing looks like many things. So it is
-never a first sight of the target, and it counts only if the picture looks like the drawing all
-over and nearly all edges that should be in view are.
+corners follow, with the covariance of what was seen. A part of a drawing looks like many things. So
+it is never a first sight of the target, and it counts only if the picture looks like the drawing
+all over and nearly all edges that should be in view are.
 """
 
 from __future__ import annotations
@@ -128,8 +127,7 @@ def _stands_for(found: Visible) -> MarkerName:
 def _start(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    """Return the pose that goes with expected corners. The small marker's are nearer to the
-    picture, where the lens is known; its own are preferred."""
+    """Return the pose that goes with expected corners, by preference the small marker's."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
     if not np.isfinite(rays).all():
@@ -146,8 +144,7 @@ def _start(
 
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
-    """Return the prediction moved to where the picture goes best with the drawing, None if it does
-    nowhere near."""
+    """Return the prediction moved to where the picture goes best with the drawing, if it does."""
     best, pose = _MIN_GLANCE, None
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
@@ -170,8 +167,7 @@ def _trusted(found: Visible) -> bool:
 
 
 def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
-    """Return the corners of the marker of that half side; None where the lens model does not reach
-    as far."""
+    """Return the corners of the marker of that half side; None where the lens does not reach."""
     r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
     X = r + found.pose.t
     if X[:, 2].min() <= 0.0:
@@ -598,8 +594,7 @@ def _in_view(
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return how far along its normal each place's edge is in the picture, (n,) px, and whether
-    there is one from dark to bright."""
+    """Return how far along its normal each place's edge is (n,) px, and whether there is one."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -635,8 +630,7 @@ def _solved(
 
 
 def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> Visible:
-    """Return the pose with its covariance: of each place's own noise, of what moves a line as a
-    whole, and of the prediction."""
+    """Return the pose with its covariance: by noise of places and of lines, and the prediction."""
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
     common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)

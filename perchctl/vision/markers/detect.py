@@ -5,9 +5,8 @@
 3. by a search in a window around that place, then in the whole picture (`search`);
 4. where blur may hide them (`blurred`).
 
-A marker of which the picture's edge, light that glares, or the vehicle's own gear (`detector`)
-hides a part is measured by what is seen of it (`partial`). Each step takes place within the same
-frame, and only where the one before saw too little.
+A marker of which a part is hidden is measured by what is seen of it (`partial`). Each step takes
+place within the same frame, and only where the one before saw too little.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from perchctl.vision.markers.cut import (
     may_be_whole,
 )
 from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_in, hides
-from perchctl.vision.markers.edge_fit import refine, refine_lines
+from perchctl.vision.markers.edge_fit import refine_lines
 from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen
 from perchctl.vision.markers.pattern import (
     LEAST_SIDE_PX,
@@ -135,8 +134,7 @@ def detect_markers(
 def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
     """Return how to search this frame. After a loss the place where the target should be and the
     whole picture take turns, and there the search and the fits of a blurred target do; later a
-    sharp target and, in every Nth frame, a blurred one. The first frame without it may only be
-    blurred: that has both."""
+    sharp target and a blurred one. The first frame without it has both."""
     if empty_frames is None:
         return "all"
     if not by_lines or (expected and empty_frames % 2):
@@ -154,8 +152,7 @@ def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Seen, Found]:
     """Return what is where both are expected, or nearby: where no side was met, a near target has
-    most often moved on further than a side is looked for, and a look around costs less than to fit
-    what may be seen of it in the old place."""
+    most often moved on further than a side is looked for."""
     seen = follow(picture, expected, shift)
     if not seen:
         found = search_halved(picture, expected)
@@ -169,8 +166,7 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
-    """Return True if a marker that should be in the picture, and not hidden, was not verified,
-    other than one too far away to be found by a search."""
+    """Return True if a marker was not verified that should be in the picture, large enough."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -181,19 +177,17 @@ def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]
 
 
 def _refined(picture: Picture, found: Found) -> _Seen:
-    """Return what the search found, by the profile's refinement. Those without four lines for sides
-    are measured by what of these is seen: a search takes the picture's edge for the side of a
-    marker that is cut off there."""
+    """Return what the search found with better corners. Those without four lines for sides are
+    measured by what of these is seen: a search takes the picture's edge for a side."""
     image, setup = picture.image, picture.setup
-    names = [name for name in MARKERS if name in found.corners_px]
-    raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
+    raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
+    lines = fit_lines(picture, raw) if setup.by_lines else {}
+    seen = {
+        name: lines.get(name) or refine_each(image, corners, setup.patterns[name].rim.cells)
+        for name, corners in raw.items()
+    }
     if not setup.by_lines:
-        return {
-            name: refine_each(image, corners, setup.patterns[name].rim.cells)
-            for name, corners in zip(names, raw, strict=True)
-        }
-    rims = [setup.patterns[name].rim for name in names]
-    seen = dict(zip(names, refine(image, raw, rims, picture.camera), strict=True))
+        return seen
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
         if r.refined and wholly_seen(picture, r):
@@ -327,16 +321,14 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """Return the blur of the sides, where lines were fitted: the fit of the drawing gets there
-    sooner."""
+    """Return the blur to start with: of the sides, where lines were fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
-    """Return the corners (4, 2) px from which the drawing should be aligned, None where that is of
-    no use."""
+    """Return the corners (4, 2) px from which to align the drawing; None where it is of no use."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -357,30 +349,35 @@ _LEAST_CELL_PX = 2.5  # for lines
 _ANCHOR = 0.12  # of the small marker's side
 
 
+def fit_lines(
+    picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
+) -> _Seen:
+    """Return the markers near to corners (4, 2) px that have lines for sides; `shift` is what was
+    measured of the edges in an earlier picture."""
+    if not places:
+        return {}
+    rims = [picture.setup.patterns[name].rim for name in places]
+    raw = np.array(list(places.values()))
+    fitted = refine_lines(picture.image, raw, rims, picture.camera, shift)
+    return {name: found for name, found in zip(places, fitted, strict=True) if found is not None}
+
+
 def follow(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
-    """Return the expected markers (corners (4, 2) px) that are verified by all sides and cells;
-    `shift` is what was measured of the edges in an earlier picture."""
+    """Return the expected markers (corners (4, 2) px) that are verified by all sides and cells."""
     image, patterns = picture.image, picture.setup.patterns
-    names = [
-        name
+    places = {
+        name: expected[name]
         for name in MARKERS
         if name in expected
         and within(expected[name], image.shape, ROOM_PX)
         and side_lengths_px(expected[name]).min() > _LEAST_CELL_PX * patterns[name].rim.cells
-    ]
-    if not names:
-        return {}
-    raw = np.array([expected[name] for name in names])
-    rims = [patterns[name].rim for name in names]
-    fitted = refine_lines(image, raw, rims, picture.camera, shift)
+    }
     return {
-        name: result
-        for name, result in zip(names, fitted, strict=True)
-        if result is not None
-        and wholly_seen(picture, result)
-        and cells_agree(image, result.corners_px, patterns[name])
+        name: found
+        for name, found in fit_lines(picture, places, shift).items()
+        if wholly_seen(picture, found) and cells_agree(image, found.corners_px, patterns[name])
     }
 
 
@@ -428,18 +425,14 @@ def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
 
     if within(start, image.shape, ROOM_PX):
         # A small marker gives a rough place; the first fit is where to look closely.
-        found = refine_lines(image, start[None], [pattern.rim], picture.camera)[0]
+        found = fit_lines(picture, {"large": start}).get("large")
         if found is not None:
-            found = refine_lines(image, found.corners_px[None], [pattern.rim], picture.camera)[0]
+            found = fit_lines(picture, {"large": found.corners_px}).get("large")
         if found is not None:
             start = found.corners_px
-        if (
-            found is not None
-            and wholly_seen(picture, found)
-            and is_centred(found)
-            and cells_mostly_agree(image, found.corners_px, pattern)
-        ):
-            return found
+            good = wholly_seen(picture, found) and is_centred(found)
+            if good and cells_mostly_agree(image, start, pattern):
+                return found
     partly = seen_partly(picture, "large", start, "other")
     return partly if partly and is_centred(partly) else None
 
@@ -471,8 +464,7 @@ def between(a: Detections, b: Detections) -> Detections:
 
 
 def _middle(a: Detection, b: Detection) -> Detection:
-    """Return the mean of two fields' detections. Each field has its own noise, so the mean is
-    surer than either."""
+    """Return the mean of two fields' detections, each with its own noise."""
 
     def half(one: float, other: float) -> float:
         return float(((one**2 + other**2) / 4.0) ** 0.5)

@@ -1,16 +1,11 @@
 """Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected.
 
-A side is hundreds of gradient samples instead of one point, and a blur that is equal on
-both of its flanks does not move it. So each side's edge points are undistorted, a line is fitted
-to them by total least squares in normalised coordinates, and neighbours are intersected.
+A blur that is equal on both flanks of a side does not move it. So each side's edge points are
+undistorted, a line is fitted to them by total least squares, and neighbours are intersected.
 
-White that is clipped, glares or went through a gamma curve does move edges: all of
-them, from white towards black, by the same number of pixels. The inner edge of a
-marker's border moves the opposite way, so the border's width, known to be one cell,
-gives the shift, and it is taken out.
-
-Where a residual shows that the sides are not lines (blur, occlusion, false
-candidates), each corner is refined on its own (`perchctl.vision.markers.corners`).
+White that is clipped, glares or went through a gamma curve does move edges: all of them, from white
+towards black, by the same number of pixels. The inner edge of a marker's border moves the opposite
+way, so the border's width, known to be one cell, gives the shift, and it is taken out.
 """
 
 from __future__ import annotations
@@ -34,7 +29,6 @@ from perchctl.vision.markers.corners import (
     doubled_area,
     from_unit,
     mapped,
-    refine_each,
     side_lengths_px,
     to_unit,
 )
@@ -149,24 +143,6 @@ _PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
 _BOWED = 3.0  # standard deviations
 
 
-def refine(
-    image: NDArray[np.uint8],
-    corners_px: Array,
-    rims: Sequence[Rim],
-    camera: CameraModel,
-) -> list[RefinedCorners]:
-    """Refine the raw corners (m, 4, 2) of m markers in a grey picture (h, w): by lines, or each by
-    its own neighbourhood where a marker's sides are none. `rims` is what lies inside of the border
-    of each."""
-    if len(corners_px) == 0:
-        return []
-    by_lines = refine_lines(image, corners_px, rims, camera)
-    return [
-        result or refine_each(image, raw, rim.cells)
-        for result, raw, rim in zip(by_lines, corners_px, rims, strict=True)
-    ]
-
-
 def refine_lines(
     image: NDArray[np.uint8],
     raw_px: Array,
@@ -250,8 +226,8 @@ def _refined_once(
 
 
 def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
-    """Return the lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, by total least
-    squares on the points of each side; and the weighted RMS distance of these, px (4m,)."""
+    """Return the lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
+    RMS distance of the points from these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -338,8 +314,8 @@ def _measured_shift(
 
 
 def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides lie further out than their middles, the
-    mean of its sides, as far as noise does not explain it."""
+    """Return how far the ends of the widest marker's sides lie further out than their middles, as
+    far as noise does not explain it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -351,8 +327,7 @@ def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) 
 
 
 def _outwards(markers: Markers, lines: Array) -> Array:
-    """Return +1 where a line's normal, which may point either way, points out of its marker, else
-    -1, (4m,)."""
+    """Return +1 where a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
@@ -382,8 +357,8 @@ def _clipped(sides: Samples) -> Array:
 def _sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
-    """Return the spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
-    `tolerance` that of the print, in cells."""
+    """Return the spread of a marker's corners, by the variance of its sides' ends and the tolerance
+    of the print, in cells."""
     blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
     bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
@@ -396,9 +371,8 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Return the spread of a marker's corners by what shakes a picture's rows, each along itself,
-    as the residuals of its four sides show it: it moves upright sides, both of a marker's alike,
-    and lying ones not. 0 where the marker stands on a corner and nothing shows."""
+    """Return the spread of a marker's corners by what shakes a picture's rows: it moves upright
+    sides and not lying ones. 0 where the marker stands on a corner and nothing shows."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -549,8 +523,7 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 
 
 def _single(value: float) -> Floats:
-    """Return a number as arrays meet it soonest: beside one of numpy's scalars they take twice as
-    long."""
+    """Return a number as arrays meet it soonest, in half the time of a Python one."""
     return np.array(value, dtype=np.float32)
 
 
@@ -687,9 +660,8 @@ class _Profiles:
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return straight lines (rows, n) through the middles of the two halves of each row: where a
-    window is put, whatever a quarter of either half shows. A half that shows nothing is taken to
-    lie where the other does."""
+    """Return straight lines (rows, n) through the middles of the halves of each row, whatever a
+    quarter of either shows. A half that shows nothing is taken to lie where the other does."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2

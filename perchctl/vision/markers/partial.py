@@ -114,9 +114,9 @@ def wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the changes (9, rows * n) of the edges with the square's increment, in the terms of
-    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9), (9,),
-    per px^2 of an edge's spread."""
+    """Return the changes (9, rows * n) of the edges with the terms of `corner_jacobian` and the
+    shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
+    spread."""
     u, v, rows = seen.own[..., 0], seen.own[..., 1], seen.rows
     nx, ny = OUT[rows.side].T[..., None] * rows.scale_px[:, None]
     A = np.empty((9, *u.shape))
@@ -142,9 +142,9 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 def _corners(
     H: Array, seen: SeenEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners and covariance of the square H (3, 3), unit to pinhole px, after the last
-    round, by what that leaves over of its edges, px (rows, n), and by its normal matrix (9, 9);
-    None where they are not determined, or the edges are those of no square."""
+    """Return the corners of the square H (3, 3), unit to pinhole px, with a covariance by what is
+    left over of its edges, px (rows, n), and its normal matrix (9, 9); None where these are
+    vague."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -193,9 +193,8 @@ _INVERTED_PX = 0.5  # the lens model holds where its inverse is one
 
 
 def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
-    """Return True if the cells that are seen have their colour: not those beyond the picture's
-    edge, behind what is hidden, or in light that glares. How many that must be depends on what
-    else says which marker it is."""
+    """Return True if the cells have their colour that are in the picture, not hidden, and not in
+    light that glares. How many that must be depends on what else says which marker it is."""
     image, hidden = picture.image, picture.hidden
     h, w = image.shape
     at = _spots_px(corners_px, pattern, picture.camera)
@@ -228,8 +227,7 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
     """Return the spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
-    does not reach. A marker that fills the picture is no square in it: its middle is a third of a
-    cell from where its corners alone put it."""
+    does not reach. A marker that fills the picture is no square in it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)
@@ -404,8 +402,7 @@ def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
     """Return which of the free profiles (rows, n) begin black and end white, as most do, and how
-    white the paper is; None without contrast. Light that glares makes black bright; what lies on
-    the paper makes white dark."""
+    white the paper is; None without contrast."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

@@ -172,8 +172,7 @@ def _likeness(grey: Array, pattern: Pattern) -> Array:
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the mean grey value of each cell that is read, None where one is outside of the
-    picture."""
+    """Return the mean grey value of each cell that is read; None outside of the picture."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
@@ -181,8 +180,7 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the grey values (k,) at the pattern's k spots, None where one is outside of the
-    picture."""
+    """Return the grey values (k,) at the pattern's k spots; None outside of the picture."""
     at = mapped(from_unit(corners_px), pattern.spots)
     # Spots are inside of the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
@@ -194,8 +192,7 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
 def _read_squares(
     image: NDArray[np.uint8], H: Array, pattern: Pattern
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Return which of m squares (m, 3, 3) have all spots in the picture, and the grey values (n, k)
-    at the k spots of those."""
+    """Return which of m squares (m, 3, 3) are in the picture, and the grey values (n, k) there."""
     h, w = image.shape
     at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -187,8 +187,8 @@ def align(
 
 
 def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
-    """Return the normal equations of the next increment; None without contrast. There are 16 or 17
-    unknowns: shape, blur and light; `total` (8,) is the sum of the increments so far."""
+    """Return the normal equations of the next increment, of shape, blur and light; None without
+    contrast. `total` (8,) is the sum of the increments so far."""
     rows, products = seen.light
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
@@ -225,13 +225,8 @@ def _cells_seen(
     seen: Rendered, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
     """Return `flip` and `flip_sigma` of an `Alignment`; `inverse` is that of N, and so `many` nodes
-    measure the same.
-
-    The mean over a cell shows a wrong bit as long as blur is smaller than the cell. Beyond that a
-    wrong bit is spread over its neighbours, and shape, blur and light of the fit take a part of
-    what it leaves over. So each cell is looked for as it would look: blurred, and without what the
-    fit's unknowns explain (a matched filter).
-    """
+    measure the same. A wrong bit is looked for as it would look: blurred, and without what the
+    unknowns of the fit explain of it (a matched filter)."""
     soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
@@ -245,8 +240,7 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, float]:
-    """Return the correlation and height of the inner pattern in the picture's grey values
-    (n * n,): what no plain square explains of them."""
+    """Return the correlation and height of the inner pattern in grey values (n * n,)."""
     rows, products = drawing.plain
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.light[0][GAIN], grey
@@ -261,8 +255,7 @@ def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, f
 
 
 def _repeated(error: Array) -> float:
-    """Return how many neighbouring nodes measure the same: from the correlation along rows and
-    columns (n, n) of what is left (nodes closer than a pixel; blur that is not round)."""
+    """Return how many neighbouring nodes measure the same, by the correlation of what is left."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
     for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
@@ -280,8 +273,7 @@ def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
 
 @lru_cache(maxsize=32)
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Return each node's number of its cell, behind the last one's around the marker, and how many
-    nodes each cell has."""
+    """Return each node's number of its cell, and how many nodes each cell has."""
     x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
     own = y.astype(np.intp) * n_cells + x.astype(np.intp)
@@ -296,8 +288,8 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 
 
 def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
-    """Return the changes (9, n * n) of the grey values with the homography's increment and the
-    blur's square, in this light (7 or 8,)."""
+    """Return the changes (9, n * n) of grey with the homography's increment and the blur's
+    square."""
     gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
     bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
@@ -364,8 +356,8 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 @lru_cache(maxsize=64)
 def _few(grid: Grid) -> tuple[Array, Array]:
-    """Return Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's
-    nodes give to its values there."""
+    """Return Chebyshev's nodes over the grid (3, _FEW^2), and their weights (n, _FEW) at its
+    own."""
     reach = float(grid.axis[-1])
     x = chebyshev.chebpts2(_FEW)
     degree = _FEW - 1
@@ -376,8 +368,7 @@ def _few(grid: Grid) -> tuple[Array, Array]:
 def _patch_around(
     image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the picture that the nodes may reach, and its first pixel x and y (2, 1);
-    None where they leave the picture."""
+    """Return the part of the picture that the nodes may reach, and its first pixel (2, 1)."""
     h, w = image.shape
     x, y = projected(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -391,8 +382,8 @@ def _patch_around(
 
 
 def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
-    """Return the grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift
-    less the patch's first pixel."""
+    """Return the grey values at the nodes, (n * n,), of a patch moved by the lens's shift (2, n *
+    n)."""
     at = (projected(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -131,8 +131,7 @@ def _pass(
     own: TargetSelector | None,
     halved: bool = False,
 ) -> Found:
-    """Return what one pass of OpenCV's detector over the window gives, or over that at half its
-    size."""
+    """Return what one pass of OpenCV's detector over the window gives, perhaps at half its size."""
     setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
@@ -205,8 +204,8 @@ def choose(
 def _nearest_first(
     candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates that are least far aside first, without those that are too far: of
-    several, since a lone one is left to the pipeline, which says why it is not taken."""
+    """Return the candidates that are least far aside first, without those that are too far. A lone
+    one is left to the pipeline, which says why it is not taken."""
     if sum(map(len, candidates.values())) < 2:
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
@@ -220,8 +219,7 @@ def _nearest_first(
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs that belong together, each large marker in one: misfit and both indices, the
-    best first."""
+    """Return the pairs that belong together: misfit and both indices, the best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
     best: dict[int, tuple[float, int, int]] = {}
@@ -243,8 +241,7 @@ def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """Return the candidate that continues the last detections, in place and in size, if any
-    does."""
+    """Return the candidate that continues the last detections, in place and size; else None."""
     if not expected or not quads:
         return None
     if name in expected:
