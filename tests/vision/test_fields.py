@@ -103,17 +103,6 @@ def test_the_order_is_found_within_a_few_frames(
     assert set(found) <= {("woven",), (first, second)}
 
 
-def test_a_stream_of_whole_pictures_is_looked_at_in_every_third() -> None:
-    """One in which fields were seen: in each."""
-    _, (frame,) = woven_frames(1)
-    plain = replace(frame, image=np.full_like(frame.image, 90))
-    # Whichever frames a busy program takes.
-    stream = [replace(plain, index=1), *(replace(frame, index=1 + 3 * k) for k in range(1, 8))]
-    found = kinds(FieldState(), [replace(f, t_s=k * PAL_S) for k, f in enumerate(stream)])
-    assert [len(f) == 1 and f[0] for f in found[:4]] == ["whole", "whole", "whole", "woven"]
-    assert ("whole",) not in found[3:]
-
-
 def test_a_changed_order_is_found() -> None:
     """A receiver that loses its lock may come back with its fields exchanged."""
     _, tops = woven_frames(5, "top")

@@ -215,14 +215,6 @@ def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     assert 0.8 < np.mean(squares) / 4.0 < 1.2
 
 
-def test_both_markers_together_are_surer_than_either() -> None:
-    rvec, tvec = pose_of(0.0, 0.0, 0.24, 0.3)
-    both = [marker(name, rvec, tvec) for name in ("large", "small")]
-    joint = posed(both)
-    for one in both:
-        assert (joint.sigma_m < posed([one]).sigma_m).all()
-
-
 def test_corners_that_are_no_square_are_refused() -> None:
     rvec, tvec = pose_of(0.0, 0.0, 0.3)
     detection = marker("large", rvec, tvec)

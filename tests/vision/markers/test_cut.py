@@ -99,15 +99,11 @@ def test_the_large_marker_stands_for_what_shows_nothing_of_the_small_one() -> No
     assert float(error @ np.linalg.solve(found.large.cov_px2, error)) < 20.0
 
 
-def test_it_is_never_a_first_sight() -> None:
+def test_it_is_never_a_first_sight_nor_one_after_a_while() -> None:
     image, expected = picture("height"), both(BESIDE_HEIGHT)
     assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
     assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
-    assert not nothing(look("height"))
-
-
-def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert not nothing(look("height", age_s=MOST_AGE_S - 0.01))
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
 

@@ -95,15 +95,6 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
     assert np.mean(np.square(squares)) < 2.0
 
 
-def test_corners_out_of_sight_are_claimed_to_be_known_less() -> None:
-    pose = cut(0.1, 1)
-    found = detect_markers(frame(render(*pose, noise=2.0)), None, SETUP, CAMERA).large
-    assert found.cov_px2 is not None
-    spread = np.sqrt(np.diagonal(found.cov_px2).reshape(4, 2).sum(axis=1))
-    gone = int(corners("large", pose)[:, 0].argmin())
-    assert spread[gone] > 1.1 * np.delete(spread, gone).max()
-
-
 @pytest.mark.parametrize("share", [0.02, 0.04, 0.25, 0.4])
 def test_the_edge_of_the_picture_is_taken_for_no_side(share: float) -> None:
     """Alone, the large marker is measured or refused, and never made smaller than it is."""
