@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 from perchctl.geometry import wrap_rad
 from perchctl.mission import ImuMotion
@@ -14,6 +15,7 @@ from perchctl.vehicle import Telemetry, is_battery_reading
 from perchctl.vision import Attitude
 
 Vector = tuple[float, float, float]
+_time_s = attrgetter("t_s")
 
 KEEP_S = 2.0
 SMEARED_S = 0.15
@@ -118,10 +120,6 @@ def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
 
 
-def _time_s(sample: Telemetry) -> float:
-    return sample.t_s
-
-
 def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
     x, y, z = (p + v * ahead_s for p, v in zip(s.position_m, s.velocity_mps, strict=True))
     return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z), s.velocity_mps)
@@ -166,8 +164,7 @@ def _is_placed(s: Telemetry) -> bool:
 
 
 def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
-    """The sample with position and velocity of the last one: its attitude, acceleration and thrust
-    are fresh all the same, and by them the vehicle comes down."""
+    """The sample with position and velocity of the last one: the others are fresh all the same."""
     behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
     return replace(
         new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s

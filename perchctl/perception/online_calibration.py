@@ -1,8 +1,7 @@
 """The camera's latency and mounting, estimated picture by picture while the vehicle flies.
 
 With `camera.latency_s: measured` the latency is used, too: taken off the pictures' times, once
-it is sure, slowly, and within bounds. What is estimated rests on the pictures' times before
-that, so that its use does not feed back.
+it is sure, slowly, and within bounds. What is estimated rests on the times before that.
 """
 
 from __future__ import annotations
@@ -73,18 +72,13 @@ def update_calibration(
             new = replace(new, newest=newest, solved_s=t_s)
     if camera.latency_s != "measured":
         return new
-    return replace(new, seen_s=t_s, used_s=_slewed(new, camera, t_s - old.seen_s))
-
-
-def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
-    """Return the latency in use, one picture on: closer to what is measured, or as it was where
-    that is unsure."""
-    if new.newest is None or not new.newest.delay_sigma_s <= USED_SIGMA_S:
-        return new.used_s
-    (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
-    goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
-    step_s = SLEW * max(0.0, min(dt_s, LONGEST_STEP_S))
-    return new.used_s + max(-step_s, min(step_s, goal_s - new.used_s))
+    used_s = new.used_s
+    if new.newest is not None and new.newest.delay_sigma_s <= USED_SIGMA_S:
+        (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
+        goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
+        step_s = SLEW * max(0.0, min(t_s - old.seen_s, LONGEST_STEP_S))
+        used_s += max(-step_s, min(step_s, goal_s - used_s))
+    return replace(new, seen_s=t_s, used_s=used_s)
 
 
 # --- What a flight tells about the latency and the mounting -----------

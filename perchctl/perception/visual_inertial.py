@@ -1,10 +1,9 @@
 """Checks whether the pictures show the motion that the accelerometer measures.
 
-The target stands still. The way from the body to it, turned by the attitude at the exposure, and
-the body's own motion by its accelerometer add up to one place, but for the speed at the window's
-begin and a constant offset. If pictures are later than assumed, or the camera is turned about the
-upward axis, the sum wanders; with the right delay or turn it comes to rest. The vehicle's estimate
-has no part in it: by the target alone it follows the pictures itself.
+The way from the body to the target, turned by the attitude at the exposure, and the body's own
+motion by its accelerometer add up to one place, but for the speed at the window's begin and a
+constant offset. If pictures are later than assumed, or the camera is turned about the upward axis,
+the sum wanders; with the right delay or turn it comes to rest.
 """
 
 from __future__ import annotations
@@ -91,8 +90,7 @@ def estimate_motion(
 
 
 def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
-    """The index that wanders least among those that are no other mismatch: a delay that is wrong by
-    some hundredths of a second adds 0.1 m/s."""
+    """The index that wanders least among those that are no other mismatch."""
     about = np.abs(LATER_S - mismatch.later_s) < LEAST_LATER_S
     about &= mismatch.turn_rad == TURNS_RAD
     return int(np.argmin(np.where(about, wanders_m, np.inf)))

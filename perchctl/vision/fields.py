@@ -22,7 +22,7 @@ from perchctl.vision.types import FieldState, Frame
 
 Grey = NDArray[np.uint8]
 
-_COMBED = 1.4
+_COMBED = 1.4  # fields a pixel apart
 # Of so many rows in a group all but the outer four are compared with their neighbours, in
 # one go. Odd and even rows must both be: a single lost line of an analogue picture then counts
 # among the differences to its own field's rows as much as among the others.
@@ -45,12 +45,12 @@ _MOST_EVIDENCE = 3.0  # so that a changed order is found in time
 _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
-def combing(image: Grey) -> float:
-    """Return how much more the rows of a picture, (h, w) grey, differ from the other field's rows
-    than from their own field's. From 1.4 on the picture counts as combed: fields a pixel apart."""
+def is_combed(image: Grey) -> bool:
+    """Return True if a picture, (h, w) grey, holds two fields of different times: its rows differ
+    much more from the other field's rows than from their own field's."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
-        return 0.0
+        return False
     # Groups of rows side by side, so that the next row is `width` further along; every third
     # group is enough.
     flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
@@ -67,12 +67,7 @@ def combing(image: Grey) -> float:
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
-    return energy[0] / (energy[1] + _FLOOR * row.size)
-
-
-def is_combed(image: Grey) -> bool:
-    """True where the picture, (h, w) grey, holds two fields of different times."""
-    return combing(image) > _COMBED
+    return energy[0] / (energy[1] + _FLOOR * row.size) > _COMBED
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:

@@ -41,8 +41,6 @@ _MOVES[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
-_YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 _UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, per state
 
 _PUSH_S = 0.1
@@ -124,14 +122,6 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
         tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         drift_mps=config.drift_mps if in_world else math.inf,
     )
-
-
-def pose_noise(cov: Array) -> Array | None:
-    """Return R (4, 4) of a measured (yaw, x, y, z) from a pose's covariance of (x, y, z, yaw); None
-    where that is not finite."""
-    if not finite(cov):
-        return None
-    return np.asarray(cov[_YAW_FIRST] + _LEAST_NOISE)
 
 
 def tilted(way_m: Array) -> Array:

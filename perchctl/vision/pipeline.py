@@ -68,8 +68,8 @@ def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
     """Return the profile's pipeline for a calibrated camera. It is never changed: several streams
-    may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds,
-    which else is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
+    may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds in
+    the camera's own pictures, else that is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
     pose = PoseSetup(
         config=profile.pose,
         target=profile.target,
@@ -78,9 +78,11 @@ def make_pipeline(
         camera=camera,
         readout_s=profile.camera.readout_s,
     )
-    detector = make_aruco_detector(
-        profile.detector, profile.target, _mask(profile, camera, covered)
-    )
+    mask = None
+    if profile.camera.mask is not None:
+        mask = read_mask(profile.camera.mask, camera.size_px) if covered is None else covered
+        mask = mask[:, ::-1] if profile.camera.mirrored else mask
+    detector = make_aruco_detector(profile.detector, profile.target, mask)
     if detector.by_lines:
         prepare_cut_markers(detector.patterns, camera)
     target = profile.target
@@ -101,17 +103,6 @@ def make_pipeline(
         kalman=profile.kalman,
         camera=camera,
     )
-
-
-def _mask(
-    profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None
-) -> NDArray[np.bool_] | None:
-    """Return what the vehicle's own gear covers in pictures as they are used; None without it."""
-    if profile.camera.mask is None:
-        return None
-    if covered is None:
-        covered = read_mask(profile.camera.mask, camera.size_px)
-    return covered[:, ::-1] if profile.camera.mirrored else covered
 
 
 def camera_profile(profile: Profile) -> Profile:

@@ -331,20 +331,6 @@ def _curl(points: Points, scored: Scored) -> Array:
     return np.asarray(points.whitening.dot(moved))
 
 
-def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
-    """Return the rotation vector of the other tilt, whose normal is mirrored at the line of sight;
-    None where both agree."""
-    R = rotation_matrix(rvec)
-    normal, sight = R[:, 2], tvec / np.linalg.norm(tvec)
-    other = 2.0 * float(normal @ sight) * sight - normal
-    axis = np.cross(normal, other)
-    sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
-    angle = math.atan2(sine, cosine)
-    if angle < _MIN_FLIP_RAD or sine < 1e-9:
-        return None
-    return rotation_vector(rotation_matrix(axis / sine * angle) @ R)
-
-
 def flat(values: Any) -> Array:
     """Return the values as a flat array of doubles."""
     return np.asarray(values, dtype=np.float64).ravel()
@@ -393,10 +379,17 @@ def _scored(candidate: PoseCandidate, points: Points) -> Scored:
 
 
 def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
-    """Return the best candidate near the mirror solution, if there is one."""
-    rvec = mirror_solution(scored.rvec, scored.tvec)
-    if rvec is None:
+    """Return the best candidate near the other tilt, whose normal is mirrored at the line of sight;
+    none where both agree."""
+    R = rotation_matrix(scored.rvec)
+    normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
+    other = 2.0 * float(normal @ sight) * sight - normal
+    axis = np.cross(normal, other)
+    sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
+    angle = math.atan2(sine, cosine)
+    if angle < _MIN_FLIP_RAD or sine < 1e-9:
         return []
+    rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
     turned = _refined(points, PoseCandidate(rvec, scored.tvec))
     return [_scored(turned, points)] if _usable(turned) else []
 

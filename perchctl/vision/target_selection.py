@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.geometry import Array, wrap_rad
-from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, pose_noise, tilted
+from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilted
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
@@ -86,6 +86,8 @@ def refusal(
 
 
 _STILL = np.eye(4)
+_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
+_YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
 def to_world(
@@ -137,7 +139,8 @@ def measurement(
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
         bias[1:] = attitude.R_world_level.dot(bias[1:])
-    return Measurement(z, pose_noise(noise), bias)
+    R = np.asarray(noise[_YAW_FIRST] + _LEAST_NOISE) if finite(noise) else None
+    return Measurement(z, R, bias)
 
 
 def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:

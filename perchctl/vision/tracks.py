@@ -90,8 +90,14 @@ def update_tracks(
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
             sight = replace(sight, looks_there=looks)
-        another = refusal(sight.pose, attitude, setup.own, setup.pose)
-        verdict = _verdict(state, sight, another, constants, setup.gate)
+        if setup.gate:
+            verdict = judged(state.lock, state.stranger, sight, constants)
+        # What was locked on goes on, however far the estimate's world has drifted meanwhile.
+        goes_on = not verdict.afresh or verdict.same
+        goes_on = goes_on and remembered(state.lock, None, t_s)[0] is not None
+        another = None if goes_on else refusal(pose, attitude, setup.own, setup.pose)
+        if another is not None and verdict.taken:
+            verdict = Verdict(False, stranger=state.stranger, text=another, refused=True)
     if not verdict.taken:
         measured, fed = replace(measured, fed={}), {}
     begun = {} if verdict.afresh else old
@@ -101,26 +107,9 @@ def update_tracks(
         return TrackedFrame(measured, tracks, verdict)
     lock, stranger = remembered(state.lock, verdict.stranger, t_s)
     if sight is not None and verdict.taken and tracks:
-        surest = next(iter(tracks.values()))
-        if len(tracks) > 1:
-            surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
+        surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict)
     return TrackedFrame(measured, tracks, verdict, lock, stranger)
-
-
-def _verdict(
-    state: PipelineState, sight: Sight, another: str | None, constants: FilterSetup, gate: bool
-) -> Verdict:
-    """Return the gate's verdict. A target that is `another` vehicle's is never locked on; one that
-    was locked on goes on, however far the estimate's world has drifted meanwhile."""
-    verdict = Verdict(taken=True, stranger=state.stranger)
-    if gate:
-        verdict = judged(state.lock, state.stranger, sight, constants)
-    lock, _ = remembered(state.lock, None, sight.t_s)
-    goes_on = lock is not None and (verdict.same or not verdict.afresh)
-    if another is not None and verdict.taken and not goes_on:
-        return Verdict(taken=False, stranger=state.stranger, text=another, refused=True)
-    return verdict
 
 
 # --- Whether a pose is the target's that was locked on ----------------

@@ -17,7 +17,6 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     RefinedCorners,
     doubled_area,
-    from_unit,
     mapped,
     mean_side_px,
     side_lengths_px,
@@ -26,7 +25,7 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detector import Picture, make_quadrilateral_finder
 from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
+from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance
 from perchctl.vision.markers.photometric_fit import Alignment, align
 from perchctl.vision.types import MARKERS, MarkerName
 
@@ -86,9 +85,8 @@ def _best(
     if len(quads) == 0:
         return []
     found: list[tuple[float, MarkerName, Array]] = []
-    squares = np.array([from_unit(quad) for quad in quads])
     for name in MARKERS:
-        like = resemblances(image, squares, patterns[name])
+        like = np.array([resemblance(image, quad, patterns[name]) for quad in quads])
         for i in np.flatnonzero(like.max(axis=1) > _MIN_RESEMBLANCE):
             turn = int(like[i].argmax())
             found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))

@@ -122,7 +122,6 @@ def with_missing_marker(
 RAW_SIGMA_PX = 0.6
 SUBPIX_SIGMA_PX = 0.25
 NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothing
-_PICTURES = 5  # for which a measured shift of all edges holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,11 +156,3 @@ def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedC
     if not np.isfinite(moved_px) or moved_px > half + 1.0:
         return RefinedCorners(raw_px, RAW_SIGMA_PX, False)
     return RefinedCorners(moved, SUBPIX_SIGMA_PX, False)
-
-
-def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
-    """Return what an earlier picture's shift still gives a picture later; None once it is too old:
-    light, lens and ink change slowly."""
-    if earlier is None or earlier.age + 1 >= _PICTURES:
-        return None
-    return EdgeShift(earlier.shift_px, earlier.sigma_px, earlier.age + 1)

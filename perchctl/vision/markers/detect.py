@@ -24,7 +24,6 @@ from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in
 from perchctl.vision.markers.corners import (
     NESTED_SIGMA_PX,
     RefinedCorners,
-    known_from,
     mean_side_px,
     refine_each,
     side_lengths_px,
@@ -61,6 +60,7 @@ from perchctl.vision.types import (
 )
 
 _SEARCHED_SIDE_PX = 13.0  # smaller markers are not found by a search
+_SHIFT_PICTURES = 5  # for which a measured shift of all edges holds: light changes slowly
 _Seen = dict[MarkerName, RefinedCorners]
 
 
@@ -94,7 +94,10 @@ def detect_markers(
     lately = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
     lately = lately and setup.by_lines and bool(last)
     was_cut = lately and not may_be_whole(last, frame.image.shape)
-    shift = known_from(None if previous is None else previous.edge_shift)
+    shift = None if previous is None else previous.edge_shift
+    if shift is not None:
+        age = shift.age + 1
+        shift = replace(shift, age=age) if age < _SHIFT_PICTURES else None
 
     def detected(frame: Frame) -> Detections:
         """Return what is in a frame of one moment."""
@@ -114,7 +117,9 @@ def detect_markers(
             if len(found.corners_px) >= len(seen):
                 seen = _refined(picture, found)
         if not seen and look not in ("sharp", "window") and setup.by_lines:
-            seen = _in_blur(picture, expected, turn)
+            bare = replace(picture, hidden=None)
+            seen = expected_in_blur(bare, expected, turn) if expected else hidden_in_blur(bare)
+            seen = improved(bare, seen)
         shifts = (r.edge_shift for r in seen.values())
         return Detections(
             frame_index=frame.index,
@@ -205,12 +210,6 @@ def _refined(picture: Picture, found: Found) -> _Seen:
         ):
             del fitted[name]
     return improved(picture, fitted, searched=True)
-
-
-def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None) -> _Seen:
-    """Return what only the drawing shows: near to where it is expected, or anywhere."""
-    seen = expected_in_blur(picture, expected, turn) if expected else hidden_in_blur(picture)
-    return improved(replace(picture, hidden=None), seen)
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:

@@ -181,7 +181,8 @@ def _refined_once(
     if markers is None:
         return found
     sides, inner = measure(image, markers, camera, with_inner=known is None)
-    clipped = _clipped(sides) > CLIPPED_SHARE
+    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
+    clipped = glaring.reshape(-1, 4) @ _QUARTERS > CLIPPED_SHARE
     if known is not None and clipped.any():
         # How far clipping moves edges changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
@@ -346,12 +347,6 @@ def _accepted(
     moved_px = np.hypot(way[..., 0], way[..., 1]).max(axis=1)
     good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
     return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
-
-
-def _clipped(sides: Samples) -> Array:
-    """Return the share of the profiles of the m markers that end in clipped white, (m,)."""
-    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
-    return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
 
 
 def _sigma_px(

@@ -149,26 +149,14 @@ def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     """Return the correlation of the cells' grey values with the pattern for corners (4, 2) rolled
     on by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
     grey = _read(image, corners_px, pattern)
-    return np.zeros(4) if grey is None else _likeness(grey[None], pattern)[0]
-
-
-def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> Array:
-    """Return the `resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m,
-    4)."""
-    like = np.zeros((len(squares), 4))
-    inside, grey = _read_squares(image, squares, pattern)
-    like[inside] = _likeness(grey, pattern)
-    return like
-
-
-def _likeness(grey: Array, pattern: Pattern) -> Array:
-    """Return the correlation (m, 4) of grey values (m, k) at the spots, 0 without contrast."""
-    grey = grey - grey.sum(axis=1, keepdims=True) / grey.shape[1]
-    spread = np.sqrt((grey * grey).sum(axis=1))[:, None]
-    like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)
+    if grey is None:
+        return np.zeros(4)
+    grey -= grey.mean()
+    spread = float(np.linalg.norm(grey))
     # Black and white each on about half of the spots are 2 spreads apart.
-    contrast = spread >= 0.5 * MIN_CONTRAST * math.sqrt(grey.shape[1])
-    return np.asarray(like * contrast)
+    if spread < 0.5 * MIN_CONTRAST * math.sqrt(len(grey)):
+        return np.zeros(4)
+    return np.asarray(pattern.soft @ grey / spread)
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
@@ -187,20 +175,6 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
         return None
     nearest = (at + 0.5).astype(np.intp)
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
-
-
-def _read_squares(
-    image: NDArray[np.uint8], H: Array, pattern: Pattern
-) -> tuple[NDArray[np.bool_], Array]:
-    """Return which of m squares (m, 3, 3) are in the picture, and the grey values (n, k) there."""
-    h, w = image.shape
-    at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at /= pattern.spots @ H[:, 2, :2, None] + H[:, 2, 2, None, None]
-        low, high = at.min(axis=1), at.max(axis=1)
-        inside = (low >= 0.0).all(axis=1) & (high <= (w - 1, h - 1)).all(axis=1)
-    nearest = (at[inside] + 0.5).astype(np.intp)
-    return inside, image[nearest[..., 1], nearest[..., 0]].astype(np.float64)
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
