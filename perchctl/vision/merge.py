@@ -176,7 +176,7 @@ def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
     late = UNKNOWN_READOUT_S if readout_s is None else readout_s
     out = []
     for d in detections.markers:
-        flow = detections.flow_px_s.get(d.marker, detections.velocity_px_s)
+        flow = detections.flow_px_s.get(d.marker)
         if flow is None:
             out.append(d)
             continue

@@ -113,8 +113,9 @@ class Detections:
     small: Detection | None = None
     mirrored: bool = False  # a marker decoded as its mirror image
     targets: int = 0  # whole targets, both markers, that a search saw
-    velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
-    flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
+    flow_px_s: dict[MarkerName, Array] = field(
+        default_factory=dict
+    )  # (4, 2), or of all corners (2,)
     edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:

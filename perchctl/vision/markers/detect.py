@@ -245,28 +245,25 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
     moves = 0.0 < gap_s <= _MAX_GAP_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
-        flow = previous.flow_px_s.get(d.marker, previous.velocity_px_s)
+        flow = previous.flow_px_s.get(d.marker)
         corners[d.marker] = d.corners_px + (flow * gap_s if moves and flow is not None else 0)
     return corners
 
 
 def with_motion(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with velocity_px_s and flow_px_s, where markers were seen a short time
-    before."""
-    if previous is None:
-        return now
-    gap_s = now.t_s - previous.t_s
-    if not 0.0 < gap_s <= _MAX_GAP_S:
+    """Return `now` with the flow of markers that were seen a short time before; the other moves as
+    they do."""
+    if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
     flow: dict[MarkerName, Array] = {}
     for name in MARKERS:
         a, b = previous.get(name), now.get(name)
         if a is not None and b is not None:
-            flow[name] = (b.corners_px - a.corners_px) / gap_s
+            flow[name] = (b.corners_px - a.corners_px) / (now.t_s - previous.t_s)
     if not flow:
         return now
-    first = next(iter(flow.values()))
-    return replace(now, velocity_px_s=_QUARTERS @ first, flow_px_s=flow)
+    mean = _QUARTERS @ next(iter(flow.values()))
+    return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
 # --- What lines alone left vague, or one of the two markers unseen: measured by the drawing, ---
