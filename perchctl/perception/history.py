@@ -25,12 +25,9 @@ FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it.
-
-    `battery_changed_s`: when the last reading differed from the one before, `battery_v`; without
-    any reading, when the first sample came: an absent one ages like one that stands still.
-    `imu`: the motion by the accelerometer over all samples of the flight.
-    """
+    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it. `battery_changed_s`:
+    when the last reading differed from the one before; without any, when the first sample came.
+    `imu`: the motion by the accelerometer over the whole flight."""
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False
@@ -51,13 +48,10 @@ class History:
 def add_samples(
     history: History, new: list[Telemetry], safety: SafetyConfig, late: bool = False
 ) -> History:
-    """The history with new samples; `jumped` and `turned_rad`, the largest step of the
-    heading, are about these samples only, or about those before, too, where they came `late` in
-    the same turn.
-
-    Samples with NaN or out of order are left out (fault 35). Where position and velocity alone
-    are no numbers, they are those of the sample before, and older by that.
-    """
+    """The history with new samples; `jumped` and `turned_rad`, the largest step of the heading, are
+    about these only, or also about those before, where they came `late` in the same turn. Samples
+    with NaN or out of order are left out (fault 35); a position or velocity alone is that of the
+    sample before."""
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu
     changed_s, battery_v = history.battery_changed_s, history.battery_v
@@ -113,8 +107,7 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """The velocity in world axes by the first sample from `t_s` on, or by the newest; zero without
-    a sample."""
+    """The velocity in world axes by the first sample from `t_s` on, or the newest; else zero."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
@@ -126,8 +119,8 @@ def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the estimate stepped farther than any flight leads: at once, or smeared over a
-    few samples by the vehicle's own filter."""
+    """True if the estimate stepped farther than any flight leads, at once or smeared over
+    samples."""
     last = before[-1]
     first = before[bisect.bisect_left(before, last.t_s - SMEARED_S, key=_time_s)]
     faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
@@ -145,8 +138,7 @@ def _turned_rad(a: Telemetry, b: Telemetry) -> float:
 
 
 def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the position moved farther than its speed explains. Floor and ceiling are near: a
-    step in height counts sooner."""
+    """True if the position moved farther than its speed explains, in height sooner."""
     moved_m = math.dist(a.position_m, b.position_m)
     rise_m = abs(b.position_m[2] - a.position_m[2])
     fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))

@@ -23,8 +23,7 @@ SOLVE_EVERY_S = 1.0
 LIKELY_S = 0.02
 """A delay whose sigma is smaller is where the next pictures' factors are taken."""
 USED_SIGMA_S = 0.008
-"""A delay that is less sure is not used: of its 95 % interval, half is 16 ms, and 30 ms make an
-alignment swing."""
+"""A delay that is less sure is not used: 30 ms make an alignment swing."""
 SLEW = 0.02
 """Seconds a second: at 0.4 m/s the target's place moves by 8 mm/s, as a drift does."""
 LONGEST_STEP_S = 0.1
@@ -54,9 +53,9 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture of the target in its sums, and once a second with
-    their solution. `t_s` is its arrival less the profile's latency. Nothing is learned of a pose
-    that is no number or too near, or where the attitude of its time is not known."""
+    """Return the estimate with one more picture in its sums, and once a second with their solution.
+    `t_s` is its arrival less the profile's latency. Nothing is learned of a pose that is no number
+    or too near, or without the attitude of its time."""
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
@@ -97,15 +96,13 @@ X, Y, HEADING = range(3)
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
 """Columns: the target's place (rad for its heading), and what may explain how it moves."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
-"""What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of the
-mounting's roll and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of
-drift."""
+"""What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of roll
+and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of drift."""
 
 ATTITUDE_STEP_S = 0.02
 """Of the difference that stands for a speed: a shake of 5 Hz keeps 0.94 of its."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
-"""Of the vehicle's speed and rates of turn, as its estimate has them. It looks like motion, and
-like motion that is seen at once: what is not well above it is taken for rest."""
+"""Of the vehicle's speed and rates of turn: what is not well above it is taken for rest."""
 JITTER_S = 0.008
 """By which single pictures are early or late."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
@@ -118,8 +115,7 @@ _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
 LEAST_RANGE_M = 0.15
 """Nearer, nothing is swept: it is pressed soon, and its estimate may run away."""
 STAMPS_S = 0.003
-"""What an average does not take away: of the stamps of telemetry and exposure, and of the
-vehicle's own answer to the noise of its estimate."""
+"""What an average does not take away, of the stamps of telemetry and exposure."""
 LARGE_TURN = 0.03
 """The speeds are those of the profile's mounting: a large turn is known to this part of it."""
 LEAST_FRAMES = 30
@@ -147,12 +143,9 @@ def consistency_moment(
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
     """Return what a frame tells: rows (3, 8) as the columns have them, the variance (3,) of the
-    target's place, and its range along the upward axis, m.
-
-    `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time less `delay_s`, `velocity_mps` its velocity then. `delay_s` is the delay that is thought
-    likely: about it, the factors are those of small changes.
-    """
+    target's place, and its range, m. `before` and `after` are the vehicle's attitude
+    `ATTITUDE_STEP_S` before and after the frame's time less `delay_s`, the delay that is thought
+    likely; `velocity_mps` its velocity then."""
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
@@ -185,14 +178,12 @@ def consistency_moment(
 
 
 def _above(size: float, noise: float) -> float:
-    """Return the part of a motion that counts: none of what noise can be, all of what is far
-    above."""
+    """Return the part of a motion that counts: none of what noise can be."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
 def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
-    """Return the first two rows of ``R_world_body``: without arrays, as this is done for every
-    picture."""
+    """Return the first two rows of ``R_world_body``, without arrays."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -210,8 +201,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_moment(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """Return the sums with one frame more; `rows`, `variance` and `range_m` are what
-    `consistency_moment` returns of it. After a gap, or a jump of the target or of the estimate,
+    """Return the sums with one frame more, by its `consistency_moment`. After a gap, or a jump,
     changes are counted anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)

@@ -102,8 +102,7 @@ class Perception:
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sights(self) -> None:
-        """Forget the sights by which the vehicle's motion is judged, since wrong positions have
-        turned its attitude."""
+        """Forget the sights by which the vehicle's motion is judged."""
         self.motion = drop_sights(self.motion)
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:

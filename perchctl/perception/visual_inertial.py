@@ -53,8 +53,8 @@ class VisualInertialWindow:
 
 
 def drop_sights(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window once wrong positions have turned the attitude: without the sights from before, and
-    content with a rougher speed."""
+    """The window without the sights from before, and content with a rougher speed, once wrong
+    positions have turned the attitude."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 

@@ -23,9 +23,8 @@ from perchctl.vision.types import FieldState, Frame
 Grey = NDArray[np.uint8]
 
 _COMBED = 1.4  # fields a pixel apart
-# Of so many rows in a group all but the outer four are compared with their neighbours, in
-# one go. Odd and even rows must both be: a single lost line of an analogue picture then counts
-# among the differences to its own field's rows as much as among the others.
+# Of so many rows in a group all but the outer four are compared with their neighbours. Odd and even
+# rows must both be: a single lost line then counts among both kinds of differences.
 _GROUP = 8
 _STRONG = 5.0  # of the mean difference within a field, for one to count
 _LEAST_GREY = 8.0
@@ -47,12 +46,11 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 def is_combed(image: Grey) -> bool:
     """Return True if a picture, (h, w) grey, holds two fields of different times: its rows differ
-    much more from the other field's rows than from their own field's."""
+    much more from the other field's than from their own."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False
-    # Groups of rows side by side, so that the next row is `width` further along; every third
-    # group is enough.
+    # Groups of rows side by side: the next row is `width` further along; every third is enough.
     flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
     above2, above, row, below, below2 = (
         flat[:, k * width : (k + _GROUP - 4) * width] for k in range(5)
@@ -80,8 +78,7 @@ def split_fields(image: Grey) -> tuple[Grey, ...]:
 
 
 def field_picture(image: Grey, first_row: int) -> Grey:
-    """Return one field at full height: its own rows (`first_row`, and every second after it) stay
-    where they are, those between are interpolated."""
+    """Return one field at full height: its own rows stay, those between are interpolated."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -95,8 +92,7 @@ def field_picture(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Return the spread of an edge along the rows of a field, by its blur in the whole picture:
-    between rows that are 2 px apart, a sharp edge is where it happens to be taken for."""
+    """Return the spread of an edge along the rows of a field, by its blur in the picture."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
@@ -147,8 +143,7 @@ def _period_s(periods_s: tuple[float, ...]) -> float:
     if not periods_s:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
-    # A receiver with a rate of its own moves them to and fro: 25 a second in 60 come 33 and
-    # 50 ms apart. Lost frames are farther apart than that.
+    # A receiver's own rate moves them to and fro: 25 a second in 60 come 33 and 50 ms apart.
     period_s = mean(p for p in periods_s if p < _LOST * middle_s)
     if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
         return min(_PERIODS_S, key=lambda p: abs(p - period_s))

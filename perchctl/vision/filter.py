@@ -46,15 +46,14 @@ _UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, p
 _PUSH_S = 0.1
 """How long an acceleration lasts: white noise of its square times this, (m/s^2)^2 s."""
 _WANDER = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
-"""Of yaw, x, y and z of the state estimate: 0.1 deg and 5 mm in a second's random walk, as
-2 mm that are forgotten within 0.3 s look from one frame to the next."""
+"""Of yaw, x, y and z of the state estimate: in a second's random walk."""
 _HEADING_RADPS2 = 0.1  # of the state estimate's heading
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Accelerations of a tracked target, standard deviations: along each axis, of its heading,
-    and of the frame's own turning about level axes, which moves what is far the most."""
+    """Accelerations of a tracked target, standard deviations: along each axis, of its heading, and
+    of the frame's own turning about level axes."""
 
     acceleration_mps2: float
     heading_radps2: float
@@ -98,8 +97,7 @@ class Measurement:
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     """Return the filter's constants. At first sight, a target in the world stands nearly still (5
-    cm/s of drift); one in the level frame moves as the vehicle does (30 cm/s), or, where the camera
-    may be in a hand, faster."""
+    cm/s); one in the level frame moves as the vehicle does (30 cm/s), or as a hand."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -241,8 +239,7 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
 ) -> MarkerTrack:
-    """Return the track at a time after its frame, with no measurement in between. Without `spread`
-    its covariance stays that of the frame."""
+    """Return the track later, without a measurement; without `spread` its covariance stays."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track

@@ -27,16 +27,15 @@ from perchctl.vision.types import (
 )
 
 CONSISTENT_CHI2 = 4.0
-"""Per degree of freedom: below it, both markers' corners fit one pose so well that the two
-cannot contradict (that takes four standard deviations)."""
+"""Per degree of freedom: below it, both markers cannot contradict."""
 _PLACE_YAW = [X, Y, Z, YAW]
 _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) is
-    what the tracks' `bias` makes of the place."""
+    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) of
+    place."""
 
     vector: Array
     velocity_mps: Array
@@ -94,7 +93,7 @@ def merge_tracks(
     tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
 ) -> Merged | None:
     """Return the target by the tracks that this frame `fed`, or else by those unseen for the
-    shortest time, both markers' merged by W (equations 5, 8, 12); None without a track."""
+    shortest time, merged by W (equations 5, 8, 12); None without a track."""
     if not tracks:
         return None
     least = min(track.unseen for track in tracks.values())
@@ -158,8 +157,7 @@ def _usable(
 UNKNOWN_READOUT_S = 0.012
 """One standard deviation of a camera's read-out time where nobody has said it."""
 FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
-"""Of a motion, along and across, as shares of it: it was measured from the frame before to this
-one, and changes."""
+"""Of a motion, along and across, as shares of it: it was measured a frame before."""
 
 
 def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
@@ -236,9 +234,8 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 
 def disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
-    """Return True if the markers contradict: farther apart than the limit and than four standard
-    deviations, in any axis (a far small marker is merely vague). What is wrong with the print moves
-    both alike, and excuses no gap."""
+    """Return True if the markers are farther apart than the limit and than four standard
+    deviations, in any axis. What is wrong with the print moves both alike, and excuses no gap."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])

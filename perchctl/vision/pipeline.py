@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from perchctl.vision.merge import Merged, measure_markers, merge_tracks, stage_o
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
-    TargetSelector,
+    marker_aside_m,
     seen_from,
     to_level,
     to_world,
@@ -143,7 +144,7 @@ def step(
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
-    own = TargetSelector(pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
+    own = partial(marker_aside_m, pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
     detections = detect_markers(
         frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
     )

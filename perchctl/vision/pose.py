@@ -211,8 +211,7 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Scored(PoseCandidate):
-    """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6) with (rvec,
-    tvec)."""
+    """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6)."""
 
     error_px: Array
     jacobian: Array
@@ -254,8 +253,8 @@ def solve(points: Points, prior: TiltPrior) -> Scored | None:
 
 
 def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
-    """Refine a pose by Gauss-Newton with each corner's own spread, from a start that is near (the
-    frame before); None where it does not settle within some steps."""
+    """Refine a pose with each corner's own spread, from a start that is near; None where that
+    fails."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -410,22 +409,20 @@ def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored
 
 
 # --- A sheet that is not flat: what its curl does to corners, and what they are worth then ---
-# Corners that curl has moved err together, and those far from the centre err most: a joint pose of
-# both markers rests on the small one as far as the large one may be off.
 
 
 def lift_of(object_m: Array, curl_per_m: float) -> Array:
     """Return how far corners (n, 3) are out of the sheet's plane at one standard deviation of each
-    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners of it to
-    one and two to the other. A sheet rolled about any axis is as much of one as of the other."""
+    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners to
+    either."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def weight_with(curl: Array) -> Array:
-    """Return the inverse covariance (2n, 2n) of errors of unit spread that have `curl` (2n, k), one
-    standard deviation each, among them."""
+    """Return the inverse covariance (2n, 2n) of errors of unit spread with `curl` (2n, k) among
+    them."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
@@ -474,8 +471,7 @@ def make_points(
     K: Array,
     lift: Array,
 ) -> Points:
-    """Return the corners of one or both detections with what each is worth; `lift` as of
-    `PoseSetup`."""
+    """Return the corners of one or both detections with what each is worth."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)

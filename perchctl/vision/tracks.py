@@ -39,8 +39,8 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in the level frame and in the world, whether a pose has to pass the
-    gate, and where the own target is."""
+    """The filters' constants in either frame, whether there is a gate, and the own target's
+    place."""
 
     level: FilterSetup
     world: FilterSetup
@@ -146,8 +146,8 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame's pose, as a measurement of the tracks; `whole` if it rests on both markers;
-    `looks_there` if the lock's place is in the picture."""
+    """A frame's pose, as a measurement; `whole` if it rests on both markers; `looks_there` if the
+    lock's place is in the picture."""
 
     t_s: float
     pose: MarkerPose
@@ -159,9 +159,8 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Whether the pose is the target's; if so, whether the tracks have to begin anew there,
-    else whose it is; and a sentence for people where that is not as ever. `same`: though the
-    tracks begin anew, it is the target that was locked on."""
+    """Whether the pose is the target's; if so, whether the tracks have to begin anew there, though
+    it may be the `same` target; else whose it is; and a sentence where that is not as ever."""
 
     taken: bool
     afresh: bool = False

@@ -43,8 +43,8 @@ _SHEET = 1.3  # half sides of a marker that are surely paper
 def expected_in_blur(
     picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first of the markers that is near to where it is expected (4, 2) px. Fits that
-    begin with little and with much blur take turns; without a `turn`, both are tried."""
+    """Return the first marker near to where it is expected (4, 2) px. Fits that begin with little
+    and with much blur take turns; without a `turn`, both are tried."""
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
@@ -64,8 +64,7 @@ def expected_in_blur(
 
 
 def hidden_in_blur(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """Find a marker anywhere in the picture: of all its quadrilaterals, those whose grey values go
-    best with a marker's cells are verified."""
+    """Return a marker anywhere: the quadrilateral whose grey values go best with its cells."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -206,9 +205,8 @@ def aligned(
 
 
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
-    """Return True if the picture looks like the drawing: the gate. On pictures without the marker
-    the pattern's correlation stays below 0.72 where its strength is as it should be; on the marker,
-    unless noise drowns it, it is above 0.95."""
+    """Return True if the picture looks like the drawing. Without the marker the pattern's
+    correlation stays below 0.72 where its strength is as it should be; on it, it is above 0.95."""
     return (
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS
@@ -219,6 +217,6 @@ def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
 
 
 def told_apart(found: Alignment) -> bool:
-    """Return True if another codeword would look different, and this one is seen. Of 36 others that
-    the gate before this one took for the marker, all had a flip above 0.5."""
+    """Return True if another codeword would look different. Of 36 others that `verified` took for
+    the marker, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA

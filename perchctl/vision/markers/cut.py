@@ -52,23 +52,21 @@ def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraMo
 def is_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """Return True if none of the markers expected at corners (4, 2) px is wholly in the picture and
-    free of the vehicle's gear, or may not be if the prediction is a little off."""
+    """Return True if none of the expected markers (4, 2) px is surely in the picture and free of
+    the vehicle's gear."""
     whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(hides(hidden, c) for c in whole)
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
-    """Return True if one of the markers expected at corners (4, 2) px is wholly in the picture, or
-    may be if the prediction is a little off: a search finds no others."""
+    """Return True if one of the expected markers (4, 2) px may be wholly in the picture."""
     return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
 
 
 def cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker that what is in view of the target stands for, or none; `expected` are
-    corners (4, 2) px, of one marker at least."""
+    """Return the marker that what is in view stands for; `expected` are corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -203,10 +201,9 @@ _LEAST_NODES = 200  # that show paper
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a pinhole's picture, `step` apart in normalised coordinates, the first at
-    `first`; how far from the axis the picture `reaches`, beyond which a lens model may fold
-    back; where the samples that make up a node are read in the reduced picture, which has
-    `size` (width, height); and the nodes that are in the picture (rows, columns)."""
+    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on; how far
+    from the axis the picture `reaches`, beyond which a lens model may fold back; where a node's
+    samples are read in the reduced picture of `size` (width, height); and which nodes are in it."""
 
     first: Array
     step: float
@@ -219,8 +216,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """Grey values at a lattice's nodes (rows, columns), and which of them are the picture's and
-    not covered."""
+    """Grey values at a lattice's nodes (rows, columns), and which of them are seen."""
 
     lattice: Lattice
     grey: Grey
@@ -289,8 +285,8 @@ def _coarse(fine: Grey) -> Grey:
 
 
 def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the whiteness of the drawing at the lattice's nodes and `margin` more all around; H
-    (3, 3) maps own coordinates to normalised ones."""
+    """Return the whiteness of the drawing through H (3, 3) at the nodes and `margin` more
+    around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -312,8 +308,7 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
 
 
 def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
-    """Return how far the picture is from the drawing through H, (2,) normalised, to a node; and the
-    correlation there."""
+    """Return how far the picture is from the drawing through H, (2,) normalised, and how like."""
     lattice = view.lattice
     wide = drawn_over(H, texture, lattice, _SEARCHED)
     mask = view.seen.astype(np.float32)
@@ -325,8 +320,8 @@ def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
 
 
 def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Return the likeness of the picture with the drawing through H in its best light, where there
-    is paper; and that light's gain, grey levels from black to white."""
+    """Return the likeness of the picture with the drawing through H in its best light, and that
+    light's gain, grey levels from black to white."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -353,9 +348,9 @@ _TEXELS = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each
-    lies on (n,), which is printed as a whole, and how far that may be off its place (n,); the width
-    of the cells beside it (n,); and whether it is the small marker's (n,)."""
+    """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each lies
+    on (n,), and how far that may be printed off (n,); the cells' width beside it (n,); and whether
+    it is the small marker's (n,)."""
 
     at: Array
     normal: Array
@@ -372,8 +367,7 @@ pixels."""
 
 @lru_cache(maxsize=8)
 def outline_of(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
-    """Return the outline of a large marker with the small one in its centre, with the tolerance of
-    the place of each one's edges, in cells."""
+    """Return the outline of both markers, with the tolerance of their edges, in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -466,9 +460,8 @@ class RigidPose:
 
 @dataclass(frozen=True, eq=False)
 class Visible:
-    """A pose with its covariance (6, 6) of turn and move; how many places along edges were in
-    view, how many showed their edge, how many of these are the small marker's; and the spread
-    of a single place."""
+    """A pose with its covariance (6, 6) of turn and move; how many places were in view, how many
+    showed their edge, how many of these are the small marker's; and the spread of one."""
 
     pose: RigidPose
     cov: Array
@@ -503,8 +496,7 @@ def fitted(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> Visible | None:
-    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off. None
-    where too few edges are in view, or the fit breaks down."""
+    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off."""
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)

@@ -47,7 +47,7 @@ from perchctl.vision.markers.pattern import (
     resembles,
 )
 from perchctl.vision.markers.search import Found, Look, search, search_halved
-from perchctl.vision.target_selection import TargetSelector
+from perchctl.vision.target_selection import AsideOf
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -71,18 +71,13 @@ def detect_markers(
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: TargetSelector | None = None,
+    own: AsideOf | None = None,
 ) -> Detections:
-    """Find and refine the target's markers in one frame.
-
-    `previous` is what an earlier frame gave (the last one that saw something is best);
-    it gives the place to look at first and decides between look-alikes. `expected` are better
-    predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
-    `empty_frames` is how many frames in a row have shown nothing: in a stream the searches take
-    turns by it, since all of them in one frame take longer than a frame may. None searches by
-    all. `own` chooses among several targets where none is expected. In a frame of two fields each
-    is looked at, and the result is the mean: where the markers were at the frame's own time.
-    """
+    """Find and refine the target's markers in one frame. `previous` is what the last frame that saw
+    something gave: it gives the place to look at first, where no corners (4, 2) px are `expected`
+    by the vehicle's motion. `empty_frames` is how many frames in a row have shown nothing: in a
+    stream the searches take turns by it; None searches by all. `own` chooses among several targets
+    where none is expected. Of a frame of two fields the result is the mean."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     both = with_missing_marker(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup.by_lines)
@@ -251,8 +246,7 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
 
 
 def with_motion(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with the flow of markers that were seen a short time before; the other moves as
-    they do."""
+    """Return `now` with the flow of markers that were seen a short time before, or of the other."""
     if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
     flow: dict[MarkerName, Array] = {}
@@ -277,8 +271,7 @@ _REACH = 0.3  # of the side
 _MAX_SIGMA_ALONE, _MAX_SIGMA = 0.06, 0.12  # of the side
 _BLUR_PX = 1.5  # to start with, where it is not known
 _ACROSS_PX = 0.37
-"""Sigma. Sides have a pixel's own width and that of reading it in their blur, the drawing has not:
-0.81 px where it settles at 0.72, of far markers in flight."""
+"""Sigma: sides have the width of pixels and of reading them in their blur, a drawing has not."""
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
@@ -290,10 +283,8 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
 
 def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
     """Return the markers that were seen, with better corners and with the other marker if it shows.
-
-    A drawing is not laid over what is hidden. What a search found, its bits read one by one,
-    stays only where lines suffice, the drawing confirms it, or the other marker was seen with
-    it."""
+    What a search found stays only where lines suffice, the drawing confirms it, or the other marker
+    was seen with it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = around(picture, better["small"])
@@ -348,8 +339,7 @@ _ANCHOR = 0.12  # of the small marker's side
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
-    """Return the markers near to corners (4, 2) px that have lines for sides; `shift` is what was
-    measured of the edges in an earlier picture."""
+    """Return the markers near to corners (4, 2) px that have lines for sides."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -383,9 +373,8 @@ def follow_partly(
     seen: _Seen,
     shift: EdgeShift | None = None,
 ) -> _Seen:
-    """Return the markers of `follow` with those that it did not verify, by what is seen of them.
-    Where the small marker was met, the large one is looked for around it instead of where it was
-    expected."""
+    """Return the markers of `follow` with the others by what is seen of them. Where the small
+    marker was met, the large one is looked for around it."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
         places["large"] = picture.nested(seen["small"].corners_px, "large")
@@ -405,9 +394,8 @@ def follow_partly(
 
 
 def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """Return the large marker around a small one that was found: something may cover a part of it,
-    and it may be cut off by the picture's edge, so long as its sides are lines where they are seen
-    and most cells show."""
+    """Return the large marker around a small one that was found, of which a part may be covered or
+    cut off."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
@@ -440,11 +428,8 @@ _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def between(a: Detections, b: Detections) -> Detections:
-    """Return the mean of both fields' corners, which is right for either order of the fields.
-
-    A marker that only one field shows is left out where the other marker is in both: the
-    two would belong to different moments. Nothing lies between two different targets.
-    """
+    """Return the mean of both fields' corners, which is right for either order of the fields. A
+    marker that only one field shows is left out where the other is in both."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = a.get(name), b.get(name)

@@ -82,8 +82,7 @@ def make_aruco_detector(
 def make_marker_decoder(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
-    """Return OpenCV's detector of markers that it can decode, for one pass over a picture of that
-    size. Making one takes about a microsecond, a pass a thousand times as long."""
+    """Return OpenCV's detector of markers, for one pass over a picture of that size."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
     parameters.minDistanceToBorder = 0
@@ -94,8 +93,7 @@ def make_marker_decoder(
 
 
 def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
-    """Return OpenCV's detector, set so that it takes nearly any quadrilateral for a candidate, for
-    blurred pictures: round corners, wide dark borders, small sides."""
+    """Return OpenCV's detector, set to take nearly any quadrilateral of a blurred picture."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -143,8 +141,8 @@ _TINY = 1e-4
 
 
 def hidden_in(frame: Frame, mask: Covered | None) -> Covered | None:
-    """Return where a frame of one moment shows the vehicle, which covers `mask` (h, w) of a whole
-    picture: in one made of a single field, whose missing rows are interpolated, beside it too."""
+    """Return where a frame shows the vehicle, which covers `mask` (h, w) of a whole picture: in a
+    single field, whose missing rows are interpolated, beside it too."""
     if mask is None or frame.fields not in ("top", "bottom"):
         return mask
     return cv2.dilate(mask.astype(np.uint8), np.ones((_FIELD_ROWS, 1), np.uint8)) > 0
@@ -167,8 +165,7 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
 
 
 def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """Return True if a part of the marker with these corners (4, 2) is hidden, as far as `reach`
-    half sides from its centre."""
+    """Return True if a part of the marker is hidden, up to `reach` half sides from its centre."""
     if hidden is None:
         return False
     h, w = hidden.shape
@@ -189,7 +186,7 @@ def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
-    where something else is before the target; None: nowhere."""
+    where something is before the target."""
 
     image: NDArray[np.uint8]
     hidden: Covered | None

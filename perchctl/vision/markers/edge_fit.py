@@ -57,8 +57,8 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """Return where along sides of these lengths (rows,) the brightness is sampled across them, as
-    shares of the side (rows, n), 0..1; not near the corners, where the next side's blur begins."""
+    """Return where along sides of these lengths (rows,) profiles are, as shares of the side (rows,
+    n): not near the corners, where the next side blurs."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -202,8 +202,7 @@ def _refined_once(
         return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, residual_px, corners_px)
-    # Variance of the ends of the sides: a line fitted to n samples spreads twice as far there as
-    # in its middle.
+    # A line fitted to n samples spreads twice as far at its ends as in its middle.
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
     ends_px2 = (4.0 * _TAILS * residual_px * residual_px / independent).tolist()
     blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
@@ -258,8 +257,7 @@ def _intersect(lines: Array) -> Array:
 
 
 def shift_prior_px(white_grey: float) -> float:
-    """Return the spread of the shift that all edges share, before it is measured, by how white the
-    camera sees the paper."""
+    """Return the spread of the shift of all edges before it is measured, by how white paper is."""
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
@@ -291,8 +289,7 @@ def _measured_shift(
     some = mass > _MIN_PROFILES
     if not some.any():
         return EdgeShift(0.0, prior_px)
-    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
-    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
+    # A sheet that curls moves outer edges farther than inner ones, and ends farther than middles.
     bent_px = 8.0 * r / (3.0 * rim.cells) * _bow_px(markers, sides, lines, residual_px)
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -380,8 +377,7 @@ def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
 
 
 # --- The sides of markers, measured: the edge's place on profiles across each of them ---
-# A row is one side of one marker: rows 4 i to 4 i + 3 belong to marker i. After all of
-# them the inner edges of one marker's border may follow.
+# Rows 4 i to 4 i + 3 are of marker i; then the inner edges of one marker's border may follow.
 
 
 _MIN_SHIFT_CELL_PX = 6.0  # of a border whose inner edge is measured too
@@ -390,10 +386,10 @@ _SIDES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """What is to be measured: raw_px (m, 4, 2), the same normalised, the lengths of their
-    sides and the width of the cells behind each of them (m, 4), the mean width of a marker's
-    cells (m,), the number of the marker with the widest, +1 or -1 as its corners run (m,), and
-    pixels for a unit of normalised coordinates along each side (4m,)."""
+    """What is to be measured: raw_px (m, 4, 2), the same normalised, the sides' lengths and the
+    width of the cells behind each (m, 4), the mean width of cells (m,), the number of the marker
+    with the widest, +1 or -1 as corners run (m,), and pixels for a normalised unit along sides
+    (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
@@ -419,8 +415,7 @@ class Samples:
 
 
 def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """Return what is to be measured of markers with these raw corners; None where one of them is no
-    square at all."""
+    """Return what is to be measured of markers with these corners; None where one is no square."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -448,9 +443,8 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
 def measure(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
-    """Return the edges' places on profiles across all sides; and, on request, across the inner
-    edges of the border with the widest cells, which shows best by how much all edges are shifted.
-    None where these cells are too small."""
+    """Return the edges' places on profiles across all sides and, on request, across the inner edges
+    of the border with the widest cells, if these are wide enough."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -486,16 +480,14 @@ def measure(
 
 
 def reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return how far from an edge the window around it and the profile across it reach, by the
-    width of the cells beside it."""
+    """Return how far the window around an edge and the profile across it reach, by the cells."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> Surroundings:
-    """Return which profiles at places `s` (rows, n) have a neighbouring edge, `depth_px` (rows,)
-    away, and which have an edge: four rows a rim, and then perhaps the border's inner edges of one.
-    """
+    """Return the `Surroundings` of profiles at places `s` (rows, n): four rows a rim, and then
+    perhaps the inner edges of one border."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -622,8 +614,7 @@ class _Profiles:
         return np.divide(moments[..., 1], np.where(usable, total, _ONE)), usable
 
     def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Return the edges by a window around the row's line (rows, n), as wide as its blur so
-        far demands, which of them count, and the blur's square."""
+        """Return the edges by a window around the row's line (rows, n), which count, and blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
@@ -633,8 +624,7 @@ class _Profiles:
         mass *= self.gradient
         total = (mass @ _STEP_ONES) * self.can
         usable = total > np.maximum(total.dot(_ONES32) * self.part, _TINY)[:, None]
-        # A neighbour seen through the window has this share, at this place, with this
-        # spread; the one outside lies at the same distance on the other flank.
+        # A neighbour seen through the window has this share, at this place, with this spread.
         wide2 = w2 + blur2
         place = self.depth * w2 / wide2
         lost = np.exp(_MINUS_HALF * self.depth * self.depth / wide2)
@@ -689,10 +679,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
 
 
 def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return each row's median over its usable values, to a rank, (rows,); 0 without any.
-
-    The others are set high and low by turns, which keeps the middle where it is.
-    """
+    """Return each row's median over its usable values, to a rank, (rows,); 0 without any."""
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)
     found = values[:, PROFILES // 2]

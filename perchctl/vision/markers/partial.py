@@ -105,8 +105,7 @@ def seen_partly(
 
 
 def wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
-    """Return True if nothing of the marker is hidden, and the picture's edge too far away to take
-    anything from the sides' blur."""
+    """Return True if nothing of the marker is hidden or too near to the picture's edge."""
     room_px = ROOM_PX + found.blur_px
     return within(found.corners_px, picture.image.shape, room_px) and not hides(
         picture.hidden, found.corners_px
@@ -300,9 +299,9 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False)
 class SeenEdges:
-    """Edges of one round: of each profile (rows, n) its place in the marker's own coordinates
-    (rows, n, 2), how far outwards it is from where the square has it, and its weight; the rows,
-    and the blur of each in terms of the window (rows,); and how white the paper is."""
+    """Edges of one round: of each profile (rows, n) its place in own coordinates (rows, n, 2), how
+    far outwards it is of the square's, and its weight; the rows, the blur of each in terms of the
+    window (rows,); and how white the paper is."""
 
     own: Array
     far_px: Array
@@ -313,8 +312,7 @@ class SeenEdges:
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """Return the edges near to where the square H has them; None where too few are seen. Sides of
-    which nothing is seen are left out."""
+    """Return the edges near to where the square H has them; None where too few are seen."""
     camera = picture.camera
     rows = _rows(H, pattern, camera)
     if rows is None:

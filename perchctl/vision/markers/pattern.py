@@ -65,10 +65,8 @@ class Pattern:
 
 
 def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """Return the rim of a marker with the inner bits (n, n), 1 = white.
-
-    At small sizes the rim's blur reaches the border's outer edge and would push it out.
-    """
+    """Return the rim of a marker with the inner bits (n, n), 1 = white, whose blur may reach the
+    edge."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -85,8 +83,7 @@ def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return how a marker looks, with spots in every cell but those that another marker in the
-    centre covers."""
+    """Return how a marker looks, with spots in the cells that no other marker covers."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -146,8 +143,8 @@ def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> 
 
 
 def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the correlation of the cells' grey values with the pattern for corners (4, 2) rolled
-    on by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
+    """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
+    rolled on by 0 to 3; 0 without contrast."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
@@ -214,8 +211,7 @@ class Drawing:
 def drawing_of(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
-    """Return the drawing of inner bits, 1 = white; with a centre, that of the target's large
-    marker: its sheet has a cell of white around it."""
+    """Return the drawing of inner bits, 1 = white; with a centre, the large marker's."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -253,8 +249,7 @@ def square(cells: int, n: int) -> NDArray[np.float32]:
 
 
 def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of each node and of `EDGE` nodes more all around, exact in area, as if
-    the paper had no end."""
+    """Return the whiteness of each node and of `EDGE` nodes more all around, exact in area."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
@@ -265,8 +260,7 @@ def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """Return the share of each row (or column) of cells in each node (n, cells), blurred by sigma
-    nodes: a cell's share in the drawing is the product of its row's and its column's."""
+    """Return the share of each row (or column) of cells in each node (n, cells), blurred."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE

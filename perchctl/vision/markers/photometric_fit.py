@@ -39,15 +39,13 @@ _HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
 _STILL_PX = 0.05  # the round after such a step moves a tenth of that, mostly
 _LENS_PX = 0.3  # what the lens does is computed anew after this way
 _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
-# How far shape may leave its start, as standard deviations, per unit of the marker's
-# half side: turns and scales; then the perspective, which a few pixels hardly show.
+# How far shape may leave its start, a unit of half a side: turns and scales; the perspective.
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
 _BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
 _MOST_BLUR_STEP = 0.5  # of a round: of the blur's square; a node's square at least
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
-"""A change of blur draws nothing anew that is smaller than both: as a share of it, and in cells.
-A blur of half a cell that is 5 % off leaves more than codewords differ by."""
+"""A change of blur draws nothing anew that is smaller than both: as a share, and in cells."""
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 _SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # unknowns: the increment, blur, those of light
@@ -108,11 +106,8 @@ def align(
     camera: CameraModel,
     blur_px: float = 1.0,
 ) -> Alignment | None:
-    """Lay the drawing over the picture, starting with corners `start_px` (4, 2) and a blur.
-
-    None where the marker leaves the picture, has no contrast, is not alike at all, or the fit
-    breaks down.
-    """
+    """Lay the drawing over the picture, starting with corners `start_px` (4, 2) and a blur. None
+    where the marker leaves the picture, is not alike at all, or the fit breaks down."""
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all():
         return None
@@ -283,8 +278,8 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 
 
 # --- The light on a marker: what turns its drawing into grey values ---
-# Offset and gain, their slopes over the marker, the bend of the tone curve (clipped white,
-# gamma) and the grey beyond the sheet. All of them shift edges if left out.
+# Offset, gain, their slopes, the bend of the tone curve and the grey beyond the sheet: all of them
+# shift edges if left out.
 
 
 def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
@@ -345,9 +340,8 @@ def through_lens(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """Return how far the lens moves each node that is seen through H, (2, n * n). A lens moves
-    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through these.
-    """
+    """Return how far the lens moves each node that is seen through H, (2, n * n): computed for a
+    few nodes, and for the rest by the polynomial through these."""
     uv1, between = _few(grid)
     pin = projected(H, uv1)
     shift = (through_lens(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -391,8 +385,7 @@ def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) ->
 
 
 # --- Products of long rows, a value for each node of a square grid ----
-# They are taken block by block: large products wake threads, which cost more than they
-# save, and far more on a busy machine.
+# They are taken block by block: large products wake threads, which cost more than they save.
 
 
 _BLOCK = 256  # values of a row

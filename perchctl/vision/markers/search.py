@@ -22,13 +22,12 @@ from perchctl.vision.markers.detector import (
     Thresholds,
     make_marker_decoder,
 )
-from perchctl.vision.target_selection import TargetSelector
+from perchctl.vision.target_selection import AsideOf
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
-"""How a picture is searched for a target that is not simply where it is expected: near to
-that place, by a search (window), by fits to a blurred one, or both (near); all over for a sharp
-one, or for one that blur hides; or all that."""
+"""Where a target is looked for: near to where it is expected by a search (window), by fits to a
+blurred one, or both (near); all over if sharp, or blurred; or all that."""
 _WINDOW_MARGIN = 0.25  # of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
@@ -44,8 +43,8 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Raw corners (4, 2) px of at most one of each marker, whether the small marker's
-    mirror image is there, and how many whole targets, both markers, there were to choose from."""
+    """Raw corners (4, 2) px of at most one of each marker, whether the mirror image of one is
+    there, and how many whole targets there were to choose from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     mirrored: bool = False
@@ -56,12 +55,11 @@ def search(
     picture: Picture,
     expected: Mapping[MarkerName, Array],
     look: Look = "all",
-    own: TargetSelector | None = None,
+    own: AsideOf | None = None,
 ) -> Found:
     """Search the window, if there is one, and the whole picture where that gave too little; only
-    one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
-    half the size first: all that may be whole in the picture is enough. `own` chooses among several
-    where none is expected."""
+    one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several where
+    none is expected."""
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.by_lines and expected and look != "sharp":
@@ -82,10 +80,10 @@ def search(
 
 
 def search_halved(
-    picture: Picture, expected: Mapping[MarkerName, Array], own: TargetSelector | None = None
+    picture: Picture, expected: Mapping[MarkerName, Array], own: AsideOf | None = None
 ) -> Found | None:
     """Search the window at half the size: a millisecond. None where that did not show all that
-    should be whole in the picture, or where that is too small for it."""
+    should be whole in the picture."""
     shape = picture.image.shape
     in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
@@ -99,11 +97,8 @@ def search_halved(
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """Return where to look, None where a window would not pay.
-
-    It holds the whole large marker as long as that can be in the picture, so that
-    the stage can change from one frame to the next.
-    """
+    """Return where to look, None where a window would not pay. It holds the whole large marker as
+    long as that can be in the picture."""
     h, w = shape[:2]
     if "large" in expected:
         corners = expected["large"]
@@ -128,7 +123,7 @@ def _pass(
     window: Window,
     expected: Mapping[MarkerName, Array],
     thresholds: Thresholds,
-    own: TargetSelector | None,
+    own: AsideOf | None,
     halved: bool = False,
 ) -> Found:
     """Return what one pass of OpenCV's detector over the window gives, perhaps at half its size."""
@@ -160,16 +155,12 @@ def choose(
     candidates: Mapping[MarkerName, list[Array]],
     expected: Mapping[MarkerName, Array],
     ratio: float,
-    own: TargetSelector | None = None,
+    own: AsideOf | None = None,
 ) -> dict[MarkerName, Array]:
-    """Return at most one of each marker: look-alikes and what does not fit together are dropped.
-
-    A small marker in the centre of a large one, of the right size and turn, verifies
-    both; of several such pairs the one counts that is nearest to the last detections, and what
-    goes on from these counts more than a pair elsewhere. Without a pair the last detections
-    decide; without these, a lone marker is taken. Of several the one counts that `own` has
-    nearest; without it the evidence is too thin to take any of several lone ones.
-    """
+    """Return at most one of each marker. A small marker in the centre of a large one, of the right
+    size and turn, verifies both; of several such pairs the one counts that is nearest to the last
+    detections, and what goes on from these counts more than a pair elsewhere. Without these, a lone
+    marker is taken, of several the one that `own` has nearest."""
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
@@ -202,7 +193,7 @@ def choose(
 
 
 def _nearest_first(
-    candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
+    candidates: Mapping[MarkerName, list[Array]], own: AsideOf
 ) -> Mapping[MarkerName, list[Array]]:
     """Return the candidates that are least far aside first, without those that are too far. A lone
     one is left to the pipeline, which says why it is not taken."""
@@ -210,9 +201,9 @@ def _nearest_first(
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
     for name, quads in candidates.items():
-        away_m = [own.aside_m(name, quad) for quad in quads]
+        away_m = [own(name, quad) for quad in quads]
         order = np.argsort(away_m, kind="stable").tolist()
-        kept[name] = [quads[k] for k in order if math.isfinite(away_m[k]) or not own.refuses]
+        kept[name] = [quads[k] for k in order if math.isfinite(away_m[k])]
     return kept if any(kept.values()) else candidates
 
 
@@ -230,8 +221,7 @@ def _wholes(
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return how far the small marker's corners are from where the large one puts them, in units of
-    what is allowed (1 or less: they belong together)."""
+    """Return how far the small marker is from where the large one puts it; up to 1 is allowed."""
     mapped = nested(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
