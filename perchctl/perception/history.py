@@ -107,7 +107,7 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """The velocity in world axes by the first sample from `t_s` on, or the newest; else zero."""
+    """The velocity in world axes from `t_s` on, or the newest; else zero."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
@@ -119,8 +119,7 @@ def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the estimate stepped farther than any flight leads, at once or smeared over
-    samples."""
+    """True if the estimate stepped farther than any flight leads, at once or smeared."""
     last = before[-1]
     first = before[bisect.bisect_left(before, last.t_s - SMEARED_S, key=_time_s)]
     faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
@@ -138,7 +137,7 @@ def _turned_rad(a: Telemetry, b: Telemetry) -> float:
 
 
 def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the position moved farther than its speed explains, in height sooner."""
+    """True if the position moved farther than its speed explains."""
     moved_m = math.dist(a.position_m, b.position_m)
     rise_m = abs(b.position_m[2] - a.position_m[2])
     fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))
@@ -156,7 +155,7 @@ def _is_placed(s: Telemetry) -> bool:
 
 
 def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
-    """The sample with position and velocity of the last one: the others are fresh all the same."""
+    """The sample with position and velocity of the last one."""
     behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
     return replace(
         new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s

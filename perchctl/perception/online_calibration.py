@@ -21,11 +21,11 @@ from perchctl.vision import Attitude, Consistency, MarkerPose, PoseSetup
 
 SOLVE_EVERY_S = 1.0
 LIKELY_S = 0.02
-"""A delay whose sigma is smaller is where the next pictures' factors are taken."""
+"""A surer delay is where the next pictures' factors are taken."""
 USED_SIGMA_S = 0.008
 """A delay that is less sure is not used: 30 ms make an alignment swing."""
 SLEW = 0.02
-"""Seconds a second: at 0.4 m/s the target's place moves by 8 mm/s, as a drift does."""
+"""Seconds a second: at 0.4 m/s the target moves by 8 mm/s, as a drift does."""
 LONGEST_STEP_S = 0.1
 
 
@@ -94,30 +94,30 @@ def update_calibration(
 
 X, Y, HEADING = range(3)
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
-"""Columns: the target's place (rad for its heading), and what may explain how it moves."""
+"""Columns: the place (rad for the heading), and what may explain its moves."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
 """What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of roll
 and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of drift."""
 
 ATTITUDE_STEP_S = 0.02
-"""Of the difference that stands for a speed: a shake of 5 Hz keeps 0.94 of its."""
+"""Of the difference that stands for a speed."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
 """Of the vehicle's speed and rates of turn: what is not well above it is taken for rest."""
 JITTER_S = 0.008
 """By which single pictures are early or late."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
-"""Of the estimate's place, and of its heading, roll and pitch, in a second's random walk."""
+"""Of the estimate's place and attitude, in a second's random walk."""
 MOST_GAP_S = 0.5
 GATE_SIGMAS = 5.0
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
-"""What the gate takes for possible beyond the noise: 200 ms, and 0.4 rad about each axis."""
+"""What the gate allows beyond the noise: 200 ms, and 0.4 rad."""
 LEAST_RANGE_M = 0.15
-"""Nearer, nothing is swept: it is pressed soon, and its estimate may run away."""
+"""Nearer, nothing is swept: it is pressed soon."""
 STAMPS_S = 0.003
 """What an average does not take away, of the stamps of telemetry and exposure."""
 LARGE_TURN = 0.03
-"""The speeds are those of the profile's mounting: a large turn is known to this part of it."""
+"""The speeds are by the profile's mounting: a large turn is known so well."""
 LEAST_FRAMES = 30
 
 

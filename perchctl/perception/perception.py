@@ -106,7 +106,7 @@ class Perception:
         self.motion = drop_sights(self.motion)
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
-        """Update the estimates of motion, latency and mounting with a picture of the target."""
+        """Update what is estimated of motion, latency and mounting."""
         pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history

@@ -53,8 +53,7 @@ class VisualInertialWindow:
 
 
 def drop_sights(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window without the sights from before, and content with a rougher speed, once wrong
-    positions have turned the attitude."""
+    """The window without the sights from before, and content with a rougher speed."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -65,8 +64,8 @@ def estimate_motion(
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
 ) -> VisualInertialWindow:
-    """The window with one more sight. `samples`: the telemetry of the last 2 s, oldest first;
-    `offset_g`: what the accelerometer reads too much."""
+    """The window with one more sight, by the telemetry of the last 2 s, oldest first; `offset_g` is
+    what the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, way_m)))
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS

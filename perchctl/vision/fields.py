@@ -92,7 +92,7 @@ def field_picture(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Return the spread of an edge along the rows of a field, by its blur in the picture."""
+    """Return the spread of an edge along the rows of a field, by its blur."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
@@ -104,7 +104,7 @@ def classify_fields(frame: Frame) -> Frame:
 
 
 def halves(frame: Frame) -> tuple[Frame, Frame]:
-    """Return the top and the bottom field of a woven frame, both at the frame's time."""
+    """Return the top and the bottom field, both at the frame's time."""
     return (
         replace(frame, image=field_picture(frame.image, 0), fields="top", encoded=None),
         replace(frame, image=field_picture(frame.image, 1), fields="bottom", encoded=None),
@@ -139,7 +139,7 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
 
 
 def _period_s(periods_s: tuple[float, ...]) -> float:
-    """Return the frames' period, which is television's where it is near to that."""
+    """Return the frames' period, perhaps television's."""
     if not periods_s:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
@@ -160,7 +160,7 @@ def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
 
 
 def _voted(state: FieldState, frame: Frame) -> FieldState:
-    """Return the state with the evidence of this frame and the one before about the order."""
+    """Return the state with this evidence about the order."""
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:

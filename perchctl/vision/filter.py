@@ -62,7 +62,7 @@ class ProcessNoise:
 
     @cached_property
     def unturned(self) -> Array:
-        """What a second adds to the rates of yaw, x, y and z, but for the turning, (4, 4)."""
+        """What a second adds to the rates of (yaw, x, y, z), (4, 4)."""
         push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
         return np.diag(push * push) * _PUSH_S
 
@@ -134,7 +134,7 @@ def transition(dt_s: float) -> Array:
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """Return Q (8, 8) of a step, for a target at `position_m` (3,) in the tracks' frame."""
+    """Return Q (8, 8) of a step, for a target at `position_m` (3,)."""
     noise = setup.process
     if noise is None:
         return setup.Q
@@ -263,7 +263,7 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
 def _moved(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """Return the track at `t_s`, its state being x, after `dt_s` without a measurement."""
+    """Return the track at `t_s`, its state being x, without a measurement."""
     x = _drifting(x, setup)
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))

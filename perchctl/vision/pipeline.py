@@ -148,26 +148,18 @@ def step(
     detections = detect_markers(
         frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
     )
-    return _followed(state, detections, near, attitude, pipeline, frame.fields or "whole")
+    return follow(state, detections, attitude, pipeline, near, frame.fields or "whole")
 
 
 def follow(
-    state: PipelineState, detections: Detections, attitude: Attitude | None, pipeline: Pipeline
-) -> tuple[PipelineState, PipelineOutput]:
-    """Do what `step` does from the corners on: from what a picture gave, at its time."""
-    _, near = expected_corners(state.sighting, detections.t_s, attitude, pipeline.pose)
-    return _followed(state, detections, near, attitude, pipeline)
-
-
-def _followed(
     state: PipelineState,
     detections: Detections,
-    near: PoseCandidate | None,
     attitude: Attitude | None,
     pipeline: Pipeline,
+    near: PoseCandidate | None = None,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Measure, track and estimate what the detections show; `near` is the pose that is expected."""
+    """Do what `step` does from the corners on; `near` is the pose that is expected."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
     measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)

@@ -52,7 +52,7 @@ class PoseSetup:
 
     @cached_property
     def lift(self) -> dict[_Source, Array]:
-        """How far these corners are out of the plane of a sheet that curls (`lift_of`)."""
+        """How far these corners are out of the plane of a sheet that curls."""
         curl = self.target.curl_per_m
         return {source: lift_of(corners, curl) for source, corners in self.corners_m.items()}
 
@@ -116,7 +116,7 @@ def estimate_pose(
 def _continued(
     points: Points, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> Scored | None:
-    """Return the solution next to a start, if it leaves `most_px` RMS or less; else None."""
+    """Return the solution next to a start, if it leaves `most_px` RMS or less."""
     solution = None if start is None else gauss_newton(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
@@ -131,7 +131,7 @@ def _level_pose(
     R_level_body: Array,
     setup: PoseSetup,
 ) -> MarkerPose:
-    """Return the solution relative to the gear in the level frame, with its covariance there."""
+    """Return the solution relative to the gear in the level frame."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
@@ -225,7 +225,7 @@ class Scored(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """The marker's normal (3,) as far as it is known, camera axes, to `spread_rad`."""
+    """The marker's normal (3,) as far as it is known, camera axes."""
 
     normal_cam: Array | None
     spread_rad: float
@@ -240,7 +240,7 @@ class TiltPrior:
 
 
 def solve(points: Points, prior: TiltPrior) -> Scored | None:
-    """Return the better of both tilts; None without a finite one in front of the camera."""
+    """Return the better of both tilts, in front of the camera."""
     candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
@@ -323,7 +323,7 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 
 def _curl(points: Points, scored: Scored) -> Array:
-    """Return what one standard deviation of each kind of curl does to the whitened errors."""
+    """Return what each kind of curl does to the whitened errors."""
     normal_cam = cv2.Rodrigues(scored.rvec)[0][:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.lift
@@ -342,7 +342,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
 
 
 def _closed_form(points: Points) -> list[PoseCandidate]:
-    """Return the candidates of OpenCV's SQPNP; none of corners all on one line or point."""
+    """Return the candidates of OpenCV's SQPNP; none of corners on one line."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
@@ -360,7 +360,7 @@ def _usable(candidate: PoseCandidate) -> bool:
 
 
 def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
-    """Return the candidate refined by OpenCV's Levenberg-Marquardt, or as it was."""
+    """Return the candidate refined by OpenCV, or as it was."""
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
@@ -394,7 +394,7 @@ def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
 
 
 def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored:
-    """Return the best candidate by the errors of corners and tilt in units of their spread."""
+    """Return the best candidate by corners and tilt."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -504,7 +504,7 @@ def make_points(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Return the unit normals (m, 4, 2) of the sides of m squares, whichever way round."""
+    """Return the unit normals (m, 4, 2) of the sides of m squares."""
     side = corners.take(_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -516,12 +516,12 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _whitened(cov_px2: Array) -> Array:
-    """Return what makes errors of that covariance independent and of unit spread, (8, 8)."""
+    """Return what makes errors independent and of unit spread, (8, 8)."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:
-    """Return the spread of the sides, (4,): the more of one lies along the rows, the worse."""
+    """Return the spread of the sides, (4,): worse for one along the rows."""
     way = corners.take(_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(way[:, 1])

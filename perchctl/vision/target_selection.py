@@ -52,7 +52,7 @@ def marker_aside_m(
 def aside_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """Return how far a target is from the own one's place, else from the axis through the gear."""
+    """Return how far a target is from the own one's place."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -62,7 +62,7 @@ def aside_m(
 def refusal(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Return one sentence where the target is another vehicle's, which needs an attitude to say."""
+    """Return one sentence where the target is another vehicle's."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = aside_m(pose, attitude, place, setup)
@@ -110,7 +110,7 @@ def measurement(
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """Return what a pose measures of a track in the world, or in the level frame."""
+    """Return what a pose measures of a track."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:

@@ -230,7 +230,7 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """By how much a pose is off in (yaw, x, y, z), (4,), and the spread S (4, 4) of that."""
+    """By how much a pose is off in (yaw, x, y, z), (4,), and its spread (4, 4)."""
 
     off: Array
     S: Array
@@ -252,7 +252,7 @@ class _Fit:
 
 
 def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
-    """Return by how much the pose is off from the one that a track foresees, however late."""
+    """Return by how much the pose is off from what a track foresees."""
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The most that it drifts counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
@@ -297,7 +297,7 @@ def _goes_on(lock: Lock, sight: Sight, off_in_world: Array) -> bool:
 
 
 def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
-    """Return the stranger with one more pose, or a new one where there was none before."""
+    """Return the stranger with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
@@ -323,7 +323,7 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
 
 
 def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
-    """Return True if the target is where the stranger is now, and not where the lock has it."""
+    """Return True if the target is where the stranger is now."""
     if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
         return True
     if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
@@ -384,7 +384,7 @@ def expected_corners(
 def update_sight(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
-    """Return the new sighting, with what it shows of the vehicle's own account of its way."""
+    """Return the new sighting, with what it shows of the estimate's motion."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
@@ -405,7 +405,7 @@ def update_sight(
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
-    """Return True if a place (3,) in the world of the state estimate lies in the picture."""
+    """Return True if a place (3,) in the world lies in the picture."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.
@@ -416,7 +416,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 
 def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """Return the camera's way (3,) in the world, by the estimate's places and by its speeds."""
+    """Return the camera's way (3,) by the estimate's places, and by its speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
@@ -432,6 +432,6 @@ def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
 
 
 def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
-    """Return the way from the vehicle's place to the camera, in the world (3,)."""
+    """Return the way from the vehicle to the camera, in the world (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -64,7 +64,7 @@ def expected_in_blur(
 
 
 def hidden_in_blur(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """Return a marker anywhere: the quadrilateral whose grey values go best with its cells."""
+    """Return a marker anywhere: the best of all quadrilaterals."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -132,7 +132,7 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
 
 
 def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
-    """Return the drawing at own coordinates (n, n, 2), softened; grey where anything may be."""
+    """Return the drawing at own coordinates (n, n, 2), softened."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)

@@ -78,13 +78,13 @@ def mean_side_px(corners_px: Array) -> float:
 
 
 def doubled_area(corners: Array) -> Array:
-    """Return twice the area (m,), positive for corners (m, 4, 2) that run clockwise as seen."""
+    """Return twice the area (m,) of corners (m, 4, 2), positive if clockwise."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Return True if all corners (4, 2) are finite, and `room_px` or more inside of a picture."""
+    """Return True if all corners (4, 2) are `room_px` or more inside a picture."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
     # False for NaN.
@@ -102,7 +102,7 @@ def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -
 def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Return both markers, the other one where the expected one puts it, by `ratio`."""
+    """Return both markers, one perhaps where the other puts it."""
     both = dict(expected)
     if "small" not in both and "large" in both:
         both["small"] = nested(both["large"], ratio, camera)
@@ -139,7 +139,7 @@ class RefinedCorners:
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Return the corners (4, 2) of a marker `cells` wide by `cv2.cornerSubPix`, or the raw ones."""
+    """Return the corners (4, 2) by `cv2.cornerSubPix`, or the raw ones."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)

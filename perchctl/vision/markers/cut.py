@@ -45,7 +45,7 @@ _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its 
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Make what `cut_markers` keeps of a target and a camera, before it is in a hurry."""
+    """Make what `cut_markers` keeps, before it is in a hurry."""
     _outline(patterns), texture_of(patterns["large"].drawing), lattice_of(camera)
 
 
@@ -112,7 +112,7 @@ def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
 
 
 def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
-    """Return the outline of both markers, of which each edge may be printed off its place."""
+    """Return the outline of both markers, as they are printed."""
     large, small = patterns["large"], patterns["small"]
     return outline_of(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
@@ -125,7 +125,7 @@ def _stands_for(found: Visible) -> MarkerName:
 def _start(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    """Return the pose that goes with expected corners, by preference the small marker's."""
+    """Return the pose that goes with expected corners."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
     if not np.isfinite(rays).all():
@@ -142,7 +142,7 @@ def _start(
 
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
-    """Return the prediction moved to where the picture goes best with the drawing, if it does."""
+    """Return the prediction moved to where the picture is like it, if it is."""
     best, pose = _MIN_GLANCE, None
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
@@ -155,7 +155,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
 
 
 def _trusted(found: Visible) -> bool:
-    """Return True if nearly all edges in view are there, and tell enough of where the target is."""
+    """Return True if nearly all edges are there, and tell enough of the place."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.shown >= _MIN_SHOWN * found.in_view
@@ -165,7 +165,7 @@ def _trusted(found: Visible) -> bool:
 
 
 def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
-    """Return the corners of the marker of that half side; None where the lens does not reach."""
+    """Return the corners of the marker of that half side, if the lens reaches."""
     r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
     X = r + found.pose.t
     if X[:, 2].min() <= 0.0:
@@ -216,7 +216,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """Grey values at a lattice's nodes (rows, columns), and which of them are seen."""
+    """Grey values at a lattice's nodes (rows, columns), and which are seen."""
 
     lattice: Lattice
     grey: Grey
@@ -262,7 +262,7 @@ def lattice_of(camera: CameraModel) -> Lattice:
 def overview_of(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """Return a picture at a glance; what `mask` (its shape, 0: free) covers is not seen."""
+    """Return a picture at a glance, where `mask` (its shape) is 0."""
     lattice = lattice_of(camera)
     seen = lattice.inside
     if mask is not None:
@@ -308,7 +308,7 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
 
 
 def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
-    """Return how far the picture is from the drawing through H, (2,) normalised, and how like."""
+    """Return how far the picture is from the drawing, (2,), and how like."""
     lattice = view.lattice
     wide = drawn_over(H, texture, lattice, _SEARCHED)
     mask = view.seen.astype(np.float32)
@@ -367,7 +367,7 @@ pixels."""
 
 @lru_cache(maxsize=8)
 def outline_of(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
-    """Return the outline of both markers, with the tolerance of their edges, in cells."""
+    """Return the outline of both markers; tolerances are in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -496,7 +496,7 @@ def fitted(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> Visible | None:
-    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off."""
+    """Fit the pose in which the outline's edges are the picture's."""
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
@@ -522,7 +522,7 @@ def fitted(
 
 
 def foreseen(pose: RigidPose, outline: Outline, camera: CameraModel) -> Visible | None:
-    """Return what `fitted` would make of a picture without a flaw, taken in that pose."""
+    """Return what `fitted` would make of a flawless picture in that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -539,7 +539,7 @@ def _in_view(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None,
 ) -> _Places:
-    """Return the places at which a whole profile is in the picture, and not covered."""
+    """Return the places at which a whole profile is in view."""
     h, w = shape[:2]
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
@@ -586,7 +586,7 @@ def _in_view(
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return how far along its normal each place's edge is (n,) px, and whether there is one."""
+    """Return how far along its normal each place's edge is (n,) px, if it is."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -603,7 +603,7 @@ def _offsets(
 def _solved(
     places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
 ) -> _Round | None:
-    """Return a robust step of turn, move and shift, after those before, in `total` (7,)."""
+    """Return a robust step, after those before, in `total` (7,)."""
     J, weight = places.J, shows.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
@@ -622,7 +622,7 @@ def _solved(
 
 
 def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> Visible:
-    """Return the pose with its covariance: by noise of places and of lines, and the prediction."""
+    """Return the pose with its covariance."""
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
     common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)

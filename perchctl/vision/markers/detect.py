@@ -166,7 +166,7 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
-    """Return True if a marker was not verified that should be in the picture, large enough."""
+    """Return True if a marker that should be found was not verified."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -208,7 +208,7 @@ def _refined(picture: Picture, found: Found) -> _Seen:
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
-    """Return the marker's detection in a picture of that kind, None where it was not seen."""
+    """Return the marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -233,7 +233,7 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """Return the last corners (4, 2) px, moved on as they moved before; empty if there are none."""
+    """Return the last corners (4, 2) px, moved on as they moved before."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -246,7 +246,7 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
 
 
 def with_motion(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with the flow of markers that were seen a short time before, or of the other."""
+    """Return `now` with the flow of its markers since a short time before."""
     if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
     flow: dict[MarkerName, Array] = {}
@@ -315,7 +315,7 @@ def _blur_px(seen: RefinedCorners | None) -> float:
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
-    """Return the corners (4, 2) px from which to align the drawing; None where it is of no use."""
+    """Return the corners (4, 2) px from which to align the drawing, if any."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -351,7 +351,7 @@ def fit_lines(
 def follow(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
-    """Return the expected markers (corners (4, 2) px) that are verified by all sides and cells."""
+    """Return the expected markers that are verified by all sides and cells."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]

@@ -82,7 +82,7 @@ def make_aruco_detector(
 def make_marker_decoder(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
-    """Return OpenCV's detector of markers, for one pass over a picture of that size."""
+    """Return OpenCV's detector of markers for a pass."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
     parameters.minDistanceToBorder = 0
@@ -93,7 +93,7 @@ def make_marker_decoder(
 
 
 def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
-    """Return OpenCV's detector, set to take nearly any quadrilateral of a blurred picture."""
+    """Return OpenCV's detector, set to take nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -112,19 +112,15 @@ def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
 
 
 def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
-    """Return a dictionary of the marker and, where these cannot be confused, its mirror image."""
+    """Return a dictionary of the marker and perhaps its mirror image."""
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
-    if _distance(mirror, bits) > 2 * correction_bits + 1:
+    distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
+    if distance > 2 * correction_bits + 1:
         patterns.append(mirror)
     rows = [cv2.aruco.Dictionary.getByteListFromBits(np.ascontiguousarray(p)) for p in patterns]
     return cv2.aruco.Dictionary(
         np.ascontiguousarray(np.concatenate(rows)), bits.shape[0], correction_bits
     )
-
-
-def _distance(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> int:
-    """Return the fewest bits in which a, in any turn, differs from b."""
-    return min(int((np.rot90(a, turn) != b).sum()) for turn in range(4))
 
 
 # --- The vehicle's own gear in the picture: where it is, nothing is to be seen of a target ---
@@ -149,7 +145,7 @@ def hidden_in(frame: Frame, mask: Covered | None) -> Covered | None:
 
 
 def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """Return the picture with what is hidden replaced by the mean of what is around it."""
+    """Return the picture with what is hidden replaced by what is around it."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
@@ -165,7 +161,7 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
 
 
 def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """Return True if a part of the marker is hidden, up to `reach` half sides from its centre."""
+    """Return True if a part of the marker is hidden, up to `reach` half sides."""
     if hidden is None:
         return False
     h, w = hidden.shape

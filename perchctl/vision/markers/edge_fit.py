@@ -175,7 +175,7 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides near to the raw corners, as `refine_lines` does, once."""
+    """Fit lines to the sides near to the raw corners, once."""
     found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = markers_of(raw_px, rims, camera)
     if markers is None:
@@ -243,7 +243,7 @@ def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
 
 
 def _intersect(lines: Array) -> Array:
-    """Return the corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
+    """Return where side i - 1 of each marker meets side i: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -257,7 +257,7 @@ def _intersect(lines: Array) -> Array:
 
 
 def shift_prior_px(white_grey: float) -> float:
-    """Return the spread of the shift of all edges before it is measured, by how white paper is."""
+    """Return the spread of a shift that is not measured, by how white paper is."""
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
@@ -334,7 +334,7 @@ def _outwards(markers: Markers, lines: Array) -> Array:
 def _accepted(
     markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
-    """Return which of the m markers have lines for sides, near to where they were expected."""
+    """Return which of the m markers have lines for sides, as expected."""
     inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
@@ -415,7 +415,7 @@ class Samples:
 
 
 def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """Return what is to be measured of markers with these corners; None where one is no square."""
+    """Return what is to be measured of markers; None where one is no square."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -480,7 +480,7 @@ def measure(
 
 
 def reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return how far the window around an edge and the profile across it reach, by the cells."""
+    """Return how far the windows around edges and the profiles across reach."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
@@ -510,7 +510,7 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 
 
 def _single(value: float) -> Floats:
-    """Return a number as arrays meet it soonest, in half the time of a Python one."""
+    """Return a number as arrays meet it soonest."""
     return np.array(value, dtype=np.float32)
 
 
@@ -551,12 +551,6 @@ class Surroundings:
     inside: Floats
     outside: Floats
     possible: NDArray[np.bool_]
-
-    def only(self, kept: NDArray[np.intp]) -> Surroundings:
-        """Return the surroundings of some of the rows."""
-        return Surroundings(
-            self.depth_px[kept], self.inside[kept], self.outside[kept], self.possible[kept]
-        )
 
 
 def locate(
@@ -602,7 +596,7 @@ class _Profiles:
         self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), _ONE)
 
     def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the edges by one window around the middle of all profiles, and which count."""
+        """Return the edges by one window around all middles, and which count."""
         spread = self.u * (_PER_NEAR / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -614,7 +608,7 @@ class _Profiles:
         return np.divide(moments[..., 1], np.where(usable, total, _ONE)), usable
 
     def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Return the edges by a window around the row's line (rows, n), which count, and blur^2."""
+        """Return the edges by a window around the row's line, which count, blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
@@ -659,7 +653,7 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
-    """Return straight lines edge(s) a row with Tukey's weights, and these weights."""
+    """Return straight lines (rows, n) with Tukey's weights, and these."""
     line = median(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
@@ -679,7 +673,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
 
 
 def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return each row's median over its usable values, to a rank, (rows,); 0 without any."""
+    """Return each row's median over its usable values, (rows,); 0 without any."""
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)
     found = values[:, PROFILES // 2]

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.values import replace
 from perchctl.vision.lens import distort, pinhole_px, undistort, undistort_px
 from perchctl.vision.markers.corners import (
     BEFORE,
@@ -39,6 +38,7 @@ from perchctl.vision.markers.edge_fit import (
     PROFILES,
     STEPS,
     Floats,
+    Surroundings,
     locate,
     places,
     reaches_px,
@@ -94,7 +94,7 @@ def seen_partly(
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
         H = incremented(H, p)
-        if k > 0 and float(np.abs(p[:6]).max() * seen.rows.scale_px.mean()) < _STILL_PX:
+        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _STILL_PX:
             break
     assert seen is not None
     left_px = seen.far_px - (step @ A).reshape(seen.far_px.shape)
@@ -105,7 +105,7 @@ def seen_partly(
 
 
 def wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
-    """Return True if nothing of the marker is hidden or too near to the picture's edge."""
+    """Return True if nothing of the marker is hidden or beyond the edge."""
     room_px = ROOM_PX + found.blur_px
     return within(found.corners_px, picture.image.shape, room_px) and not hides(
         picture.hidden, found.corners_px
@@ -116,18 +116,18 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
     """Return the changes (9, rows * n) of the edges with the terms of `corner_jacobian` and the
     shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
     spread."""
-    u, v, rows = seen.own[..., 0], seen.own[..., 1], seen.rows
-    nx, ny = OUT[rows.side].T[..., None] * rows.scale_px[:, None]
+    u, v = seen.own[..., 0], seen.own[..., 1]
+    nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the seen one by the shift.
-    A[8] = np.where(rows.at < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(seen.at < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles nearer to each other than a pixel measure the same.
-    worth = np.minimum(1.0, 2.0 * rows.scale_px * rows.at / PROFILES)
+    worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.at / PROFILES)
     weighted = A * (seen.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
     # An edge's spread is about a tenth of a pixel while it is not known.
@@ -276,60 +276,52 @@ _SEARCH_STEPS: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """The marker's sides and perhaps the inner edges of its border: starts, ends (rows, 2)
-    normalised; of each row (rows,) the side that it belongs to, its distance from the centre in
-    half sides, its length, pixels for a half side across it, and +1 where white is to the left of
-    the way from start to end; the mean width of a cell."""
-
-    starts: Array
-    ends: Array
-    side: NDArray[np.intp]
-    at: Array
-    lengths_px: Array
-    scale_px: Array
-    cell_px: float
-    sign: Array
-
-    def only(self, kept: NDArray[np.intp]) -> _Rows:
-        """Return some of the rows."""
-        of_each = ("starts", "ends", "side", "at", "lengths_px", "scale_px", "sign")
-        return replace(self, **{name: getattr(self, name)[kept] for name in of_each})
-
-
-@dataclass(frozen=True, eq=False)
 class SeenEdges:
     """Edges of one round: of each profile (rows, n) its place in own coordinates (rows, n, 2), how
-    far outwards it is of the square's, and its weight; the rows, the blur of each in terms of the
-    window (rows,); and how white the paper is."""
+    far outwards it is of the square's, and its weight; of each row (rows,) the side that it belongs
+    to, its distance from the centre in half sides, pixels for a half side across it, and its blur
+    in terms of the window; and how white the paper is."""
 
     own: Array
     far_px: Array
     weight: Array
-    rows: _Rows
+    side: NDArray[np.intp]
+    at: Array
+    scale_px: Array
     blur: Array
     white: float
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """Return the edges near to where the square H has them; None where too few are seen."""
-    camera = picture.camera
-    rows = _rows(H, pattern, camera)
-    if rows is None:
+    """Return the edges near to where the square H has them, if enough are seen."""
+    camera, cells, corners = picture.camera, pattern.rim.cells, mapped(H, UNIT)
+    sides_px = side_lengths_px(corners)
+    if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
-    s = places(rows.lengths_px)
-    origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
+    cell_px = float(sides_px.mean()) / cells
+    # The marker's sides, and perhaps the inner edges of its border.
+    rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _INNER_CELL_PX else (1.0,)
+    at = np.repeat(rings, 4)
+    side = np.arange(len(at)) % 4
+    to_rays: Array = np.linalg.inv(camera.K) @ H
+    starts = np.stack([mapped(to_rays, r * UNIT) for r in rings])
+    scale_px = (0.25 * (sides_px[BEFORE] + sides_px[NEXT]))[side]
+    s = places(sides_px[side] * at)
+    ends = starts[:, NEXT].reshape(-1, 2)
+    origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
     if not (np.abs(origin) < _FAR_PX).all():
         return None  # a lens model throws what is far outside anywhere, to no number too
-    normal *= rows.sign[:, None, None]
-    near_px, half_px = reaches_px(np.full(len(rows.at), rows.cell_px))
-    depth_px = 2.0 * rows.scale_px / pattern.rim.cells
+    # White is outside of the marker, and inside of its border.
+    turn = float(np.sign(doubled_area(corners[None])[0]))
+    normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
+    near_px, half_px = reaches_px(np.full(len(at), cell_px))
+    depth_px = 2.0 * scale_px / cells
     around = surroundings(s, [pattern.rim], pattern.rim, depth_px)
     free = around.possible & _in_view(picture, origin, normal, near_px)
     kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
     if len(kept) < _LEAST_EDGES:
         return None
-    rows, around = rows.only(kept), around.only(kept)
+    side, at, scale_px = side[kept], at[kept], scale_px[kept]
     origin, normal, free = origin[kept], normal[kept], free[kept]
     near_px, half_px = near_px[kept], half_px[kept]
     grey = sample(picture.image, origin, normal, half_px)
@@ -337,7 +329,7 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     if lit is None:
         return None
     good, white = lit
-    around = replace(around, possible=good)
+    around = Surroundings(depth_px[kept], around.inside[kept], around.outside[kept], good)
     offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
     weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
@@ -345,45 +337,21 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
     if not np.isfinite(own).all():
         return None
-    far = np.einsum("rni,ri->rn", own, OUT[rows.side]) - rows.at[:, None]
+    far = np.einsum("rni,ri->rn", own, OUT[side]) - at[:, None]
     return SeenEdges(
         own=own,
-        far_px=far * rows.scale_px[:, None],
+        far_px=far * scale_px[:, None],
         weight=weight,
-        rows=rows,
+        side=side,
+        at=at,
+        scale_px=scale_px,
         blur=blur_px / near_px,
         white=white,
     )
 
 
-def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
-    """Return the rows of the square H, unit to pinhole px; None where that is none."""
-    corners, cells = mapped(H, UNIT), pattern.rim.cells
-    sides_px = side_lengths_px(corners)
-    if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
-        return None
-    cell_px = float(sides_px.mean()) / cells
-    rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _INNER_CELL_PX else (1.0,)
-    at = np.repeat(rings, 4)
-    side = np.arange(len(at)) % 4
-    to_rays: Array = np.linalg.inv(camera.K) @ H
-    starts = np.stack([mapped(to_rays, r * UNIT) for r in rings])
-    across_px = 0.5 * (sides_px[BEFORE] + sides_px[NEXT])
-    turn = float(np.sign(doubled_area(corners[None])[0]))
-    return _Rows(
-        starts=starts.reshape(-1, 2),
-        ends=starts[:, NEXT].reshape(-1, 2),
-        side=side,
-        at=at,
-        lengths_px=sides_px[side] * at,
-        scale_px=0.5 * across_px[side],
-        cell_px=cell_px,
-        sign=turn * np.where(at < 1.0, -1.0, 1.0),
-    )
-
-
 def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> NDArray[np.bool_]:
-    """Return which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
+    """Return which profiles (rows, n) are in the picture, and not hidden."""
     hidden, (h, w) = picture.hidden, picture.image.shape
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)

@@ -83,7 +83,7 @@ def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return how a marker looks, with spots in the cells that no other marker covers."""
+    """Return how a marker looks, with spots in all cells that are uncovered."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -112,7 +112,7 @@ def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
 
 
 def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if every cell of the marker at these corners has its colour, clearly."""
+    """Return True if every cell at these corners has its colour, clearly."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -128,7 +128,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if nearly all cells have their colour, the others being covered."""
+    """Return True if nearly all cells have their colour."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -138,7 +138,7 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
 
 
 def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if the grey values in the cells go with the pattern, blurred as they may be."""
+    """Return True if the grey values in the cells go with the pattern."""
     return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
@@ -157,7 +157,7 @@ def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the mean grey value of each cell that is read; None outside of the picture."""
+    """Return the mean grey value of each cell; None outside of the picture."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
@@ -165,7 +165,7 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the grey values (k,) at the pattern's k spots; None outside of the picture."""
+    """Return the grey values (k,) at the spots; None outside of the picture."""
     at = mapped(from_unit(corners_px), pattern.spots)
     # Spots are inside of the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
@@ -234,12 +234,14 @@ def _wide(axis: Array, half_node: float) -> Array:
 
 @lru_cache(maxsize=64)
 def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """Return the drawing at n by n nodes over its reach, and perhaps what is beyond its sheet."""
+    """Return the drawing at n by n nodes, and perhaps what is beyond its sheet."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = drawn(drawing, axis, half_node)
-    outside = beyond_sheet(drawing, axis, half_node)
-    return (paper,) if outside is None else (paper, outside)
+    if drawing.sheet is None:
+        return (paper,)
+    on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
+    return paper, (1.0 - on @ on.T).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
@@ -249,7 +251,7 @@ def square(cells: int, n: int) -> NDArray[np.float32]:
 
 
 def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of each node and of `EDGE` nodes more all around, exact in area."""
+    """Return the whiteness of each node and of `EDGE` nodes all around."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
@@ -260,20 +262,12 @@ def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """Return the share of each row (or column) of cells in each node (n, cells), blurred."""
+    """Return the blurred share of each row of cells in each node (n, cells)."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
     )
     return np.asarray(soft[EDGE : EDGE + len(axis)], dtype=np.float64)
-
-
-def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32] | None:
-    """Return the share of each node that is not on the paper, likewise; None without an end."""
-    if drawing.sheet is None:
-        return None
-    on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
-    return (1.0 - on @ on.T).astype(np.float32)
 
 
 def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:

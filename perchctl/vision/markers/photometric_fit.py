@@ -210,7 +210,7 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """Return the correlation of the picture with the fit that leaves `error` over."""
+    """Return the correlation with the fit that leaves `error` over."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -235,7 +235,7 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, float]:
-    """Return the correlation and height of the inner pattern in grey values (n * n,)."""
+    """Return the correlation and height of the inner pattern in grey (n * n,)."""
     rows, products = drawing.plain
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.light[0][GAIN], grey
@@ -250,7 +250,7 @@ def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, f
 
 
 def _repeated(error: Array) -> float:
-    """Return how many neighbouring nodes measure the same, by the correlation of what is left."""
+    """Return how many neighbouring nodes measure the same."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
     for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
@@ -313,7 +313,7 @@ class Grid:
 
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """Return the nodes in the middle of n by n equal parts of the square from -reach to reach."""
+    """Return the nodes in the middle of n by n parts of a square."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
@@ -325,7 +325,7 @@ def _crossings(axis: Array) -> Array:
 
 
 def projected(H: Array, uv1: Array) -> Array:
-    """Map own coordinates (3, n) through a homography to pinhole pixels, x and y (2, n)."""
+    """Map own coordinates (3, n) to pinhole pixels, x and y (2, n)."""
     q = H.dot(uv1)
     return np.asarray(q[:2] / q[2])
 
@@ -362,7 +362,7 @@ def _few(grid: Grid) -> tuple[Array, Array]:
 def _patch_around(
     image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the picture that the nodes may reach, and its first pixel (2, 1)."""
+    """Return the part of the picture that is needed, and its first pixel (2, 1)."""
     h, w = image.shape
     x, y = projected(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -411,7 +411,7 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """The drawing's sheets, blurred by `sigma` nodes: the paper, and perhaps what is beyond it."""
+    """The drawing's sheets, blurred by `sigma` nodes."""
 
     drawing: Drawing
     grid: Grid
@@ -458,7 +458,7 @@ def rendered(drawing: Drawing, n: int, step: int) -> Rendered:
 
 
 def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> tuple[Array, Array]:
-    """Return a sheet blurred by sigma nodes, and its changes, per unit of the drawing."""
+    """Return a sheet blurred by sigma nodes, and its changes."""
     soft = softened(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)

@@ -126,7 +126,7 @@ def _pass(
     own: AsideOf | None,
     halved: bool = False,
 ) -> Found:
-    """Return what one pass of OpenCV's detector over the window gives, perhaps at half its size."""
+    """Return what one pass of OpenCV's detector over the window gives."""
     setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
@@ -210,7 +210,7 @@ def _nearest_first(
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs that belong together: misfit and both indices, the best first."""
+    """Return the pairs that belong together, misfit and indices, best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
     best: dict[int, tuple[float, int, int]] = {}
@@ -221,7 +221,7 @@ def _wholes(
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return how far the small marker is from where the large one puts it; up to 1 is allowed."""
+    """Return how far the small marker is from its place; up to 1 is allowed."""
     mapped = nested(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
@@ -231,7 +231,7 @@ def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """Return the candidate that continues the last detections, in place and size; else None."""
+    """Return the candidate that continues the last detections, if any."""
     if not expected or not quads:
         return None
     if name in expected:
