@@ -164,25 +164,18 @@ def _voted(state: FieldState, frame: Frame) -> FieldState:
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
-        votes = min(max(votes + _vote(before, frame.image), -_MOST_EVIDENCE), _MOST_EVIDENCE)
+        # Rows are compared with the mean of their two neighbours of the other field.
+        rows = (len(before) - 2) // 2 * 2
+        tops = [image[0:rows:2] for image in (before, frame.image)]
+        bottoms = [image[1 : rows + 1 : 2] for image in (before, frame.image)]
+        low = cv2.addWeighted(bottoms[0][:-1], 0.5, bottoms[0][1:], 0.5, 0.0)
+        bottom_to_top = cv2.norm(low, tops[1][1:], cv2.NORM_L2SQR)
+        high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
+        top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
+        vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
+        votes = min(max(votes + vote, -_MOST_EVIDENCE), _MOST_EVIDENCE)
     if top_first is None and abs(votes) > _EVIDENCE:
         top_first = votes > 0.0
     elif top_first is not None and (votes if not top_first else -votes) > _TURNED_EVIDENCE:
         top_first = not top_first
     return replace(state, last_s=frame.t_s, votes=votes, top_first=top_first, previous=frame.image)
-
-
-def _vote(before: Grey, now: Grey) -> float:
-    """Return -1 (the bottom field is earlier) to 1 (the top field is).
-
-    Rows are compared with the mean of their two neighbours of the other field, or motion along the
-    columns would count for one of the two orders.
-    """
-    rows = (min(len(before), len(now)) - 2) // 2 * 2
-    tops = [image[0:rows:2] for image in (before, now)]
-    bottoms = [image[1 : rows + 1 : 2] for image in (before, now)]
-    low = cv2.addWeighted(bottoms[0][:-1], 0.5, bottoms[0][1:], 0.5, 0.0)
-    bottom_to_top = cv2.norm(low, tops[1][1:], cv2.NORM_L2SQR)
-    high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
-    top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
-    return (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)

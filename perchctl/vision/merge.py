@@ -80,11 +80,19 @@ def measure_markers(
     contradicting = False
     if not clear and len(singles) == 2:
         contradicting = disagree(singles["large"], singles["small"], config.disagreement_m)
-    fed = _usable(singles, contradicting, attitude, config, setup)
+    fed, one = dict(singles), joint
+    if len(singles) == 2:
+        better = better_conditioned(singles["large"], singles["small"])
+        one = joint or better
+        if contradicting:
+            fed = {better.source: better}
+        elif config.stages == "range":
+            # By the distance from the camera to the target's plane (equations 4, 6 and 11).
+            offset = level_rotation(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
+            stage = stage_by_range(float(better.e_m[2] + offset[2]), config)
+            fed = {stage.value: singles[stage.value]} if stage is not Stage.BOTH else fed
     if config.method == "joint":
-        one = next(iter(fed.values())) if len(fed) == 1 else joint
-        if one is None and fed:
-            one = better_conditioned(fed["large"], fed["small"])
+        one = next(iter(fed.values())) if len(fed) == 1 else one
         fed = {} if one is None else {"joint": one}
     return MeasuredMarkers(poses, fed, contradicting)
 
@@ -125,27 +133,6 @@ def merge_tracks(
         unseen=least,
         stage=Stage.BOTH if fed else Stage.NONE,
     )
-
-
-def _usable(
-    singles: Mapping[str, MarkerPose],
-    contradicting: bool,
-    attitude: Attitude | None,
-    config: MergeConfig,
-    setup: PoseSetup,
-) -> dict[str, MarkerPose]:
-    """Return the single markers' poses that count: of two that contradict the better, else all, or
-    (`merge.stages: range`) what the distance to the target asks for (equations 4, 6 and 11)."""
-    if len(singles) < 2:
-        return dict(singles)
-    use = better_conditioned(singles["large"], singles["small"])
-    if contradicting:
-        return {use.source: use}
-    if config.stages == "seen":
-        return dict(singles)
-    offset = setup.gear_body_m - setup.T_body_cam[:3, 3]
-    stage = stage_by_range(float(use.e_m[2] + (level_rotation(attitude) @ offset)[2]), config)
-    return dict(singles) if stage is Stage.BOTH else {stage.value: singles[stage.value]}
 
 
 # --- Corners of a rolling shutter at one moment -----------------------

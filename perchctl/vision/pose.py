@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -171,7 +171,7 @@ def rotation_matrix(rvec: Array) -> Array:
 
 def rotation_vector(R: Array) -> Array:
     """Return the rotation vector (3,) rad of a rotation matrix (3, 3)."""
-    return flat(cv2.Rodrigues(R)[0])
+    return np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
 
 
 def normal_cam(pose: MarkerPose) -> Array:
@@ -324,20 +324,15 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 def _curl(points: Points, scored: Scored) -> Array:
     """Return what each kind of curl does to the whitened errors."""
-    normal_cam = cv2.Rodrigues(scored.rvec)[0][:, 2]
+    normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.lift
     return np.asarray(points.whitening.dot(moved))
 
 
-def flat(values: Any) -> Array:
-    """Return the values as a flat array of doubles."""
-    return np.asarray(values, dtype=np.float64).ravel()
-
-
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     """Return the angle between the marker's normal and the expected one."""
-    normal = cv2.Rodrigues(rvec)[0][:, 2]
+    normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
@@ -349,7 +344,8 @@ def _closed_form(points: Points) -> list[PoseCandidate]:
         )
     except cv2.error:
         return []
-    candidates = [PoseCandidate(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
+    solutions = zip(rvecs, tvecs, strict=True)
+    candidates = [PoseCandidate(np.ravel(r), np.ravel(t)) for r, t in solutions]
     return [candidate for candidate in candidates if _usable(candidate)]
 
 
@@ -366,7 +362,7 @@ def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
     except cv2.error:
         return start
-    return PoseCandidate(flat(rvec), flat(tvec))
+    return PoseCandidate(np.ravel(rvec), np.ravel(tvec))
 
 
 def _scored(candidate: PoseCandidate, points: Points) -> Scored:
@@ -482,7 +478,7 @@ def make_points(
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
         shift[rows, 0] = d.shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
-            W[rows, rows] = _whitened(d.cov_px2)
+            W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
         elif d.refined:
             spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
             own = np.zeros(64)
@@ -513,11 +509,6 @@ def _outward_normals(corners: Array) -> Array:
     np.divide(y, length, out=normals[..., 0])
     np.divide(x, -length, out=normals[..., 1])
     return normals
-
-
-def _whitened(cov_px2: Array) -> Array:
-    """Return what makes errors independent and of unit spread, (8, 8)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:

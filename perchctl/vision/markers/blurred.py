@@ -91,15 +91,13 @@ def _best(
             found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
-        if len(chosen) == _MAX_CANDIDATES:
-            break
         middle, room_px = corners_px.mean(axis=0), _SAME * mean_side_px(corners_px)
         if not any(
             name == other and float(np.abs(there.mean(axis=0) - middle).max()) < room_px
             for other, there in chosen
         ):
             chosen.append((name, corners_px))
-    return chosen
+    return chosen[:_MAX_CANDIDATES]
 
 
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:

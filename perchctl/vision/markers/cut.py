@@ -143,12 +143,18 @@ def _start(
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
     """Return the prediction moved to where the picture is like it, if it is."""
-    best, pose = _MIN_GLANCE, None
+    best, pose, lattice = _MIN_GLANCE, None, view.lattice
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
-        drift, glance = drift_of(RigidPose(start.R, t).H, texture, view)
-        if glance > best:
-            best, pose = glance, RigidPose(start.R, t + np.append(drift * t[2], 0.0))
+        wide = drawn_over(RigidPose(start.R, t).H, texture, lattice, _SEARCHED)
+        mask = view.seen.astype(np.float32)
+        score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
+        score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
+        row, column = np.unravel_index(int(score.argmax()), score.shape)
+        drift = (_SEARCHED - np.array([column, row], dtype=np.float64)) * lattice.step
+        if score[row, column] > best:
+            best = float(score[row, column])
+            pose = RigidPose(start.R, t + np.append(drift * t[2], 0.0))
         if best > _GOOD_GLANCE:
             break
     return pose
@@ -305,18 +311,6 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
         borderValue=1.0,
     )
     return _coarse(np.asarray(fine, np.float32))
-
-
-def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
-    """Return how far the picture is from the drawing, (2,), and how like."""
-    lattice = view.lattice
-    wide = drawn_over(H, texture, lattice, _SEARCHED)
-    mask = view.seen.astype(np.float32)
-    score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
-    score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
-    row, column = np.unravel_index(int(score.argmax()), score.shape)
-    drift = (_SEARCHED - np.array([column, row], dtype=np.float64)) * lattice.step
-    return drift, float(score[row, column])
 
 
 def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:

@@ -509,32 +509,24 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 # of one marker) shares is (rows,), what differs from profile to profile (rows, n).
 
 
-def _single(value: float) -> Floats:
-    """Return a number as arrays meet it soonest."""
-    return np.array(value, dtype=np.float32)
-
-
 _ALONG32 = ALONG.astype(np.float32)
-_ZERO, _ONE, _TINY = _single(0.0), _single(1.0), _single(1e-9)
-_QUARTER_OF, _MINUS_HALF = _single(0.25), _single(-0.5)
-_WINDOW2, _MOST_SHARE = _single(2.25), _single(0.9)
-_LEAST_MOMENT2, _MOST_MOMENT = _single(0.01), _single(0.8)
-_PER_NEAR = _single(1.0 / 0.6)  # of the wide window's spread
-_TUKEY = _single(3.5 * 1.4826)
+_WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81  # squares of its sigma: of the blur's, and px^2
+_MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
+_PER_NEAR = 1.0 / 0.6  # of the wide window's spread
+_TUKEY = 3.5 * 1.4826
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
 _STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)
-_LEAST_SHARE = _single(0.3)  # of the row's mean gradient, for a profile to count
-_TUKEY_FLOOR_PX = _single(3.5 * 0.05)  # of the scatter that is taken for noise
+_LEAST_SHARE = 0.3  # of the row's mean gradient, for a profile to count
+_TUKEY_FLOOR_PX = 3.5 * 0.05  # of the scatter that is taken for noise
 _ONE_ROUND_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _SETTLED_PX = 0.06
 _ROUNDS = 3
-_LEAST_WINDOW2 = _single(0.81)  # square of its sigma, px^2
-_FAR = _single(1e6)
+_FAR = 1e6
 _QUARTER = PROFILES // 4
 _QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
 # The line through values in the middles of both halves of the profiles, (2, n).
-_SLOPE: Floats = _ALONG32 * _single(0.5 / float(ALONG[PROFILES // 2 :].mean()))
-_THROUGH_HALVES: Floats = np.stack([_single(0.5) - _SLOPE, _single(0.5) + _SLOPE])
+_SLOPE: Floats = _ALONG32 * (0.5 / float(ALONG[PROFILES // 2 :].mean()))
+_THROUGH_HALVES: Floats = np.stack([0.5 - _SLOPE, 0.5 + _SLOPE])
 _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
 
 
@@ -588,24 +580,24 @@ class _Profiles:
         self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
         self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # where, (rows, steps)
         self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
-        self.most2 = _QUARTER_OF * self.near * self.near  # square of a window's largest sigma
+        self.most2 = 0.25 * self.near * self.near  # square of a window's largest sigma
         # The flanks with a neighbouring edge: both, and outside less inside.
         self.both, self.side = around.inside + around.outside, around.outside - around.inside
         self.can = around.possible.astype(np.float32)
         # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), _ONE)
+        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), 1.0)
 
     def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the edges by one window around all middles, and which count."""
         spread = self.u * (_PER_NEAR / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
-        np.exp(_MINUS_HALF * spread, out=window[..., 0])
+        np.exp(-0.5 * spread, out=window[..., 0])
         np.multiply(window[..., 0], self.u, out=window[..., 1])
-        moments: Floats = np.maximum(self.gradient, _ZERO) @ window
+        moments: Floats = np.maximum(self.gradient, 0.0) @ window
         total = moments[..., 0] * self.can
         usable = total > (total.dot(_ONES32) * self.part)[:, None]
-        return np.divide(moments[..., 1], np.where(usable, total, _ONE)), usable
+        return np.divide(moments[..., 1], np.where(usable, total, 1.0)), usable
 
     def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Return the edges by a window around the row's line, which count, blur^2."""
@@ -613,27 +605,27 @@ class _Profiles:
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
         squared = relative * relative
-        mass = squared * (_MINUS_HALF / w2)[:, None, None]
+        mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
         mass *= self.gradient
         total = (mass @ _STEP_ONES) * self.can
-        usable = total > np.maximum(total.dot(_ONES32) * self.part, _TINY)[:, None]
+        usable = total > np.maximum(total.dot(_ONES32) * self.part, 1e-9)[:, None]
         # A neighbour seen through the window has this share, at this place, with this spread.
         wide2 = w2 + blur2
         place = self.depth * w2 / wide2
-        lost = np.exp(_MINUS_HALF * self.depth * self.depth / wide2)
+        lost = np.exp(-0.5 * self.depth * self.depth / wide2)
         share = np.minimum(self.both * lost[:, None], _MOST_SHARE)
-        total = np.where(usable, total / (_ONE - share), _ONE)
+        total = np.where(usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = relative @ _STEP_ONES + total * self.side * (lost * place)[:, None]
         mass *= squared
         second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
         moment = (second * usable).dot(_ONES32)
-        moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
+        moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
         moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
         found2 = moment * w2 / (w2 - moment)
         # The window pulls the centroid towards its own middle: undo that.
-        centroid = first / total * (_ONE + found2 / w2)[:, None]
+        centroid = first / total * (1.0 + found2 / w2)[:, None]
         limit = self.near[:, None]
         return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
@@ -648,7 +640,7 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     # Left out before the sum: beside the others' size an edge's place is rounded away.
     shown = np.abs(middle) < _FAR
     count = shown @ _QUARTER_ONES
-    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, _ONE)
+    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, 1.0)
     return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _THROUGH_HALVES)
 
 
@@ -659,14 +651,14 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
         size = np.abs(edge - line)
         size /= np.maximum(_TUKEY * median(size, usable), _TUKEY_FLOOR_PX)[:, None]
         size *= size
-        weight = np.maximum(_ONE - size, _ZERO)
+        weight = np.maximum(1.0 - size, 0.0)
         weight *= weight
         weight *= usable
         w = weight.dot(_POWERS)
         e = (weight * edge).dot(_POWERS)
-        w0, w1 = np.maximum(w[:, 0], _TINY), w[:, 1]
+        w0, w1 = np.maximum(w[:, 0], 1e-9), w[:, 1]
         mean, middle = e[:, 0] / w0, w1 / w0
-        slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, _TINY)
+        slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, 1e-9)
         line = slope[:, None] * (_ALONG32 - middle[:, None])
         line += mean[:, None]
     return line, weight
@@ -677,4 +669,4 @@ def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)
     found = values[:, PROFILES // 2]
-    return np.asarray(np.where(np.abs(found) < _FAR, found, _ZERO))
+    return np.asarray(np.where(np.abs(found) < _FAR, found, 0.0))
