@@ -89,8 +89,9 @@ def measure_markers(
         elif config.stages == "range":
             # By the distance from the camera to the target's plane (equations 4, 6 and 11).
             offset = level_rotation(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
-            stage = stage_by_range(float(better.e_m[2] + offset[2]), config)
-            fed = {stage.value: singles[stage.value]} if stage is not Stage.BOTH else fed
+            z_m = float(better.e_m[2] + offset[2])
+            if not config.z3_m < z_m <= config.z2_m:
+                del fed["small" if z_m > config.z2_m else "large"]
     if config.method == "joint":
         one = next(iter(fed.values())) if len(fed) == 1 else one
         fed = {} if one is None else {"joint": one}
@@ -148,13 +149,10 @@ FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 
 
 def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the markers with their corners at the frame's own time, as far as their motion is
-    known.
-
-    `setup.readout_s` is from a picture's first row to its last; where it is None the corners stay
-    where they are, with what a likely read-out would do to them for an error (`common_px`);
-    else with what the motion's own error does.
-    """
+    """Return the markers with their corners at the frame's own time. `setup.readout_s` is from a
+    picture's first row to its last; where it is None the corners stay where they are, with what a
+    likely read-out would do to them for an error (`common_px`); else with what the motion's own
+    error does."""
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
@@ -195,13 +193,6 @@ def stage_of(large: bool, small: bool) -> Stage:
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
-
-
-def stage_by_range(z_m: float, config: MergeConfig) -> Stage:
-    """Return what to merge of both markers at a distance."""
-    if z_m > config.z2_m:
-        return Stage.LARGE
-    return Stage.BOTH if z_m > config.z3_m else Stage.SMALL
 
 
 def weight_matrix(weights: WeightsConfig) -> Array:

@@ -197,7 +197,7 @@ _MAX_STEPS = 8
 _TRUST = 8.0  # degrees of freedom that the claimed spread is worth beside the residuals
 
 _SMALL_GAIN, _SMALL_STEP = 1.0, 0.005  # rad and m
-# What a movement of corners departs from linear is its square over their distances, 20 px or more.
+# Departs from linear by its square over the corners' distances, 20 px or more.
 _SMALL_MOVE_PX = 0.3
 
 

@@ -31,7 +31,7 @@ class OwnTargetPlace:
 
 
 AsideOf = Callable[[MarkerName, Array], float]
-"""How far a marker with corners (4, 2) px is from where the own target is; inf: it cannot be it."""
+"""How far a marker with corners (4, 2) px is from the own target's place, or inf."""
 
 
 def marker_aside_m(
@@ -74,8 +74,7 @@ def refusal(
     )
 
 
-# --- Where the target is in the vehicle's world, in its level frame, and what of that a filter ---
-# is fed with.
+# --- The target in the world, in the level frame, and as a measurement of a filter ---
 
 
 _STILL = np.eye(4)

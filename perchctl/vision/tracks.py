@@ -129,7 +129,7 @@ def update_tracks(
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 FORGET_S = 10.0
 ESTABLISHED_FRAMES = 5
-"""A lock of fewer frames was perhaps no target: a stranger that was seen more often counts more."""
+"""A lock of fewer frames gives way to a stranger that was seen more often."""
 
 _JUMPED = "the state estimate jumped, the target did not"
 _GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
@@ -331,7 +331,7 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
     if not lock.whole:
         return True
     unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
-    # What is not looked at is not empty; where the estimate jumped, it is looked for in vain.
+    # What is not looked at is not empty.
     return (
         (sight.looks_there or unseen_s >= 2.0 * REACQUIRE_S)
         and not stranger.another_range
@@ -354,11 +354,8 @@ def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Return where both markers' corners should be, (4, 2) px each, and the pose that they follow
-    from: the last sighting of the target, moved by the vehicle's own motion since.
-
-    Without an attitude at both times there are no corners and the pose is unmoved. Both are None
-    where the sighting is too old or the target has gone behind the camera.
-    """
+    from: the last sighting, moved by the vehicle's own motion since. Without an attitude at both
+    times the pose is unmoved, and there are no corners."""
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude

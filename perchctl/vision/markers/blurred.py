@@ -78,8 +78,8 @@ def hidden_in_blur(picture: Picture) -> dict[MarkerName, RefinedCorners]:
 def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in the turn in
-    which they do; the most alike first, and each place once."""
+    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in their turn;
+    the most alike first, and each place once."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -204,7 +204,7 @@ def aligned(
 
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
     """Return True if the picture looks like the drawing. Without the marker the pattern's
-    correlation stays below 0.72 where its strength is as it should be; on it, it is above 0.95."""
+    correlation stays below 0.72 at the right strength; on it, it is above 0.95."""
     return (
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS

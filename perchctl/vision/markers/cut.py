@@ -401,8 +401,8 @@ def texture_of(drawing: Drawing) -> Texture:
 def _edges(
     cells: Array, half: float, places: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
-    """Return the sides at which a marker's cells (or the paper around it) differ: places along it
-    and its normal, as an `Outline` has them, a name for its line, and the cell's width."""
+    """Return the sides at which cells differ: places along each and its normal, as an `Outline` has
+    them, a name for its line, and the width of the cells."""
     width = 2.0 * half / len(cells)
     s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
     for across in (0, 1):

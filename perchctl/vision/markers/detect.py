@@ -260,8 +260,7 @@ def with_motion(now: Detections, previous: Detections | None) -> Detections:
     return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
-# --- What lines alone left vague, or one of the two markers unseen: measured by the drawing, ---
-# where the other marker puts it.
+# --- What lines left vague or unseen, by the drawing --------------------
 
 
 _GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster

@@ -150,10 +150,9 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2); None where residual, inliers, contrast, blur
-    or movement show that these are not a marker's sides. The shift of all edges is measured unless
-    it is known. Wide edges, and those near to the profiles' ends, are looked at twice, the second
-    time with the profiles centred on them."""
+    """Fit lines to the sides of m markers (m, 4, 2); None where these are not a marker's sides. The
+    shift of all edges is measured unless it is known. Wide edges, and those near to the profiles'
+    ends, are looked at twice, the second time with the profiles centred on them."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -364,7 +363,7 @@ def _sigma_px(
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
     """Return the spread of a marker's corners by what shakes a picture's rows: it moves upright
-    sides and not lying ones. 0 where the marker stands on a corner and nothing shows."""
+    sides and not lying ones."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -632,7 +631,7 @@ class _Profiles:
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Return straight lines (rows, n) through the middles of the halves of each row, whatever a
-    quarter of either shows. A half that shows nothing is taken to lie where the other does."""
+    quarter of either shows."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2

@@ -193,7 +193,7 @@ _INVERTED_PX = 0.5  # the lens model holds where its inverse is one
 
 def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
     """Return True if the cells have their colour that are in the picture, not hidden, and not in
-    light that glares. How many that must be depends on what else says which marker it is."""
+    light that glares; how many, depends on what else says which marker it is."""
     image, hidden = picture.image, picture.hidden
     h, w = image.shape
     at = _spots_px(corners_px, pattern, picture.camera)
@@ -260,8 +260,7 @@ def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bo
     )
 
 
-# --- The edges of a marker where they are seen: on profiles across its sides, and across the inner
-# edges of its border, that are in the picture, not hidden, and neither glaring nor shaded.
+# --- The edges of a marker where they are seen: of its sides, and inside of its border ---
 
 
 ROOM_PX = 2.0
@@ -367,8 +366,8 @@ def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> 
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return which of the free profiles (rows, n) begin black and end white, as most do, and how
-    white the paper is; None without contrast."""
+    """Return which of the free profiles (rows, n) begin black and end white, and how white the
+    paper is; None without contrast."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

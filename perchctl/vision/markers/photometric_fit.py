@@ -219,9 +219,8 @@ def likeness(grey: Array, error: Array) -> float:
 def _cells_seen(
     seen: Rendered, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
-    """Return `flip` and `flip_sigma` of an `Alignment`; `inverse` is that of N, and so `many` nodes
-    measure the same. A wrong bit is looked for as it would look: blurred, and without what the
-    unknowns of the fit explain of it (a matched filter)."""
+    """Return `flip` and `flip_sigma` of an `Alignment`, by the inverse of N. A wrong bit is looked
+    for as it would look: blurred, and without what the unknowns of the fit explain of it."""
     soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
@@ -401,7 +400,7 @@ def gram(rows: Array) -> Array:
     return np.asarray(total + rest.dot(rest.T))
 
 
-# --- A marker's drawing at the nodes of a grid, blurred, with all that follows from that alone ---
+# --- A marker's drawing at the nodes of a grid, blurred ---------------
 
 
 _STEP = 0.02  # of the blur

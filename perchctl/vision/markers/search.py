@@ -159,8 +159,8 @@ def choose(
 ) -> dict[MarkerName, Array]:
     """Return at most one of each marker. A small marker in the centre of a large one, of the right
     size and turn, verifies both; of several such pairs the one counts that is nearest to the last
-    detections, and what goes on from these counts more than a pair elsewhere. Without these, a lone
-    marker is taken, of several the one that `own` has nearest."""
+    detections. What goes on from these counts more than a pair elsewhere. Of several lone ones that
+    counts which `own` has nearest."""
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
