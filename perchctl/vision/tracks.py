@@ -181,6 +181,8 @@ def judged(
         return Verdict(taken=True)
     if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
         return Verdict(taken=False, stranger=stranger)
+    if stranger is None and _is_clear(lock.track, sight, constants):
+        return Verdict(taken=True)
     fit = _misfit(lock.track, sight, constants)
     other = None if stranger is None else _misfit(stranger.track, sight, constants)
     theirs = other is not None and other.squared <= _GATE
@@ -263,6 +265,15 @@ def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
     R = constants.R if measured.R is None else measured.R
     S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _PLACE + R + bias @ bias.T
     return _Fit(off, S + np.diag(_unclaimed(_range_m(sight)) ** 2))
+
+
+def _is_clear(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
+    """Return True if what no pose claims explains all, as in most frames: a quick look."""
+    wanted = predict_track(track, sight.t_s, constants, spread=False)
+    off = sight.measured.z - wanted.x[MEASURED]
+    off[0] = wrap_rad(float(off[0]))
+    off /= _unclaimed(_range_m(sight))
+    return float(off @ off) <= _GATE
 
 
 def _range_m(sight: Sight) -> float:

@@ -8,18 +8,29 @@ from itertools import product
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.profile import KalmanConfig, MergeConfig
 from perchctl.vision import (
     Attitude,
+    MarkerPose,
     Pipeline,
     PipelineOutput,
     PipelineState,
 )
+from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.pipeline import follow
-from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S
-from perchctl.vision.types import Detections
+from perchctl.vision.tracks import (
+    ESTABLISHED_FRAMES,
+    FORGET_S,
+    REACQUIRE_S,
+    Sight,
+    _is_clear,
+    judged,
+)
+from perchctl.vision.types import Detections, Lock, MarkerTrack, Stranger
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -96,6 +107,31 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
     (back,) = watch.show(1)
     assert measured([back]) == [True]
     assert back.lock_note == ""
+
+
+@settings(max_examples=80)
+@given(
+    off_m=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
+    off_rad=st.floats(-0.6, 0.6),
+    sigma_m=st.floats(1e-4, 0.1),
+    range_m=st.floats(0.05, 2.0),
+)
+def test_what_is_clearly_the_targets_is_so_by_every_spread(
+    off_m: tuple[float, float, float], off_rad: float, sigma_m: float, range_m: float
+) -> None:
+    """By way of all spreads, as beside a stranger, too."""
+    track = MarkerTrack(t_s=0.0, x=np.zeros(8), P=np.eye(8) * sigma_m**2)
+    pose = MarkerPose(
+        "joint", 0.03, np.zeros(3), np.array([0.0, 0.0, range_m]), np.zeros(3), 0.0, np.ones(3),
+        1.0, 0.0,
+    )  # fmt: skip
+    z = np.array([off_rad, *off_m])
+    sight = Sight(0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True)
+    constants = make_filter(KalmanConfig(), in_world=True)
+    stranger = Stranger(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
+    lock = Lock(track=track, pose=pose, in_world=True, frames=9, whole=True)
+    if _is_clear(track, sight, constants):
+        assert judged(lock, stranger, sight, constants).taken
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:

@@ -469,7 +469,8 @@ def measure(
     around = surroundings(s, markers.rims, rim, depth_px.ravel())
     offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
     points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
-    points = np.nan_to_num(points.reshape(-1, PROFILES, 2))
+    points = points.reshape(-1, PROFILES, 2)
+    points = points if finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_px)
     sides, inner_edges = (
         Samples(grey[part], near_px[part], points[part], weight[part], blur_px[part])
