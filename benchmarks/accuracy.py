@@ -29,7 +29,7 @@ from common import (
 )
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
+from perchctl.profile import DetectorConfig, MergeConfig
 from perchctl.vision import (
     CameraModel,
     Frame,
@@ -73,8 +73,7 @@ def report(title: str, views: Iterator[View], camera: CameraModel) -> None:
     ours = setup_with(camera)
     paper = setup_with(
         camera,
-        detector=DetectorConfig(refinement="none", window=False),
-        pose=PoseConfig(solver="epnp", refine=False),
+        detector=DetectorConfig(refinement="subpix"),
         merge=MergeConfig(method="weights"),
     )
     errors: dict[str, list[Array]] = defaultdict(list)

@@ -2,11 +2,10 @@
 
 The camera sits beside the magnet gear, or under it, and as the gear comes near to the target
 the markers grow out of the picture. Ascents are rendered with motion blur and noise, the
-vehicle swaying a little; every frame goes through the pipeline. `--without` switches the
-alignment of what is left of the drawing off. Blind is the share of the last 10 cm without
-a measured pose; the squared error is that of (x, y, z, yaw) in units of its covariance, a
-degree of freedom. In every ascent the target is printed a little too large or too small, by as
-much as a print that was measured leaves open, and the state estimate wanders.
+vehicle swaying a little; every frame goes through the pipeline. Blind is the share of the last
+10 cm without a measured pose; the squared error is that of (x, y, z, yaw) in units of its
+covariance, a degree of freedom. In every ascent the target is printed a little too large or too
+small, by as much as a print that was measured leaves open, and the state estimate wanders.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 from common import CAMERA, CEILING_Z_M, SIDES_M, TARGET, renderer, rms, table
 
 from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
-from perchctl.profile import CameraConfig, DetectorConfig, Mounting, Profile
+from perchctl.profile import CameraConfig, Mounting, Profile
 from perchctl.profile.vision import VehicleConfig
 from perchctl.sim import Renderer
 from perchctl.target.prints import MEASURED_SIGMA
@@ -80,12 +79,11 @@ class Row:
     took_s: float
 
 
-def setup_for(case: Case, cut: bool) -> Pipeline:
+def setup_for(case: Case) -> Pipeline:
     profile = Profile(
         target=TARGET.model_copy(update={"size_sigma": MEASURED_SIGMA}),
         camera=CameraConfig(mount=Mounting(position_m=(0.0, 0.0, 0.0))),
         vehicle=VehicleConfig(gear_body_m=case.gear_m),
-        detector=DetectorConfig(cut=cut),
     )
     return make_pipeline(profile, CAMERA)
 
@@ -136,7 +134,6 @@ def ascent(case: Case, setup: Pipeline, scene: Renderer, seed: int, in_hand: boo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one ascent a mounting")
-    parser.add_argument("--without", action="store_true", help="as before the alignment")
     parser.add_argument("--hand", action="store_true", help="without the vehicle's attitude")
     parser.add_argument("--only", default="", help="mountings whose name holds this")
     options = parser.parse_args()
@@ -145,7 +142,7 @@ def main() -> None:
     scenes = [printed(seed, rng) for seed in range(1 if options.quick else 3)]
     lines = []
     for case in (c for c in CASES if options.only in c.name):
-        setup = setup_for(case, not options.without)
+        setup = setup_for(case)
         rows = [
             row
             for seed, scene in enumerate(scenes)

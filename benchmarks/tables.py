@@ -20,7 +20,7 @@ from common import (
 )
 
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
+from perchctl.profile import DetectorConfig, MergeConfig
 from perchctl.sim import Renderer
 from perchctl.vision import Frame, Pipeline, PipelineState, step
 
@@ -84,8 +84,7 @@ def main() -> None:
     scene = renderer(seed=21, camera_noise_sigma=NOISE_SIGMA)
     ours = setup_with()
     paper = setup_with(
-        detector=DetectorConfig(refinement="none", window=False),
-        pose=PoseConfig(solver="epnp", refine=False),
+        detector=DetectorConfig(refinement="subpix"),
         merge=MergeConfig(method="weights"),
     )
     limit_deg = math.degrees(math.atan(CAMERA.size_px[0] / 2.0 / float(CAMERA.K[0, 0])))

@@ -251,11 +251,8 @@ class Tracker:
     and gear; with `stills` each picture is searched thoroughly, and nothing is remembered."""
 
     def __init__(self, profile: Profile, camera: CameraModel, *, live: bool, stills: bool) -> None:
-        bare = camera_profile(profile)
-        if stills:
-            detector = bare.detector.model_copy(update={"blurred_every": 1})
-            bare = bare.model_copy(update={"detector": detector})
-        self._perception = Perception(make_pipeline(bare, camera), stills=stills)
+        pipeline = make_pipeline(camera_profile(profile), camera)
+        self._perception = Perception(pipeline, stills=stills)
         self._config, self._live, self._stills = profile.camera, live, stills
         self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
         self._target: CameraPose | None = None

@@ -25,7 +25,6 @@ from perchctl.perception import (
     Perception,
     add_samples,
     attitude_at,
-    battery_age_s,
 )
 from perchctl.positioning import FeedStatus, SightFeed
 from perchctl.profile import Profile
@@ -178,7 +177,7 @@ class FlightInputs:
             new_frame=self.output is not None,
             camera_age_s=now_s - self.last_good_frame_s,
             camera_problem=self.camera_problem,
-            battery_age_s=battery_age_s(self.history, now_s),
+            battery_age_s=self.history.battery_age_s(now_s),
             jumped=self.history.jumped,
             turned_rad=self.history.turned_rad,
             disagreeing_frames=perception.state.disagreeing_frames,

@@ -1,6 +1,5 @@
 from .history import History as History
 from .history import add_samples as add_samples
 from .history import attitude_at as attitude_at
-from .history import battery_age_s as battery_age_s
 from .perception import MIRRORED_FRAMES as MIRRORED_FRAMES
 from .perception import Perception as Perception

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 from perchctl.geometry import wrap_rad
 from perchctl.mission import ImuMotion
@@ -14,6 +15,7 @@ from perchctl.vehicle import Telemetry, is_battery_reading
 from perchctl.vision import Attitude
 
 Vector = tuple[float, float, float]
+_time_s = attrgetter("t_s")
 
 KEEP_S = 2.0
 SMEARED_S = 0.15
@@ -23,12 +25,9 @@ FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it.
-
-    `battery_changed_s`: when the last reading differed from the one before, `battery_v`; without
-    any reading, when the first sample came: an absent one ages like one that stands still.
-    `imu`: the motion by the accelerometer over all samples of the flight.
-    """
+    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it. `battery_changed_s`:
+    when the last reading differed from the one before; without any, when the first sample came.
+    `imu`: the motion by the accelerometer over the whole flight."""
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False
@@ -41,20 +40,19 @@ class History:
     def newest(self) -> Telemetry | None:
         return self.samples[-1] if self.samples else None
 
+    def battery_age_s(self, now_s: float) -> float:
+        """Seconds since the battery's last new reading; 0 before there is telemetry."""
+        return 0.0 if self.battery_changed_s is None else now_s - self.battery_changed_s
+
 
 def add_samples(
     history: History, new: list[Telemetry], safety: SafetyConfig, late: bool = False
 ) -> History:
-    """The history with new samples; `jumped` and `turned_rad`, the largest step of the
-    heading, are about these samples only, or about those before, too, where they came `late` in
-    the same turn.
-
-    Samples with NaN or out of order are left out (fault 35). Where position and velocity alone
-    are no numbers, they are those of the sample before, and older by that.
-    """
+    """The history with new samples; `jumped` and `turned_rad`, the largest step of the heading, are
+    about these only, or also about those before, where they came `late` in the same turn. Samples
+    with NaN or out of order are left out (fault 35); a position or velocity alone is that of the
+    sample before."""
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
-    if not new:
-        return replace(history, jumped=jumped, turned_rad=turned_rad)
     samples, imu = list(history.samples), history.imu
     changed_s, battery_v = history.battery_changed_s, history.battery_v
     for sample in new:
@@ -72,16 +70,9 @@ def add_samples(
         imu = imu.with_sample(samples[-1] if samples else None, sample)
         samples.append(sample)
     if samples:
-        oldest = samples[-1].t_s - KEEP_S
-        first = bisect.bisect_left(samples, oldest, key=_time_s)
-        samples = samples[first:]
+        oldest_s = samples[-1].t_s - KEEP_S
+        samples = samples[bisect.bisect_left(samples, oldest_s, key=_time_s) :]
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
-
-
-def battery_age_s(history: History, now_s: float) -> float:
-    """Seconds since the battery's last new reading; 0 before there is telemetry."""
-    changed_s = history.battery_changed_s
-    return 0.0 if changed_s is None else now_s - changed_s
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:
@@ -116,17 +107,10 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """The velocity in world axes by the first sample from `t_s` on, or by the newest; zero without
-    a sample."""
-    samples = history.samples
-    if not samples:
-        return 0.0, 0.0, 0.0
-    i = bisect.bisect_left(samples, t_s, key=_time_s)
-    return samples[min(i, len(samples) - 1)].velocity_mps
-
-
-def _time_s(sample: Telemetry) -> float:
-    return sample.t_s
+    """The velocity in world axes from `t_s` on, or the newest; else zero."""
+    later = bisect.bisect_left(history.samples, t_s, key=_time_s)
+    found = history.samples[later : later + 1] or history.samples[-1:]
+    return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
 
 
 def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
@@ -135,8 +119,7 @@ def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the estimate stepped farther than any flight leads: at once, or smeared over a
-    few samples by the vehicle's own filter."""
+    """True if the estimate stepped farther than any flight leads, at once or smeared."""
     last = before[-1]
     first = before[bisect.bisect_left(before, last.t_s - SMEARED_S, key=_time_s)]
     faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
@@ -154,8 +137,7 @@ def _turned_rad(a: Telemetry, b: Telemetry) -> float:
 
 
 def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the position moved farther than its speed explains. Floor and ceiling are near: a
-    step in height counts sooner."""
+    """True if the position moved farther than its speed explains."""
     moved_m = math.dist(a.position_m, b.position_m)
     rise_m = abs(b.position_m[2] - a.position_m[2])
     fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))
@@ -173,8 +155,7 @@ def _is_placed(s: Telemetry) -> bool:
 
 
 def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
-    """The sample with position and velocity of the last one: its attitude, acceleration and thrust
-    are fresh all the same, and by them the vehicle comes down."""
+    """The sample with position and velocity of the last one."""
     behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
     return replace(
         new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s

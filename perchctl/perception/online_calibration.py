@@ -1,8 +1,7 @@
 """The camera's latency and mounting, estimated picture by picture while the vehicle flies.
 
 With `camera.latency_s: measured` the latency is used, too: taken off the pictures' times, once
-it is sure, slowly, and within bounds. What is estimated rests on the pictures' times before
-that, so that its use does not feed back.
+it is sure, slowly, and within bounds. What is estimated rests on the times before that.
 """
 
 from __future__ import annotations
@@ -22,12 +21,11 @@ from perchctl.vision import Attitude, Consistency, MarkerPose, PoseSetup
 
 SOLVE_EVERY_S = 1.0
 LIKELY_S = 0.02
-"""A delay whose sigma is smaller is where the next pictures' factors are taken."""
+"""A surer delay is where the next pictures' factors are taken."""
 USED_SIGMA_S = 0.008
-"""A delay that is less sure is not used: of its 95 % interval, half is 16 ms, and 30 ms make an
-alignment swing."""
+"""A delay that is less sure is not used: 30 ms make an alignment swing."""
 SLEW = 0.02
-"""Seconds a second: at 0.4 m/s the target's place moves by 8 mm/s, as a drift does."""
+"""Seconds a second: at 0.4 m/s the target moves by 8 mm/s, as a drift does."""
 LONGEST_STEP_S = 0.1
 
 
@@ -55,98 +53,71 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture of the target. `t_s` is its arrival less the
-    profile's latency."""
-    new = _learned(old, t_s, pose, history, setup, attitude_sigma_rad)
-    if camera.latency_s != "measured":
-        return new
-    return replace(new, seen_s=t_s, used_s=_slewed(new, camera, t_s - old.seen_s))
-
-
-def _learned(
-    old: OnlineCalibration,
-    t_s: float,
-    pose: MarkerPose,
-    history: History,
-    setup: PoseSetup,
-    attitude_sigma_rad: float,
-) -> OnlineCalibration:
-    """Return the estimate with the picture's target in its sums, and once a second with their
-    solution; unchanged by a pose that is no number or too near, or where the attitude of its time
-    is not known."""
-    if pose.cov is None or not finite(pose.cov) or float(pose.tvec_m[2]) < LEAST_RANGE_M:
-        return old
-    likely = old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
+    """Return the estimate with one more picture in its sums, and once a second with their solution.
+    `t_s` is its arrival less the profile's latency. Nothing is learned of a pose that is no number
+    or too near, or without the attitude of its time."""
+    new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
     before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
     after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
-    if before is None or after is None:
-        return old
-    velocity_mps = velocity_at(history, t_s - delay_s)
-    moment = consistency_moment(pose, before, after, velocity_mps, delay_s, setup)
-    new = replace(old, sums=add_moment(old.sums, t_s, *moment))
-    if t_s - old.solved_s >= SOLVE_EVERY_S:
-        newest = solve_consistency(new.sums, attitude_sigma_rad)
-        new = replace(new, newest=newest, solved_s=t_s)
-    return new
-
-
-def _slewed(new: OnlineCalibration, camera: CameraConfig, dt_s: float) -> float:
-    """Return the latency in use, one picture on: closer to what is measured, or as it was where
-    that is unsure."""
-    if new.newest is None or not new.newest.delay_sigma_s <= USED_SIGMA_S:
-        return new.used_s
-    (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
-    goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
-    step_s = SLEW * max(0.0, min(dt_s, LONGEST_STEP_S))
-    return new.used_s + max(-step_s, min(step_s, goal_s - new.used_s))
+    is_measured = pose.cov is not None and finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
+    if is_measured and before is not None and after is not None:
+        velocity_mps = velocity_at(history, t_s - delay_s)
+        moment = consistency_moment(pose, before, after, velocity_mps, delay_s, setup)
+        new = replace(old, sums=add_moment(old.sums, t_s, *moment))
+        if t_s - old.solved_s >= SOLVE_EVERY_S:
+            newest = solve_consistency(new.sums, attitude_sigma_rad)
+            new = replace(new, newest=newest, solved_s=t_s)
+    if camera.latency_s != "measured":
+        return new
+    used_s = new.used_s
+    if new.newest is not None and new.newest.delay_sigma_s <= USED_SIGMA_S:
+        (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
+        goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
+        step_s = SLEW * max(0.0, min(t_s - old.seen_s, LONGEST_STEP_S))
+        used_s += max(-step_s, min(step_s, goal_s - used_s))
+    return replace(new, seen_s=t_s, used_s=used_s)
 
 
 # --- What a flight tells about the latency and the mounting -----------
-# The target stands still in the world. Where the pictures are later than the profile says by d,
-# it is placed as the vehicle was d earlier: beside its place by d times the speed at which the
-# vehicle's motion and turning sweep the line of sight. Where the camera is turned from what the
-# profile says, it is placed beside by the turn times the way to it. So the place of the target in
-# the estimate's world, frame by frame, is linear in the delay and the turn, with what the vehicle
-# did as known factors, and one least squares over a flight gives both.
+# Where the pictures are later than the profile says by d, the target is placed beside its place by
+# d times the speed at which the vehicle's motion and turning sweep the line of sight; where the
+# camera is turned, by the turn times the way to it. So its place in the estimate's world is linear
+# in the delay and the turn, and one least squares over a flight gives both.
 #
 # The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
 # each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
-# through the same one as the target's place, and what is summed are the innovations: that is
-# the generalized least squares of the whole flight with a few numbers of memory (de Jong 1991, "The
-# diffuse Kalman filter"). Nothing is solved until somebody asks (`solve_consistency`).
+# through the same one, and what is summed are the innovations: the generalized least squares of the
+# whole flight with a few numbers of memory (de Jong 1991, "The diffuse Kalman filter").
 
 
 X, Y, HEADING = range(3)
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
-"""Columns: the target's place (rad for its heading), and what may explain how it moves."""
+"""Columns: the place (rad for the heading), and what may explain its moves."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
-"""What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of the
-mounting's roll and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of
-drift."""
+"""What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of roll
+and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of drift."""
 
 ATTITUDE_STEP_S = 0.02
-"""Of the difference that stands for a speed: a shake of 5 Hz keeps 0.94 of its."""
+"""Of the difference that stands for a speed."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
-"""Of the vehicle's speed and rates of turn, as its estimate has them. It looks like motion, and
-like motion that is seen at once: what is not well above it is taken for rest."""
+"""Of the vehicle's speed and rates of turn: what is not well above it is taken for rest."""
 JITTER_S = 0.008
 """By which single pictures are early or late."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
-"""Of the estimate's place, and of its heading, roll and pitch, in a second's random walk."""
+"""Of the estimate's place and attitude, in a second's random walk."""
 MOST_GAP_S = 0.5
 GATE_SIGMAS = 5.0
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
-"""What the gate takes for possible beyond the noise: 200 ms, and 0.4 rad about each axis."""
+"""What the gate allows beyond the noise: 200 ms, and 0.4 rad."""
 LEAST_RANGE_M = 0.15
-"""Nearer, nothing is swept: it is pressed soon, and its estimate may run away."""
+"""Nearer, nothing is swept: it is pressed soon."""
 STAMPS_S = 0.003
-"""What an average does not take away: of the stamps of telemetry and exposure, and of the
-vehicle's own answer to the noise of its estimate."""
+"""What an average does not take away, of the stamps of telemetry and exposure."""
 LARGE_TURN = 0.03
-"""The speeds are those of the profile's mounting: a large turn is known to this part of it."""
+"""The speeds are by the profile's mounting: a large turn is known so well."""
 LEAST_FRAMES = 30
 
 
@@ -172,12 +143,9 @@ def consistency_moment(
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
     """Return what a frame tells: rows (3, 8) as the columns have them, the variance (3,) of the
-    target's place, and its range along the upward axis, m.
-
-    `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time less `delay_s`, `velocity_mps` its velocity then. `delay_s` is the delay that is thought
-    likely: about it, the factors are those of small changes.
-    """
+    target's place, and its range, m. `before` and `after` are the vehicle's attitude
+    `ATTITUDE_STEP_S` before and after the frame's time less `delay_s`, the delay that is thought
+    likely; `velocity_mps` its velocity then."""
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
@@ -210,14 +178,12 @@ def consistency_moment(
 
 
 def _above(size: float, noise: float) -> float:
-    """Return the part of a motion that counts: none of what noise can be, all of what is far
-    above."""
+    """Return the part of a motion that counts: none of what noise can be."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
 def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
-    """Return the first two rows of ``R_world_body``: without arrays, as this is done for every
-    picture."""
+    """Return the first two rows of ``R_world_body``, without arrays."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -235,8 +201,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_moment(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """Return the sums with one frame more; `rows`, `variance` and `range_m` are what
-    `consistency_moment` returns of it. After a gap, or a jump of the target or of the estimate,
+    """Return the sums with one frame more, by its `consistency_moment`. After a gap, or a jump,
     changes are counted anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
@@ -280,16 +245,13 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consi
     # More scatter than claimed widens what is claimed, less of it narrows nothing.
     covariance *= max(1.0, left / sums.rows)
     sigma = np.sqrt(np.diagonal(covariance))
-    by = {column: column - 1 for column in (DELAY, TILT_X, TILT_Y, TURN, SCALE)}
-    tilts = [math.hypot(float(sigma[by[c]]), attitude_sigma_rad) for c in (TILT_X, TILT_Y)]
-    turn = math.atan2(float(found[by[TURN]]), 1.0 - float(found[by[SCALE]]))
+    tilt_x, tilt_y = (
+        math.hypot(sigma[column - 1], attitude_sigma_rad) for column in (TILT_X, TILT_Y)
+    )
+    turn = math.atan2(found[TURN - 1], 1.0 - found[SCALE - 1])
     return Consistency(
-        delay_s=float(found[by[DELAY]]),
-        delay_sigma_s=math.hypot(float(sigma[by[DELAY]]), STAMPS_S),
-        turn_rad=(float(found[by[TILT_X]]), float(found[by[TILT_Y]]), turn),
-        turn_sigma_rad=(
-            tilts[0],
-            tilts[1],
-            math.hypot(float(sigma[by[TURN]]), LARGE_TURN * turn),
-        ),
+        delay_s=float(found[DELAY - 1]),
+        delay_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
+        turn_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
+        turn_sigma_rad=(tilt_x, tilt_y, math.hypot(sigma[TURN - 1], LARGE_TURN * turn)),
     )

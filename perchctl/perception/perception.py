@@ -62,7 +62,7 @@ class Perception:
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
     health: FrameHealth = field(default_factory=FrameHealth)
-    _mirrored: int = 0
+    _mirrored: int = 0  # frames with the target's mirror image since one showed the target
 
     def look(self, frame: Frame, later_s: float = 0.0) -> Iterator[tuple[Frame, PipelineOutput]]:
         """Yield each picture of the frame with what the pipeline finds in it: one picture, or the
@@ -76,7 +76,10 @@ class Perception:
         for picture in found:
             attitude = attitude_at(self.history, picture.t_s)
             self.state, output = step(self.state, picture, attitude, self.pipeline)
-            self._mirrored = _mirrored_frames(self._mirrored, output)
+            if output.detections.mirrored:
+                self._mirrored += 1
+            elif output.detections.markers:
+                self._mirrored = 0
             if output.refused:
                 self.refused = output.lock_note
             self._calibrate(output, later_s)
@@ -99,12 +102,11 @@ class Perception:
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sights(self) -> None:
-        """Forget the sights by which the vehicle's motion is judged, since wrong positions have
-        turned its attitude."""
+        """Forget the sights by which the vehicle's motion is judged."""
         self.motion = drop_sights(self.motion)
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
-        """Update the estimates of motion, latency and mounting with a picture of the target."""
+        """Update what is estimated of motion, latency and mounting."""
         pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history
@@ -127,10 +129,3 @@ class Perception:
     @property
     def _attitude_sigma_rad(self) -> float:
         return math.radians(self.profile.kalman.attitude_sigma_deg)
-
-
-def _mirrored_frames(before: int, output: PipelineOutput) -> int:
-    """Count the frames that have shown the target's mirror image since one showed the target."""
-    if output.detections.mirrored:
-        return before + 1
-    return 0 if output.detections.markers else before

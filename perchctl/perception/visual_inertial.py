@@ -1,10 +1,9 @@
 """Checks whether the pictures show the motion that the accelerometer measures.
 
-The target stands still. The way from the body to it, turned by the attitude at the exposure, and
-the body's own motion by its accelerometer add up to one place, but for the speed at the window's
-begin and a constant offset. If pictures are later than assumed, or the camera is turned about the
-upward axis, the sum wanders; with the right delay or turn it comes to rest. The vehicle's estimate
-has no part in it: by the target alone it follows the pictures itself.
+The way from the body to the target, turned by the attitude at the exposure, and the body's own
+motion by its accelerometer add up to one place, but for the speed at the window's begin and a
+constant offset. If pictures are later than assumed, or the camera is turned about the upward axis,
+the sum wanders; with the right delay or turn it comes to rest.
 """
 
 from __future__ import annotations
@@ -54,8 +53,7 @@ class VisualInertialWindow:
 
 
 def drop_sights(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window once wrong positions have turned the attitude: without the sights from before, and
-    content with a rougher speed."""
+    """The window without the sights from before, and content with a rougher speed."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -66,8 +64,8 @@ def estimate_motion(
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
 ) -> VisualInertialWindow:
-    """The window with one more sight. `samples`: the telemetry of the last 2 s, oldest first;
-    `offset_g`: what the accelerometer reads too much."""
+    """The window with one more sight, by the telemetry of the last 2 s, oldest first; `offset_g` is
+    what the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, way_m)))
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
@@ -75,9 +73,10 @@ def estimate_motion(
         return new
     wanders_m, velocity_mps, bias_mps2 = motion_by_hypothesis(new.sights, samples, offset_g)
     if old.mismatch is None:  # else it stays
-        found = _found(wanders_m)
-        agrees = found is not None and old.found is not None and _alike(found, old.found)
-        agreed = 0 if found is None else old.agreed + 1 if agrees else 1
+        found, before = _found(wanders_m), old.found
+        agreed = 0 if found is None else 1
+        if found is not None and before is not None and found.turn_rad == before.turn_rad:
+            agreed += old.agreed if abs(found.later_s - before.later_s) <= ALIKE_S else 0
         new = replace(new, found=found, found_s=t_s, agreed=agreed)
     i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
@@ -89,19 +88,8 @@ def estimate_motion(
     return replace(new, judged_s=t_s)
 
 
-def _alike(a: Mismatch, b: Mismatch) -> bool:
-    return a.turn_rad == b.turn_rad and abs(a.later_s - b.later_s) <= ALIKE_S
-
-
-def _nearest(mismatch: Mismatch) -> int:
-    """The index of a mismatch among those that are tried."""
-    later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
-    return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
-
-
 def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
-    """The index that wanders least among those that are no other mismatch: a delay that is wrong by
-    some hundredths of a second adds 0.1 m/s."""
+    """The index that wanders least among those that are no other mismatch."""
     about = np.abs(LATER_S - mismatch.later_s) < LEAST_LATER_S
     about &= mismatch.turn_rad == TURNS_RAD
     return int(np.argmin(np.where(about, wanders_m, np.inf)))
@@ -110,7 +98,7 @@ def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
 def _found(wanders_m: Array) -> Mismatch | None:
     """The mismatch that explains the pictures; None if the profile does."""
     best = int(np.argmin(wanders_m))
-    as_it_is = float(wanders_m[_nearest(Mismatch())])
+    as_it_is = float(wanders_m[np.argmin(np.abs(LATER_S) + np.abs(TURNS_RAD))])
     if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
         return None
     found = Mismatch(float(LATER_S[best]), float(TURNS_RAD[best]))

@@ -116,6 +116,7 @@ def key_unit(path: str) -> str:
 GONE = frozenset(
     (
         "camera.controls",
+        "detector.window",
         "simulation.bare_floor_aside_m",
         "simulation.bare_floor_m",
         "simulation.camera_blank_rate",

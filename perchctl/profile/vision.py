@@ -139,9 +139,7 @@ class CameraConfig(Section):
     start_timeout_s: float = key(8.0, "wait for the first good picture", gt=0, le=60)
     mirrored: bool = key(False, "flip each picture before use")
     mask: str | None = key(None, "picture of what the vehicle itself covers, white")
-    fields: Literal["auto", "top", "bottom", "progressive"] = key(
-        "auto", "interlaced pictures: found by measure, or which field is earlier, or never"
-    )
+    fields: ClassVar[str] = "auto"  # of interlaced pictures: found by measure
     readout_s: float | None = key(
         0.0, "rolling shutter: from the first row to the last; none: not known", ge=0, le=0.05
     )
@@ -271,28 +269,21 @@ class TargetConfig(Section):
 class DetectorConfig(Section):
     """The profile's `detector`: how markers are searched and measured."""
 
-    refinement: Literal["none", "subpix", "line"] = key(
-        "line", "of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
+    refinement: Literal["subpix", "line"] = key(
+        "line", "of corners: lines, and all that builds on them, or OpenCV's sub-pixel"
     )
-    window: bool = key(True, "look around the last pose first")
-    blurred: bool = key(True, "look once more where blur may hide the target")
-    blurred_every: int = key(
-        4, "... so in every Nth picture of a stream without it, not for a sharp one", ge=1, le=100
-    )
-    cut: bool = key(
-        True, "measure by what is left of the drawing where the picture cuts both markers"
-    )
+    blurred: ClassVar[bool] = True  # with lines: looked for where blur may hide the target
+    blurred_every: ClassVar[int] = 4  # ... in so many pictures of a stream without it
+    cut: ClassVar[bool] = True  # with lines: measured where the picture cuts both markers
     correction_bits_large: ClassVar[int] = 0  # wrong cells that are corrected
-    correction_bits_small: int = key(1, "wrong cells that are corrected", ge=0, le=3)
+    correction_bits_small: ClassVar[int] = 1
 
 
 class PoseConfig(Section):
     """The profile's `pose`: how a pose is solved from corners."""
 
-    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = key(
-        "sqpnp", "OpenCV's solver for the first guess"
-    )
-    refine: bool = key(True, "least squares on the corners after it")
+    solver: ClassVar[str] = "sqpnp"  # OpenCV's, for the first guess
+    refine: ClassVar[bool] = True  # by least squares on the corners after it
     max_reprojection_px: float = key(3.0, "no pose above this RMS", gt=0)
     each_marker: bool = key(False, "beside the joint pose also each marker's own, for the log")
 

@@ -1,26 +1,17 @@
 """Pictures of interlaced cameras: found out, taken apart, and put in their order of time; pure.
 
 An interlaced frame is two pictures, half a frame's period apart, each in every second row.
-What moved between them stands in it like a comb, and a marker so combed is not read.
-Three things about a stream are found by measure, none is configured:
-
-- whether a frame is combed: then a row is unlike the rows beside it, which are of the other
-  field, and like the rows two away, which are of its own. In a whole picture, nearer rows
-  are more alike; in noise, all are alike unlike. Strong differences only are counted, so
-  that a small target in a noisy picture is enough;
-- which field is the earlier one: of two frames in a row the later field of the first
-  is more like the earlier field of the second than the other way around;
-- how far they are apart: half the frames' period.
-
-While the order is not known yet (a first frame, a single picture) both fields are measured and
-the mean is taken, which belongs to the middle moment in either order.
+What moved between them stands in it like a comb: a row is unlike the rows beside it, which are of
+the other field, and like the rows two away. Strong differences only are counted, so that a small
+target in a noisy picture is enough. Of two frames in a row the later field of the first is more
+like the earlier field of the second than the other way around. While the order is not known yet
+both fields are measured, and their mean belongs to the middle moment in either order.
 """
 
 from __future__ import annotations
 
 import math
 from statistics import mean, median
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -29,13 +20,11 @@ from numpy.typing import NDArray
 from perchctl.values import replace
 from perchctl.vision.types import FieldState, Frame
 
-FieldsMode = Literal["auto", "top", "bottom", "progressive"]
 Grey = NDArray[np.uint8]
 
-_COMBED = 1.4
-# Of so many rows in a group all but the outer four are compared with their neighbours, in
-# one go. Odd and even rows must both be: a single lost line of an analogue picture then counts
-# among the differences to its own field's rows as much as among the others.
+_COMBED = 1.4  # fields a pixel apart
+# Of so many rows in a group all but the outer four are compared with their neighbours. Odd and even
+# rows must both be: a single lost line then counts among both kinds of differences.
 _GROUP = 8
 _STRONG = 5.0  # of the mean difference within a field, for one to count
 _LEAST_GREY = 8.0
@@ -55,14 +44,13 @@ _MOST_EVIDENCE = 3.0  # so that a changed order is found in time
 _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
-def combing(image: Grey) -> float:
-    """Return how much more the rows of a picture, (h, w) grey, differ from the other field's rows
-    than from their own field's. From 1.4 on the picture counts as combed: fields a pixel apart."""
+def is_combed(image: Grey) -> bool:
+    """Return True if a picture, (h, w) grey, holds two fields of different times: its rows differ
+    much more from the other field's than from their own."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
-        return 0.0
-    # Groups of rows side by side, so that the next row is `width` further along; every third
-    # group is enough.
+        return False
+    # Groups of rows side by side: the next row is `width` further along; every third is enough.
     flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
     above2, above, row, below, below2 = (
         flat[:, k * width : (k + _GROUP - 4) * width] for k in range(5)
@@ -77,12 +65,7 @@ def combing(image: Grey) -> float:
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
-    return energy[0] / (energy[1] + _FLOOR * row.size)
-
-
-def is_combed(image: Grey) -> bool:
-    """True where the picture, (h, w) grey, holds two fields of different times."""
-    return combing(image) > _COMBED
+    return energy[0] / (energy[1] + _FLOOR * row.size) > _COMBED
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
@@ -95,8 +78,7 @@ def split_fields(image: Grey) -> tuple[Grey, ...]:
 
 
 def field_picture(image: Grey, first_row: int) -> Grey:
-    """Return one field at full height: its own rows (`first_row`, and every second after it) stay
-    where they are, those between are interpolated."""
+    """Return one field at full height: its own rows stay, those between are interpolated."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -110,42 +92,33 @@ def field_picture(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Return the spread of an edge along the rows of a field, by its blur in the whole picture:
-    between rows that are 2 px apart, a sharp edge is where it happens to be taken for."""
+    """Return the spread of an edge along the rows of a field, by its blur."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
-def classify_fields(frame: Frame, mode: FieldsMode) -> Frame:
+def classify_fields(frame: Frame) -> Frame:
     """Return the frame with `fields` set to what it is."""
     if frame.fields is not None:
         return frame
-    if mode == "progressive":
-        return replace(frame, fields="whole")
-    combed = mode != "auto" or is_combed(frame.image)
-    return replace(frame, fields="woven" if combed else "whole")
+    return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
 def halves(frame: Frame) -> tuple[Frame, Frame]:
-    """Return the top and the bottom field of a woven frame, both at the frame's time."""
+    """Return the top and the bottom field, both at the frame's time."""
     return (
         replace(frame, image=field_picture(frame.image, 0), fields="top", encoded=None),
         replace(frame, image=field_picture(frame.image, 1), fields="bottom", encoded=None),
     )
 
 
-def separate_fields(
-    state: FieldState, frame: Frame, mode: FieldsMode
-) -> tuple[FieldState, tuple[Frame, ...]]:
+def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
     """Return the pictures of a stream's frame, in their order of time: one, or two fields.
 
-    The frame's time is the middle between its fields. `mode`: ``auto`` finds all by measure,
-    ``top`` and ``bottom`` say that every frame is woven and which field is earlier,
-    ``progressive`` that none is. In a stream in which none was seen yet, every third frame
-    is looked at.
+    The frame's time is the middle between its fields. In a stream in which none was seen yet,
+    every third frame is looked at.
     """
-    skip = frame.fields is None and mode == "auto" and state.kind == "whole"
-    skip = skip and state.skipped + 1 < _EVERY
-    frame = replace(frame, fields="whole") if skip else classify_fields(frame, mode)
+    skip = frame.fields is None and state.kind == "whole" and state.skipped + 1 < _EVERY
+    frame = replace(frame, fields="whole") if skip else classify_fields(frame)
     skipped = state.skipped + 1 if skip else 0
     # A stream of fields stays one.
     kind = state.kind if state.kind == "woven" else frame.fields
@@ -153,11 +126,7 @@ def separate_fields(
     if frame.fields == "whole":
         new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
         return new, (frame,)
-    state = replace(state, kind=kind, skipped=skipped, periods_s=periods_s)
-    if mode in ("top", "bottom"):
-        state = replace(state, last_s=frame.t_s, top_first=mode == "top")
-    else:
-        state = _voted(state, frame)
+    state = _voted(replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame)
     if frame.fields != "woven" or state.top_first is None:
         return state, (frame,)
     top, bottom = halves(frame)
@@ -170,12 +139,11 @@ def separate_fields(
 
 
 def _period_s(periods_s: tuple[float, ...]) -> float:
-    """Return the frames' period, which is television's where it is near to that."""
+    """Return the frames' period, perhaps television's."""
     if not periods_s:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
-    # A receiver with a rate of its own moves them to and fro: 25 a second in 60 come 33 and
-    # 50 ms apart. Lost frames are farther apart than that.
+    # A receiver's own rate moves them to and fro: 25 a second in 60 come 33 and 50 ms apart.
     period_s = mean(p for p in periods_s if p < _LOST * middle_s)
     if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
         return min(_PERIODS_S, key=lambda p: abs(p - period_s))
@@ -192,29 +160,22 @@ def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
 
 
 def _voted(state: FieldState, frame: Frame) -> FieldState:
-    """Return the state with the evidence of this frame and the one before about the order."""
+    """Return the state with this evidence about the order."""
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
-        votes = min(max(votes + _vote(before, frame.image), -_MOST_EVIDENCE), _MOST_EVIDENCE)
+        # Rows are compared with the mean of their two neighbours of the other field.
+        rows = (len(before) - 2) // 2 * 2
+        tops = [image[0:rows:2] for image in (before, frame.image)]
+        bottoms = [image[1 : rows + 1 : 2] for image in (before, frame.image)]
+        low = cv2.addWeighted(bottoms[0][:-1], 0.5, bottoms[0][1:], 0.5, 0.0)
+        bottom_to_top = cv2.norm(low, tops[1][1:], cv2.NORM_L2SQR)
+        high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
+        top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
+        vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
+        votes = min(max(votes + vote, -_MOST_EVIDENCE), _MOST_EVIDENCE)
     if top_first is None and abs(votes) > _EVIDENCE:
         top_first = votes > 0.0
     elif top_first is not None and (votes if not top_first else -votes) > _TURNED_EVIDENCE:
         top_first = not top_first
     return replace(state, last_s=frame.t_s, votes=votes, top_first=top_first, previous=frame.image)
-
-
-def _vote(before: Grey, now: Grey) -> float:
-    """Return -1 (the bottom field is earlier) to 1 (the top field is).
-
-    Rows are compared with the mean of their two neighbours of the other field, or motion along the
-    columns would count for one of the two orders.
-    """
-    rows = (min(len(before), len(now)) - 2) // 2 * 2
-    tops = [image[0:rows:2] for image in (before, now)]
-    bottoms = [image[1 : rows + 1 : 2] for image in (before, now)]
-    low = cv2.addWeighted(bottoms[0][:-1], 0.5, bottoms[0][1:], 0.5, 0.0)
-    bottom_to_top = cv2.norm(low, tops[1][1:], cv2.NORM_L2SQR)
-    high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
-    top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
-    return (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)

@@ -4,12 +4,10 @@ State order as in the paper: yaw, yaw rate, then position and velocity of x, y, 
 The time step is the real one: with 15 % late frames a fixed step gave 0.63 cm RMS,
 the real one 0.19 cm.
 
-The paper's constants are the same for every frame (`kalman.noise: fixed`). A pose is a tenth
-of a millimetre true near the target and centimetres far from it, so by default each brings
-its own covariance, and the process noise is what accelerates: the vehicle in the level frame,
-the state estimate's drift in the world (`measured`). Constant errors, which no average takes
-away, are carried along as consider terms: by how much the vehicle's roll and pitch, the print's
-size and its curl have moved each state. They change no gain, only what is claimed.
+The paper's constants are the same for every frame (`kalman.noise: fixed`). By default each pose
+brings its own covariance, and the process noise is what accelerates: the vehicle in the level
+frame, the state estimate's drift in the world (`measured`). Constant errors (the vehicle's roll and
+pitch, the print's size and curl) are consider terms: they change no gain, only what is claimed.
 """
 
 from __future__ import annotations
@@ -43,22 +41,19 @@ _MOVES[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
-_YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 _UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, per state
 
 _PUSH_S = 0.1
 """How long an acceleration lasts: white noise of its square times this, (m/s^2)^2 s."""
 _WANDER = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
-"""Of yaw, x, y and z of the state estimate: 0.1 deg and 5 mm in a second's random walk, as
-2 mm that are forgotten within 0.3 s look from one frame to the next."""
+"""Of yaw, x, y and z of the state estimate: in a second's random walk."""
 _HEADING_RADPS2 = 0.1  # of the state estimate's heading
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Accelerations of a tracked target, standard deviations: along each axis, of its heading,
-    and of the frame's own turning about level axes, which moves what is far the most."""
+    """Accelerations of a tracked target, standard deviations: along each axis, of its heading, and
+    of the frame's own turning about level axes."""
 
     acceleration_mps2: float
     heading_radps2: float
@@ -67,7 +62,7 @@ class ProcessNoise:
 
     @cached_property
     def unturned(self) -> Array:
-        """What a second adds to the rates of yaw, x, y and z, but for the turning, (4, 4)."""
+        """What a second adds to the rates of (yaw, x, y, z), (4, 4)."""
         push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
         return np.diag(push * push) * _PUSH_S
 
@@ -102,8 +97,7 @@ class Measurement:
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     """Return the filter's constants. At first sight, a target in the world stands nearly still (5
-    cm/s of drift); one in the level frame moves as the vehicle does (30 cm/s), or, where the camera
-    may be in a hand, faster."""
+    cm/s); one in the level frame moves as the vehicle does (30 cm/s), or as a hand."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -128,14 +122,6 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     )
 
 
-def pose_noise(cov: Array) -> Array | None:
-    """Return R (4, 4) of a measured (yaw, x, y, z) from a pose's covariance of (x, y, z, yaw); None
-    where that is not finite."""
-    if not finite(cov):
-        return None
-    return np.asarray(cov[_YAW_FIRST] + _LEAST_NOISE)
-
-
 def tilted(way_m: Array) -> Array:
     """Return the change of a way (3,) with a turn about the level x and y axes, m/rad, (3, 2)."""
     x, y, z = way_m
@@ -148,7 +134,7 @@ def transition(dt_s: float) -> Array:
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """Return Q (8, 8) of a step, for a target at `position_m` (3,) in the tracks' frame."""
+    """Return Q (8, 8) of a step, for a target at `position_m` (3,)."""
     noise = setup.process
     if noise is None:
         return setup.Q
@@ -253,8 +239,7 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
 ) -> MarkerTrack:
-    """Return the track at a time after its frame, with no measurement in between. Without `spread`
-    its covariance stays that of the frame."""
+    """Return the track later, without a measurement; without `spread` its covariance stays."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
@@ -263,37 +248,6 @@ def predict_track(
     x = transition(dt_s).dot(_drifting(track.x, setup))
     x[YAW] = wrap_rad(float(x[YAW]))
     return replace(track, t_s=t_s, x=x)
-
-
-def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
-    """Return the measurement that the track predicts for a later time, with what it leaves open for
-    its R: the part of `predict_track` that is measured."""
-    dt_s, x = _ahead(track, t_s, setup)
-    P, noise = track.P, setup.process
-    R = P[MEASURED, MEASURED] + dt_s * (P[MEASURED, RATES] + P[RATES, MEASURED])
-    R += dt_s * dt_s * P[RATES, RATES]
-    if noise is None:
-        R += setup.Q[MEASURED, MEASURED] * (dt_s > 0.0)
-    else:
-        R += _pushed(noise, x[POSITION]) * (dt_s**3 / 3.0)
-        if noise.wanders:
-            R += _WANDER * dt_s
-    bias = track.bias[MEASURED] + dt_s * track.bias[RATES]
-    return Measurement(foreseen_z(track, t_s, setup), R, bias)
-
-
-def foreseen_z(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Array:
-    """Return the z (4,) of `foreseen` alone."""
-    dt_s, x = _ahead(track, t_s, setup)
-    z = x[MEASURED] + dt_s * x[RATES]
-    z[0] = wrap_rad(float(z[0]))
-    return np.asarray(z)
-
-
-def _ahead(track: MarkerTrack, t_s: float, setup: FilterSetup) -> tuple[float, Array]:
-    """Return for how long to predict, and from which state."""
-    dt_s = max(min(t_s - track.t_s, MAX_PREDICTION_S), 0.0)
-    return dt_s, _drifting(track.x, setup) if dt_s > 0.0 else track.x
 
 
 def _drifting(x: Array, setup: FilterSetup) -> Array:
@@ -309,7 +263,7 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
 def _moved(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """Return the track at `t_s`, its state being x, after `dt_s` without a measurement."""
+    """Return the track at `t_s`, its state being x, without a measurement."""
     x = _drifting(x, setup)
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))

@@ -1,33 +1,32 @@
 """THE pipeline: one frame through detection, pose, filter and merge.
 
-`step` is the only way from a picture to a pose; flying, weight fitting, tracking and
-replaying (`perchctl.analysis.sense`) all call it. `estimate` carries its result to any later
+`step` is the only way from a picture to a pose, and `estimate` carries its result to any later
 moment. Neither keeps a memory of its own: what must be remembered is in `PipelineState`, which
-goes in and comes out.
+goes in and comes out. Matrices of a few numbers are multiplied by `dot`: `@` takes twice as long.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array
-from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
+from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import FieldsMode, classify_fields, separate_fields
+from perchctl.vision.fields import classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
-from perchctl.vision.merge import Joint, Merged, MergePrior, MergeStrategy, Weights, stage_of
+from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
+from perchctl.vision.merge import Merged, measure_markers, merge_tracks, stage_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
-    TargetSelector,
+    marker_aside_m,
     seen_from,
     to_level,
     to_world,
@@ -60,19 +59,18 @@ class Pipeline:
 
     detector: DetectorSetup
     pose: PoseSetup
-    strategy: MergeStrategy
+    merge: MergeConfig
     tracks: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
-    fields: FieldsMode = "auto"
 
 
 def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
     """Return the profile's pipeline for a calibrated camera. It is never changed: several streams
-    may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds,
-    which else is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
+    may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds in
+    the camera's own pictures, else that is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
     pose = PoseSetup(
         config=profile.pose,
         target=profile.target,
@@ -81,12 +79,12 @@ def make_pipeline(
         camera=camera,
         readout_s=profile.camera.readout_s,
     )
-    way = Joint if profile.merge.method == "joint" else Weights
-    strategy = way(profile.merge, pose)
-    detector = make_aruco_detector(
-        profile.detector, profile.target, _mask(profile, camera, covered)
-    )
-    if detector.cut:
+    mask = None
+    if profile.camera.mask is not None:
+        mask = read_mask(profile.camera.mask, camera.size_px) if covered is None else covered
+        mask = mask[:, ::-1] if profile.camera.mirrored else mask
+    detector = make_aruco_detector(profile.detector, profile.target, mask)
+    if detector.by_lines:
         prepare_cut_markers(detector.patterns, camera)
     target = profile.target
     own = OwnTargetPlace(profile.planner.approach_xy_m)  # where the vehicle is sent to look for it
@@ -95,31 +93,17 @@ def make_pipeline(
     return Pipeline(
         detector=detector,
         pose=pose,
-        strategy=strategy,
+        merge=profile.merge,
         tracks=TrackSetup(
             level=make_filter(profile.kalman, in_world=False),
             world=make_filter(profile.kalman, in_world=True),
-            names=strategy.tracks,
             pose=pose,
             gate=profile.kalman.gate,
             own=own,
         ),
         kalman=profile.kalman,
         camera=camera,
-        fields=profile.camera.fields,
     )
-
-
-def _mask(
-    profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None
-) -> GearMask | None:
-    """Return what the vehicle's own gear covers; None without `camera.mask`. The file is of the
-    camera's own pictures, which `camera.mirrored` has turned over since."""
-    if profile.camera.mask is None:
-        return None
-    if covered is None:
-        covered = read_mask(profile.camera.mask, camera.size_px)
-    return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
 
 
 def camera_profile(profile: Profile) -> Profile:
@@ -141,7 +125,7 @@ def pictures(
     """Return the new memory and what a stream's frame holds, each for a `step` of its own: one
     picture, or the two fields of an interlaced camera in their order of time, each with its own
     time."""
-    fields, found = separate_fields(state.fields, frame, pipeline.fields)
+    fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
 
@@ -154,42 +138,31 @@ def step(
     Without an attitude the vehicle counts as level and at rest: the filter then works
     in the level frame, whatever `kalman.frame` says. The frame is one picture of what
     `pictures` makes of a stream's; one that was not looked at there is looked at here.
-
-    What runs in each tracked frame multiplies its matrices by `dot`: `@` takes twice as long for
-    a few numbers, and a frame has a hundred such products.
     """
-    frame = classify_fields(frame, pipeline.fields)
+    frame = classify_fields(frame)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
-    own = TargetSelector(pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
+    own = partial(marker_aside_m, pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
     detections = detect_markers(
         frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
     )
-    return _followed(state, detections, near, attitude, pipeline, frame.fields or "whole")
+    return follow(state, detections, attitude, pipeline, near, frame.fields or "whole")
 
 
 def follow(
-    state: PipelineState, detections: Detections, attitude: Attitude | None, pipeline: Pipeline
-) -> tuple[PipelineState, PipelineOutput]:
-    """Do what `step` does from the corners on: from what a picture gave, at its time."""
-    _, near = expected_corners(state.sighting, detections.t_s, attitude, pipeline.pose)
-    return _followed(state, detections, near, attitude, pipeline)
-
-
-def _followed(
     state: PipelineState,
     detections: Detections,
-    near: PoseCandidate | None,
     attitude: Attitude | None,
     pipeline: Pipeline,
+    near: PoseCandidate | None = None,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Measure, track and estimate what the detections show; `near` is the pose that is expected."""
+    """Do what `step` does from the corners on; `near` is the pose that is expected."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
-    measured = pipeline.strategy.measure(detections, MergePrior(attitude, near, normal))
+    measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
 
     in_world = pipeline.kalman.frame == "world" and attitude is not None
     followed = update_tracks(state, measured, t_s, attitude, in_world, pipeline.tracks)
@@ -214,7 +187,6 @@ def _followed(
         tracks=followed.tracks,
         in_world=in_world,
         measured=measured,
-        attitude=attitude,
         target=target or state.target,
         last=last,
         sighting=sighting if sees or followed.tracks else None,
@@ -254,6 +226,12 @@ def estimate(
     target = state.target
     if target is None or attitude is None or target.world_m is None:
         return target
+    if state.tracks and state.in_world:
+        world = pipeline.tracks.world
+        tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
+        merged = merge_tracks(tracks, state.measured.fed, pipeline.merge.weights)
+        assert merged is not None
+        return replace(target, t_s=t_s, **_placed(merged, attitude, True, pipeline, spread))
     if not state.tracks:
         nothing = np.zeros(3)
         target = replace(
@@ -264,14 +242,10 @@ def estimate(
             velocity_mps=nothing,
             world_velocity_mps=nothing,
         )
-        return _carried(target, t_s, attitude, pipeline)
-    if not state.in_world:
-        return _carried(target, t_s, attitude, pipeline)
-    world = pipeline.tracks.world
-    tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
-    merged = pipeline.strategy.merge(tracks, state.measured.fed)
-    assert merged is not None
-    return replace(target, t_s=t_s, **_seen_in_world(merged, attitude, pipeline, spread))
+    assert target.world_m is not None
+    assert target.world_yaw_rad is not None
+    e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
+    return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
 # --- from the tracks to the target ------------------------------------
@@ -285,19 +259,14 @@ def _at_frame(
     in_world: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """Return the target at the newest frame's time; None without a track. `before` is the last
-    one."""
+    """Return the target at the newest frame's time; None without a track."""
     fed, tracks = followed.measured.fed, followed.tracks
-    merged = pipeline.strategy.merge(tracks, fed)
+    merged = merge_tracks(tracks, fed, pipeline.merge.weights)
     if merged is None:
         return None
     measured = any(n in tracks and tracks[n].t_s == t_s for n in fed)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
-    if attitude is not None and in_world:
-        place = _seen_in_world(merged, attitude, pipeline)
-    else:
-        place = _seen_in_level(merged, attitude, pipeline)
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,
@@ -306,65 +275,38 @@ def _at_frame(
         measured=measured,
         tracked=True,
         unseen=merged.unseen,
-        **place,
+        **_placed(merged, attitude, in_world, pipeline),
     )
 
 
-def _carried(
-    target: TargetEstimate, t_s: float, attitude: Attitude, pipeline: Pipeline
-) -> TargetEstimate:
-    """Return the same place in the world, seen from the vehicle at `attitude`."""
-    assert target.world_m is not None
-    assert target.world_yaw_rad is not None
-    e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
-    return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
-
-
-# --- What merged tracks say of the target, as a `TargetEstimate` has it ---
-
-
-def _seen_in_level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:
-    """Return place, motion and spread of tracks in the level frame."""
-    e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    world_m, world_yaw_rad = None, None
-    if attitude is not None:
-        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, pipeline.pose)
-    return {
-        "e_m": e_m,
-        "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": merged.velocity_mps,
-        "world_m": world_m,
-        "world_yaw_rad": world_yaw_rad,
-        **_spread(merged, merged.cov_m2, merged.bias_m),
-    }
-
-
-def _seen_in_world(
-    merged: Merged, attitude: Attitude, pipeline: Pipeline, spread: bool = True
+def _placed(
+    merged: Merged,
+    attitude: Attitude | None,
+    in_world: bool,
+    pipeline: Pipeline,
+    spread: bool = True,
 ) -> dict[str, Any]:
-    """Return place, motion and, on request, spread of tracks in the world, as seen from the
-    vehicle at `attitude`."""
-    world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
-    turn = attitude.R_world_level.T
-    seen = {
-        "e_m": e_m,
-        "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": turn.dot(merged.velocity_mps),
-        "world_m": world_m,
-        "world_yaw_rad": world_yaw_rad,
-        "world_velocity_mps": merged.velocity_mps,
-    }
-    if not spread:
-        return seen
-    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
-    return seen | _spread(merged, turn.dot(merged.cov_m2).dot(turn.T), bias_m)
-
-
-def _spread(merged: Merged, cov_m2: Array, bias_m: Array) -> dict[str, Any]:
-    """Return the standard deviations of a place with that covariance and constant errors."""
-    variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
-    return {
-        "sigma_m": np.asarray(np.sqrt(np.maximum(variance, 0.0))),
-        "sigma_yaw_rad": math.sqrt(max(merged.var_yaw_rad2, 0.0)),
-    }
+    """Return place, motion and, on request, spread of merged tracks in the world or in the level
+    frame, as a `TargetEstimate` has them for the vehicle at `attitude`."""
+    place_m, yaw_rad = merged.vector[:3], float(merged.vector[3])
+    cov_m2, bias_m = merged.cov_m2, merged.bias_m
+    seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}
+    if attitude is not None and in_world:
+        turn = attitude.R_world_level.T
+        seen["world_m"], seen["world_yaw_rad"] = place_m, yaw_rad
+        seen["e_m"], seen["e_yaw_rad"] = to_level(place_m, yaw_rad, attitude, pipeline.pose)
+        seen["velocity_mps"] = turn.dot(merged.velocity_mps)
+        seen["world_velocity_mps"] = merged.velocity_mps
+        if spread:
+            cov_m2 = turn.dot(cov_m2).dot(turn.T)
+            bias_m = seen_from(bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+    else:
+        seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
+        if attitude is not None:
+            world = to_world(place_m, yaw_rad, attitude, pipeline.pose)
+            seen["world_m"], seen["world_yaw_rad"] = world
+    if spread:
+        variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
+        seen["sigma_m"] = np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+        seen["sigma_yaw_rad"] = math.sqrt(max(merged.var_yaw_rad2, 0.0))
+    return seen

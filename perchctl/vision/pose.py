@@ -1,11 +1,9 @@
 """From corners to the target's pose relative to the gear.
 
-All solving is done in pixels of a pinhole with the camera's `K`, from corners that
-were undistorted. A planar marker has two tilts with nearly the same picture; which
-one is true is decided by the vehicle's roll and pitch (the target lies level) or by
-the tilt of the frame before. The position comes from the camera-frame translation,
-turned level by the vehicle's roll and pitch, never from the marker's own axes: at
-1.15 m that is 0.5 mm against 40 mm.
+A planar marker has two tilts with nearly the same picture; which one is true is decided by the
+vehicle's roll and pitch (the target lies level) or by the tilt of the frame before. The position is
+turned level by the vehicle's roll and pitch, too, never by the marker's own axes: at 1.15 m that is
+0.5 mm against 40 mm.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -23,7 +21,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.values import replace
 from perchctl.vision.lens import undistort_px
-from perchctl.vision.types import MARKERS, Attitude, CameraModel, Detection, MarkerName, MarkerPose
+from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
@@ -46,26 +44,17 @@ class PoseSetup:
     readout_s: float | None = 0.0
 
     @cached_property
-    def object_points(self) -> dict[MarkerName, Array]:
-        """Each marker's corners in its own axes, (4, 3) m, in the order of a detection's."""
-        large, small = self.target.large.side_m, self.target.small.side_m
-        return {"large": square_corners(large), "small": square_corners(small)}
+    def corners_m(self) -> dict[_Source, Array]:
+        """The corners of each marker (4, 3) in its own axes, in the order of a detection's, and
+        ``joint`` (8, 3) those of both, the large one's first."""
+        large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
+        return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
-    def all_points(self) -> Array:
-        """Both markers' points, the large one's first, (8, 3)."""
-        return np.concatenate([self.object_points[name] for name in MARKERS])
-
-    @cached_property
-    def lift(self) -> dict[MarkerName, Array]:
-        """How far each marker's corners are out of the plane of a sheet that curls (`lift_of`)."""
+    def lift(self) -> dict[_Source, Array]:
+        """How far these corners are out of the plane of a sheet that curls."""
         curl = self.target.curl_per_m
-        return {n: lift_of(points, curl) for n, points in self.object_points.items()}
-
-    @cached_property
-    def all_lift(self) -> Array:
-        """The same for both markers' corners, the large one's first."""
-        return lift_of(self.all_points, self.target.curl_per_m)
+        return {source: lift_of(corners, curl) for source, corners in self.corners_m.items()}
 
 
 def square_corners(side_m: float) -> Array:
@@ -94,21 +83,22 @@ def estimate_pose(
     None where the corners give no pose: no finite solution in front of the camera, or
     a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
     """
-    points = _points(detections, setup)
-    if points is None:
-        return None
+    source: _Source = "joint" if len(detections) > 1 else detections[0].marker
+    image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
+    if not finite(image_px):
+        return None  # the lens cannot have imaged them
+    K, lift = setup.camera.K, setup.lift[source]
+    points = make_points(detections, setup.corners_m[source], image_px, K, lift)
     R_level_body = level_rotation(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
         prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_RAD)
     else:
         prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
-    solution = _continued(points, start, prior, setup.config) or _solved(
-        points, prior, setup.config
-    )
-    if solution is None:
+    most_px = setup.config.max_reprojection_px
+    solution = _continued(points, start, prior, most_px) or solve(points, prior)
+    if solution is None or not solution.rms_px <= most_px:
         return None
-    source = "joint" if len(detections) > 1 else detections[0].marker
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
     if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
@@ -116,51 +106,21 @@ def estimate_pose(
         return pose  # sides between interpolated rows look curled
     # No flat sheet has both markers where they are. One that curls may, or the corners err.
     points = replace(points, curled=True)
-    settled = _continued(points, solution, prior, setup.config)
+    settled = _continued(points, solution, prior, most_px)
     if settled is None:
         return pose
     bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
     return replace(bent, chi2=pose.chi2) if bent.chi2 < _EXPLAINED * pose.chi2 else pose
 
 
-def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
-    """Return the corners through a pinhole; None where the lens cannot have imaged them."""
-    if len(detections) > 1:
-        object_m, lift = setup.all_points, setup.all_lift
-        raw_px = np.concatenate([d.corners_px for d in detections])
-    else:
-        marker, raw_px = detections[0].marker, detections[0].corners_px
-        object_m, lift = setup.object_points[marker], setup.lift[marker]
-    image_px = undistort_px(raw_px, setup.camera)
-    if not finite(image_px):
-        return None
-    return make_points(detections, object_m, image_px, setup.camera.K, lift)
-
-
 def _continued(
-    points: Points, start: PoseCandidate | None, prior: TiltPrior, config: PoseConfig
+    points: Points, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> Scored | None:
-    """Return the solution next to a start; None where there is none that fits."""
-    if start is None or not config.refine:
-        return None
-    solution = gauss_newton(points, start)
-    if solution is None or not _fits(solution, config) or prior.contradicts(solution):
+    """Return the solution next to a start, if it leaves `most_px` RMS or less."""
+    solution = None if start is None else gauss_newton(points, start)
+    if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
     return solution
-
-
-def _solved(points: Points, prior: TiltPrior, config: PoseConfig) -> Scored | None:
-    """Return the solution without a start; None where none fits."""
-    solution = solve(points, config.solver, config.refine, prior)
-    if not _fits(solution, config) and config.solver != "sqpnp":
-        # EPnP and IPPE fail on exactly frontal views, which is where hovering happens.
-        solution = solve(points, "sqpnp", config.refine, prior)
-    return solution if _fits(solution, config) else None
-
-
-def _fits(solution: Scored | None, config: PoseConfig) -> bool:
-    """Return True if there is a solution that leaves no more than the profile allows."""
-    return solution is not None and solution.rms_px <= config.max_reprojection_px
 
 
 def _level_pose(
@@ -171,7 +131,7 @@ def _level_pose(
     R_level_body: Array,
     setup: PoseSetup,
 ) -> MarkerPose:
-    """Return the solution relative to the gear in the level frame, with its covariance there."""
+    """Return the solution relative to the gear in the level frame."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
@@ -211,7 +171,7 @@ def rotation_matrix(rvec: Array) -> Array:
 
 def rotation_vector(R: Array) -> Array:
     """Return the rotation vector (3,) rad of a rotation matrix (3, 3)."""
-    return flat(cv2.Rodrigues(R)[0])
+    return np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
 
 
 def normal_cam(pose: MarkerPose) -> Array:
@@ -227,24 +187,17 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
 
-# --- Rotation and translation from corners: closed forms, then least squares in which each ---
+# --- Rotation and translation from corners: a closed form, then least squares in which each ---
 # corner counts as it was measured.
 
 
-_FLAGS = {
-    "sqpnp": cv2.SOLVEPNP_SQPNP,
-    "iterative": cv2.SOLVEPNP_ITERATIVE,
-    "epnp": cv2.SOLVEPNP_EPNP,
-    "ippe": cv2.SOLVEPNP_IPPE,
-    "ippe_square": cv2.SOLVEPNP_IPPE_SQUARE,
-}
 _MIN_FLIP_RAD = math.radians(2.0)  # closer solutions are one
 _MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can show
 _MAX_STEPS = 8
 _TRUST = 8.0  # degrees of freedom that the claimed spread is worth beside the residuals
 
 _SMALL_GAIN, _SMALL_STEP = 1.0, 0.005  # rad and m
-# What a movement of corners departs from linear is its square over their distances, 20 px or more.
+# Departs from linear by its square over the corners' distances, 20 px or more.
 _SMALL_MOVE_PX = 0.3
 
 
@@ -258,8 +211,7 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Scored(PoseCandidate):
-    """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6) with (rvec,
-    tvec)."""
+    """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6)."""
 
     error_px: Array
     jacobian: Array
@@ -273,7 +225,7 @@ class Scored(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """The marker's normal (3,) as far as it is known, camera axes, to `spread_rad`."""
+    """The marker's normal (3,) as far as it is known, camera axes."""
 
     normal_cam: Array | None
     spread_rad: float
@@ -287,29 +239,22 @@ class TiltPrior:
         )
 
 
-def solve(points: Points, solver: str, refine: bool, prior: TiltPrior) -> Scored | None:
-    """Return the better of both tilts; None without a finite one in front of the camera, or where a
-    solver other than ``sqpnp`` gives a start from which nothing settles."""
-    candidates = _closed_form(points, solver)
-    if refine:
-        candidates = [_refined(points, c) for c in candidates]
+def solve(points: Points, prior: TiltPrior) -> Scored | None:
+    """Return the better of both tilts, in front of the camera."""
+    candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
         return None
     best = _likeliest(scored, points, prior)
-    if not refine:
-        return best
     if prior.normal_cam is None or prior.contradicts(best):
         best = _likeliest([best, *_other_tilt(best, points)], points, prior)
-    # The unweighted optimum is near enough for errors to be linear; where they are not,
-    # a weaker solver than SQPnP has led astray.
-    settled = gauss_newton(points, best)
-    return best if settled is None and solver == "sqpnp" else settled
+    # The unweighted optimum is near enough for errors to be linear.
+    return gauss_newton(points, best) or best
 
 
 def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
-    """Refine a pose by Gauss-Newton with each corner's own spread, from a start that is near (the
-    frame before); None where it does not settle within some steps."""
+    """Refine a pose with each corner's own spread, from a start that is near; None where that
+    fails."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -378,58 +323,29 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 
 def _curl(points: Points, scored: Scored) -> Array:
-    """Return what one standard deviation of each kind of curl does to the whitened errors."""
-    if points.lift is None:
-        return np.zeros((len(points.whitening), 2))
-    normal_cam = cv2.Rodrigues(scored.rvec)[0][:, 2]
+    """Return what each kind of curl does to the whitened errors."""
+    normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.lift
     return np.asarray(points.whitening.dot(moved))
 
 
-def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
-    """Return the rotation vector of the other tilt, whose normal is mirrored at the line of sight;
-    None where both agree."""
-    R = cv2.Rodrigues(rvec)[0]
-    normal, sight = R[:, 2], tvec / np.linalg.norm(tvec)
-    other = 2.0 * float(normal @ sight) * sight - normal
-    axis = np.array(  # normal x other
-        [
-            normal[1] * other[2] - normal[2] * other[1],
-            normal[2] * other[0] - normal[0] * other[2],
-            normal[0] * other[1] - normal[1] * other[0],
-        ]
-    )
-    sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
-    angle = math.atan2(sine, cosine)
-    if angle < _MIN_FLIP_RAD or sine < 1e-9:
-        return None
-    turn = cv2.Rodrigues(axis / sine * angle)[0]
-    return flat(cv2.Rodrigues(turn @ R)[0])
-
-
-def flat(values: Any) -> Array:
-    """Return the values as a flat array of doubles."""
-    return np.asarray(values, dtype=np.float64).ravel()
-
-
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     """Return the angle between the marker's normal and the expected one."""
-    normal = cv2.Rodrigues(rvec)[0][:, 2]
+    normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: Points, solver: str) -> list[PoseCandidate]:
-    """Return the candidates of OpenCV's solver; none of corners all on one line or point."""
-    if solver == "ippe_square" and len(points.object_m) != 4:
-        solver = "ippe"
+def _closed_form(points: Points) -> list[PoseCandidate]:
+    """Return the candidates of OpenCV's SQPNP; none of corners on one line."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            points.object_m, points.image_px, points.K, None, flags=_FLAGS[solver]
+            points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
         )
     except cv2.error:
-        return []  # degenerate corners: all on one line, or on one point
-    candidates = [PoseCandidate(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
+        return []
+    solutions = zip(rvecs, tvecs, strict=True)
+    candidates = [PoseCandidate(np.ravel(r), np.ravel(t)) for r, t in solutions]
     return [candidate for candidate in candidates if _usable(candidate)]
 
 
@@ -440,13 +356,13 @@ def _usable(candidate: PoseCandidate) -> bool:
 
 
 def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
-    """Return the candidate refined by OpenCV's Levenberg-Marquardt, or as it was."""
+    """Return the candidate refined by OpenCV, or as it was."""
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
     except cv2.error:
         return start
-    return PoseCandidate(flat(rvec), flat(tvec))
+    return PoseCandidate(np.ravel(rvec), np.ravel(tvec))
 
 
 def _scored(candidate: PoseCandidate, points: Points) -> Scored:
@@ -458,17 +374,23 @@ def _scored(candidate: PoseCandidate, points: Points) -> Scored:
 
 
 def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
-    """Return the best candidate near the mirror solution, if there is one."""
-    rvec = mirror_solution(scored.rvec, scored.tvec)
-    if rvec is None:
+    """Return the best candidate near the other tilt, whose normal is mirrored at the line of sight;
+    none where both agree."""
+    R = rotation_matrix(scored.rvec)
+    normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
+    other = 2.0 * float(normal @ sight) * sight - normal
+    axis = np.cross(normal, other)
+    sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
+    angle = math.atan2(sine, cosine)
+    if angle < _MIN_FLIP_RAD or sine < 1e-9:
         return []
+    rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
     turned = _refined(points, PoseCandidate(rvec, scored.tvec))
     return [_scored(turned, points)] if _usable(turned) else []
 
 
 def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored:
-    """Return the best candidate by the squared errors of corners and tilt, in units of their
-    spread."""
+    """Return the best candidate by corners and tilt."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -483,35 +405,31 @@ def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored
 
 
 # --- A sheet that is not flat: what its curl does to corners, and what they are worth then ---
-# Corners that curl has moved err together, and those far from the centre err most: a joint pose of
-# both markers rests on the small one as far as the large one may be off.
 
 
 def lift_of(object_m: Array, curl_per_m: float) -> Array:
     """Return how far corners (n, 3) are out of the sheet's plane at one standard deviation of each
-    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners of it to
-    one and two to the other. A sheet rolled about any axis is as much of one as of the other."""
+    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners to
+    either."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def weight_with(curl: Array) -> Array:
-    """Return the inverse covariance (2n, 2n) of errors of unit spread that have `curl` (2n, k), one
-    standard deviation each, among them."""
+    """Return the inverse covariance (2n, 2n) of errors of unit spread with `curl` (2n, k) among
+    them."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
 
 
 # --- Corners as a pose is solved from them: where they are, and what each is worth ---
-# Corners that are intersections of fitted lines do not err on their own: a line is off
-# by an offset and a tilt, and moves the corners at both of its ends. Its two ends have
-# errors across it of variance s^2 with a correlation of -1/2, so half the line's offset
-# is known to s/2 and its tilt to s sqrt(3)/2. `whitening` turns corner errors into these
-# independent ones. A shift of all edges by the same number of pixels (clipped white, ink)
-# is left out of the fit, where small markers' own faults would feed it, but not out of the
-# covariance.
+# A fitted line is off by an offset and a tilt, and moves the corners at both of its ends. These
+# have errors across it of variance s^2 with a correlation of -1/2, so half the line's offset is
+# known to s/2 and its tilt to s sqrt(3)/2: `whitening` turns corner errors into these independent
+# ones. A shift that all edges share (clipped white, ink) is left out of the fit, where small
+# markers' own faults would feed it, but not out of the covariance.
 
 
 _EACH = np.eye(8)
@@ -538,7 +456,7 @@ class Points:
     whitening: Array
     shift: Array
     K: Array
-    lift: Array | None = None
+    lift: Array
     curled: bool = False
 
 
@@ -547,10 +465,9 @@ def make_points(
     object_m: Array,
     image_px: Array,
     K: Array,
-    lift: Array | None = None,
+    lift: Array,
 ) -> Points:
-    """Return the corners of one or both detections with what each is worth; `lift` as of
-    `PoseSetup`."""
+    """Return the corners of one or both detections with what each is worth."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
@@ -561,7 +478,7 @@ def make_points(
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
         shift[rows, 0] = d.shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
-            W[rows, rows] = _whitened(d.cov_px2)
+            W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
         elif d.refined:
             spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
             own = np.zeros(64)
@@ -583,8 +500,7 @@ def make_points(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Return the unit normals (m, 4, 2) of the sides of m squares, whichever way round these
-    are."""
+    """Return the unit normals (m, 4, 2) of the sides of m squares."""
     side = corners.take(_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -595,18 +511,8 @@ def _outward_normals(corners: Array) -> Array:
     return normals
 
 
-def _whitened(cov_px2: Array) -> Array:
-    """Return the matrix (8, 8) that makes errors of that covariance independent and of unit
-    spread."""
-    try:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.diag(1.0 / np.sqrt(np.maximum(np.diagonal(cov_px2), 1e-6)))
-
-
 def _lying_px(d: Detection, corners: Array) -> Array:
-    """Return the spread of the sides, (4,): the more of a side lies along the rows, the worse. Over
-    several rows errors of interpolation cancel out."""
+    """Return the spread of the sides, (4,): worse for one along the rows."""
     way = corners.take(_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(way[:, 1])
@@ -614,8 +520,8 @@ def _lying_px(d: Detection, corners: Array) -> Array:
 
 
 def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
-    """Return the whitening of the corners of four fitted lines with normals (4, 2), by the offset
-    and the tilt of each, at `_SIDES`; `sigma_px` is of all or of each, (4,)."""
+    """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
+    `_SIDES`; `sigma_px` is of all or of each, (4,)."""
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT
     return np.concatenate([across, across, -tilt, tilt])

@@ -1,20 +1,20 @@
 """Which of several targets is the vehicle's own, where their markers are the same.
 
-Several vehicles may hang under one ceiling, each with its target. Where ids do not tell these
-apart, the place does: the one counts that is nearest to where the profile says that the own one
-is, in the world of the state estimate, or else to the upward axis through the gear. That
-decides once; from then on the lock (`perchctl.vision.tracks`) stays with the one that was chosen.
+The one counts that is nearest to where the profile says that the own one is, in the world of the
+state estimate, or else to the upward axis through the gear. That decides once; from then on the
+lock (`perchctl.vision.tracks`) stays with the one that was chosen.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.geometry import Array, wrap_rad
-from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, pose_noise, tilted
+from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilted
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
@@ -23,47 +23,36 @@ _SIGMA_PX = 1.0  # of corners as a search finds them
 
 @dataclass(frozen=True)
 class OwnTargetPlace:
-    """Where the own target is, in the world of the state estimate; `xy_m` None: not known.
-    One that is farther than `within_m` from there is another vehicle's."""
+    """Where the own target is, in the world of the state estimate; None: not known. One farther
+    than `within_m` from there is not it."""
 
     xy_m: tuple[float, float] | None = None
     within_m: float = math.inf
 
 
-NOWHERE = OwnTargetPlace()
-"""Nothing is known: the gear's axis decides."""
+AsideOf = Callable[[MarkerName, Array], float]
+"""How far a marker with corners (4, 2) px is from the own target's place, or inf."""
 
 
-@dataclass(frozen=True, eq=False)
-class TargetSelector:
-    """How far aside a marker is, for a picture taken at `attitude`."""
-
-    place: OwnTargetPlace
-    t_s: float
-    attitude: Attitude | None
-    pose: PoseSetup
-
-    @property
-    def refuses(self) -> bool:
-        """True if some markers are too far aside to be the own target's."""
-        return self.attitude is not None and math.isfinite(self.place.within_m)
-
-    def aside_m(self, marker: MarkerName, corners_px: Array) -> float:
-        """Return how far a marker with corners (4, 2) px is from where the own target is; inf for
-        one that cannot be it."""
-        seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
-        pose = estimate_pose([seen], self.t_s, self.attitude, self.pose)
-        if pose is None:
-            return math.inf
-        away_m = aside_m(pose, self.attitude, self.place, self.pose)
-        return away_m if away_m <= self.place.within_m else math.inf
+def marker_aside_m(
+    place: OwnTargetPlace,
+    t_s: float,
+    attitude: Attitude | None,
+    setup: PoseSetup,
+    marker: MarkerName,
+    corners_px: Array,
+) -> float:
+    """Return what `AsideOf` does, in a picture taken at `attitude`."""
+    seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
+    pose = estimate_pose([seen], t_s, attitude, setup)
+    away_m = math.inf if pose is None else aside_m(pose, attitude, place, setup)
+    return away_m if attitude is None or away_m <= place.within_m else math.inf
 
 
 def aside_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """Return how far a target is from the own one's place; without that, or without an attitude,
-    from the upward axis through the gear."""
+    """Return how far a target is from the own one's place."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -73,8 +62,7 @@ def aside_m(
 def refusal(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Return one sentence where the target is another vehicle's, else None. Nothing is refused
-    without an attitude: where the vehicle is, is not known then."""
+    """Return one sentence where the target is another vehicle's."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = aside_m(pose, attitude, place, setup)
@@ -86,11 +74,12 @@ def refusal(
     )
 
 
-# --- Where the target is in the vehicle's world, in its level frame, and what of that a filter ---
-# is fed with.
+# --- The target in the world, in the level frame, and as a measurement of a filter ---
 
 
 _STILL = np.eye(4)
+_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
+_YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
 def to_world(
@@ -120,8 +109,7 @@ def measurement(
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """Return what a pose measures of a track in the world (with an attitude), or in the level
-    frame."""
+    """Return what a pose measures of a track."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
@@ -142,13 +130,13 @@ def measurement(
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
         bias[1:] = attitude.R_world_level.dot(bias[1:])
-    return Measurement(z, pose_noise(noise), bias)
+    R = np.asarray(noise[_YAW_FIRST] + _LEAST_NOISE) if finite(noise) else None
+    return Measurement(z, R, bias)
 
 
 def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:
     """Return what constant errors make of the way from the gear to a target in the world, level
-    axes (3, 4): of `bias_m` (3, 4), by which they have moved the target, less what roll and pitch
-    make of the gear's place."""
+    axes (3, 4): of `bias_m` (3, 4), less what roll and pitch make of the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(bias_m)
     moved[:, TILTS] -= tilted(gear_level) * constants.tilt_sigma_rad

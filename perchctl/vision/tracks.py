@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,18 +12,18 @@ from perchctl.geometry import Array, finite, wrap_rad
 from perchctl.values import replace
 from perchctl.vision.filter import (
     MAX_TRACK_GAP_S,
+    MEASURED,
     POSITION,
     FilterSetup,
     Measurement,
-    foreseen,
-    foreseen_z,
+    predict_track,
     start_track,
     step_track,
 )
 from perchctl.vision.lens import project
 from perchctl.vision.markers.cut import lattice_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import NOWHERE, OwnTargetPlace, measurement, refusal
+from perchctl.vision.target_selection import OwnTargetPlace, measurement, refusal
 from perchctl.vision.types import (
     Attitude,
     Lock,
@@ -38,15 +39,14 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in the level frame and in the world, the tracks' names,
-    whether a pose has to pass the gate, and where the own target is."""
+    """The filters' constants in either frame, whether there is a gate, and the own target's
+    place."""
 
     level: FilterSetup
     world: FilterSetup
-    names: tuple[str, ...]
     pose: PoseSetup
     gate: bool
-    own: OwnTargetPlace = NOWHERE
+    own: OwnTargetPlace
 
     def constants(self, in_world: bool) -> FilterSetup:
         """Return the filters' constants in the tracks' frame."""
@@ -90,65 +90,46 @@ def update_tracks(
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
             sight = replace(sight, looks_there=looks)
-        another = refusal(sight.pose, attitude, setup.own, setup.pose)
-        verdict = _verdict(state, sight, another, constants, setup.gate)
+        if setup.gate:
+            verdict = judged(state.lock, state.stranger, sight, constants)
+        # What was locked on goes on, however far the estimate's world has drifted meanwhile.
+        goes_on = not verdict.afresh or verdict.same
+        goes_on = goes_on and remembered(state.lock, None, t_s)[0] is not None
+        another = None if goes_on else refusal(pose, attitude, setup.own, setup.pose)
+        if another is not None and verdict.taken:
+            verdict = Verdict(False, stranger=state.stranger, text=another, refused=True)
     if not verdict.taken:
         measured, fed = replace(measured, fed={}), {}
     begun = {} if verdict.afresh else old
-    stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in setup.names}
+    stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in {**begun, **fed}}
     tracks = {n: track for n, track in stepped.items() if track is not None}
     if not setup.gate:
         return TrackedFrame(measured, tracks, verdict)
     lock, stranger = remembered(state.lock, verdict.stranger, t_s)
     if sight is not None and verdict.taken and tracks:
-        surest = next(iter(tracks.values()))
-        if len(tracks) > 1:
-            surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
+        surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict)
     return TrackedFrame(measured, tracks, verdict, lock, stranger)
 
 
-def _verdict(
-    state: PipelineState, sight: Sight, another: str | None, constants: FilterSetup, gate: bool
-) -> Verdict:
-    """Return the gate's verdict. A target that is `another` vehicle's is never locked on; one that
-    was locked on goes on, however far the estimate's world has drifted meanwhile."""
-    verdict = Verdict(taken=True, stranger=state.stranger)
-    if gate:
-        verdict = judged(state.lock, state.stranger, sight, constants)
-    lock, _ = remembered(state.lock, None, sight.t_s)
-    goes_on = lock is not None and (verdict.same or not verdict.afresh)
-    if another is not None and verdict.taken and not goes_on:
-        return Verdict(taken=False, stranger=state.stranger, text=another, refused=True)
-    return verdict
-
-
 # --- Whether a pose is the target's that was locked on ----------------
-# Something else can look like the target: one more of it, a smaller one, or one of its markers,
-# lone and of another size. In a picture it cannot be told from the target, but the target does not
-# jump. A pose that contradicts the lock by more than noise, motion and drift explain is a
-# stranger's and feeds no filter; the planner then sees a target that is not measured. The stranger
-# is watched: as long as it goes on it stays one, however vague the lock becomes meanwhile.
+# Another target, or a marker of another size, cannot be told from the target in a picture, but the
+# target does not jump. A pose that contradicts the lock by more than noise, motion and drift
+# explain is a stranger's and feeds no filter. It is watched, and stays one however vague the lock
+# becomes.
 #
-# The lock goes over to a stranger explicitly: to one that rests on both markers, at once if the
-# lock never did, or, if it is as far away as the target was, after `REACQUIRE_S` in which the
-# target was not seen, though its place is in the picture; and to any that was seen more often than
-# a lock that is hardly begun. A lock that nothing has confirmed for `FORGET_S` is forgotten.
+# The lock goes over to a stranger that rests on both markers: at once if the lock never did, or, if
+# it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
+# picture; and to any that was seen more often than a lock that is hardly begun.
 #
-# One pose a picture is judged. While something is seen where the lock is, be it a lone marker of
-# the size that is expected, the search (`perchctl.vision.markers.search.choose`) hands on that, and
-# no whole target beside it: with or without `detector.window`. So a lock on a lone look-alike goes
-# over to a whole target once the look-alike is out of sight, and not before.
-#
-# Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
-# a pose that goes on from the last one relative to the vehicle, though not in the world, is the
-# target's, too.
+# While something is seen where the lock is, the search hands on that and no whole target beside it.
+# Where the state estimate jumps, the target seems to jump in the world, but not in the picture.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 FORGET_S = 10.0
 ESTABLISHED_FRAMES = 5
-"""A lock of fewer frames was perhaps no target: a stranger that was seen more often counts more."""
+"""A lock of fewer frames gives way to a stranger that was seen more often."""
 
 _JUMPED = "the state estimate jumped, the target did not"
 _GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
@@ -165,8 +146,8 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame's pose, as a measurement of the tracks; `whole` if it rests on both markers;
-    `looks_there` if the lock's place is in the picture."""
+    """A frame's pose, as a measurement; `whole` if it rests on both markers; `looks_there` if the
+    lock's place is in the picture."""
 
     t_s: float
     pose: MarkerPose
@@ -178,9 +159,8 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Whether the pose is the target's; if so, whether the tracks have to begin anew there,
-    else whose it is; and a sentence for people where that is not as ever. `same`: though the
-    tracks begin anew, it is the target that was locked on."""
+    """Whether the pose is the target's; if so, whether the tracks have to begin anew there, though
+    it may be the `same` target; else whose it is; and a sentence where that is not as ever."""
 
     taken: bool
     afresh: bool = False
@@ -201,17 +181,14 @@ def judged(
         return Verdict(taken=True)
     if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
         return Verdict(taken=False, stranger=stranger)
-    if stranger is None and _clearly(lock.track, sight, constants):
+    if stranger is None and _is_clear(lock.track, sight, constants):
         return Verdict(taken=True)
-    wanted = _expected(lock.track, sight.t_s, constants)
-    fit = _misfit(wanted, sight, constants)
-    other = None
-    if stranger is not None:
-        other = _misfit(_expected(stranger.track, sight.t_s, constants), sight, constants)
+    fit = _misfit(lock.track, sight, constants)
+    other = None if stranger is None else _misfit(stranger.track, sight, constants)
     theirs = other is not None and other.squared <= _GATE
     if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
         return Verdict(taken=True, stranger=stranger)
-    if not theirs and _goes_on(lock, sight, fit):
+    if not theirs and _goes_on(lock, sight, fit.off):
         return Verdict(taken=True, afresh=True, same=True, text=_JUMPED)
     seen = _watched(stranger if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
@@ -255,59 +232,45 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """By how much it is off (4,); its square in units of its spread S (4, 4); how far away (m),
-    how far turned, how much farther up (m), and whether that alone is too much."""
+    """By how much a pose is off in (yaw, x, y, z), (4,), and its spread (4, 4)."""
 
     off: Array
-    squared: float
     S: Array
-    away_m: float
-    turned_rad: float
-    farther_m: float
-    another_range: bool
+
+    @cached_property
+    def squared(self) -> float:
+        """The square of what is off, in units of its spread."""
+        return float(self.off @ np.linalg.solve(self.S, self.off))
 
     @property
     def cost(self) -> float:
         """The squared distance, with what a vaguer claim costs."""
         return self.squared + float(np.linalg.slogdet(self.S)[1])
 
+    @property
+    def away_m(self) -> float:
+        """How far away the pose is."""
+        return float(np.linalg.norm(self.off[1:]))
 
-def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> Measurement:
-    """Return the measurement that is expected at a later time, however late: what is not measured
-    drifts."""
-    ahead = foreseen(track, t_s, constants)
+
+def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
+    """Return by how much the pose is off from what a track foresees."""
+    wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The most that it drifts counts as three standard deviations.
-    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(t_s - track.t_s, 0.0)
-    assert ahead.R is not None
-    return replace(ahead, R=ahead.R + drift_m**2 * _PLACE)
-
-
-def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
-    """Return by how much the pose is off from the one that is `wanted`."""
-    measured = sight.measured
-    assert wanted.R is not None
-    assert wanted.bias is not None
-    off = measured.z - wanted.z
+    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
+    off = measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
     # A constant error moves both.
-    bias = wanted.bias if measured.bias is None else measured.bias - wanted.bias
+    bias = wanted.bias[MEASURED] if measured.bias is None else measured.bias - wanted.bias[MEASURED]
     R = constants.R if measured.R is None else measured.R
-    S = wanted.R + R + bias @ bias.T + np.diag(_unclaimed(_range_m(sight)) ** 2)
-    return _Fit(
-        off=off,
-        squared=float(off @ np.linalg.solve(S, off)),
-        S=S,
-        away_m=float(np.linalg.norm(off[1:])),
-        turned_rad=abs(float(off[0])),
-        farther_m=float(off[3]),
-        another_range=bool(off[3] ** 2 > _SAME_RANGE**2 * S[3, 3]),
-    )
+    S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _PLACE + R + bias @ bias.T
+    return _Fit(off, S + np.diag(_unclaimed(_range_m(sight)) ** 2))
 
 
-def _clearly(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
-    """Return True if what no pose claims explains all that the pose is off, as in most frames: no
-    other spread can make that too little."""
-    off = sight.measured.z - foreseen_z(track, sight.t_s, constants)
+def _is_clear(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
+    """Return True if what no pose claims explains all, as in most frames: a quick look."""
+    wanted = predict_track(track, sight.t_s, constants, spread=False)
+    off = sight.measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
     off /= _unclaimed(_range_m(sight))
     return float(off @ off) <= _GATE
@@ -324,9 +287,9 @@ def _unclaimed(range_m: float) -> Array:
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
+def _goes_on(lock: Lock, sight: Sight, off_in_world: Array) -> bool:
     """Return True if the pose goes on from the last one as seen from the vehicle, much better than
-    in the world (`fit`): what is off in both did not come about by the estimate."""
+    in the world."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
@@ -336,7 +299,7 @@ def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
     unclaimed = _unclaimed(range_m)
-    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, fit.off))
+    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, off_in_world))
     calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
     return calm and seen < _EXPLAINED * jumped
 
@@ -345,17 +308,19 @@ def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
 
 
 def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
-    """Return the stranger with one more pose, or a new one where there was none before."""
+    """Return the stranger with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
         whole = before.whole + int(sight.whole)
         return replace(before, track=track, frames=before.frames + 1, whole=whole)
+    turned_rad, farther_m = abs(float(fit.off[0])), float(fit.off[3])
+    another_range = farther_m**2 > _SAME_RANGE**2 * float(fit.S[3, 3])
     where = f"{fit.away_m:.2f} m away from it"
-    if fit.turned_rad > _TURNED_RAD:
-        where += f" and turned by {math.degrees(fit.turned_rad):.0f} deg"
-    if fit.another_range:
-        where = f"{abs(fit.farther_m):.2f} m {'above' if fit.farther_m > 0.0 else 'below'} it"
+    if turned_rad > _TURNED_RAD:
+        where += f" and turned by {math.degrees(turned_rad):.0f} deg"
+    if another_range:
+        where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or of another size"
     return Stranger(
         track=start_track(sight.measured, sight.t_s, constants),
@@ -363,13 +328,13 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
         since_s=sight.t_s,
         frames=1,
         whole=int(sight.whole),
-        another_range=fit.another_range,
+        another_range=another_range,
         text=where,
     )
 
 
 def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
-    """Return True if the target is where the stranger is now, and not where the lock has it."""
+    """Return True if the target is where the stranger is now."""
     if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
         return True
     if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
@@ -377,7 +342,7 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
     if not lock.whole:
         return True
     unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
-    # What is not looked at is not empty; where the estimate jumped, it is looked for in vain.
+    # What is not looked at is not empty.
     return (
         (sight.looks_there or unseen_s >= 2.0 * REACQUIRE_S)
         and not stranger.another_range
@@ -387,11 +352,10 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
 
 
 # --- Where the target should be in the next picture -------------------
-# The target stands still, so the vehicle's own motion predicts its place in the picture. The state
-# estimate gives that motion twice: as the difference of two positions, and as speed times time.
-# Positions step by millimetres with each fix from outside, which are many pixels near the target;
-# the noise of a speed adds up. Which is better depends on what the estimate rests on. It is learned
-# from the target's own pictures: each prediction is weighted by how little it was off of late.
+# The state estimate gives the vehicle's motion twice: as the difference of two positions, which
+# step by millimetres with each fix from outside, and as speed times time, whose noise adds up.
+# Which is better is learned from the target's own pictures: each is weighted by how little it was
+# off of late.
 
 
 _FORGOTTEN = 0.1  # of what was learned, with each picture
@@ -401,11 +365,8 @@ def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Return where both markers' corners should be, (4, 2) px each, and the pose that they follow
-    from: the last sighting of the target, moved by the vehicle's own motion since.
-
-    Without an attitude at both times there are no corners and the pose is unmoved. Both are None
-    where the sighting is too old or the target has gone behind the camera.
-    """
+    from: the last sighting, moved by the vehicle's own motion since. Without an attitude at both
+    times the pose is unmoved, and there are no corners."""
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude
@@ -421,7 +382,7 @@ def expected_corners(
     if tvec[2] <= 0.0:
         return None, None
     rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
-    corners = project(setup.all_points, rvec, tvec, setup.camera)
+    corners = project(setup.corners_m["joint"], rvec, tvec, setup.camera)
     moved = PoseCandidate(rvec, tvec)
     if not finite(corners):
         return None, moved
@@ -431,7 +392,7 @@ def expected_corners(
 def update_sight(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
-    """Return the new sighting, with what it shows of the vehicle's own account of its way."""
+    """Return the new sighting, with what it shows of the estimate's motion."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
@@ -452,7 +413,7 @@ def update_sight(
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
-    """Return True if a place (3,) in the world of the state estimate lies in the picture."""
+    """Return True if a place (3,) in the world lies in the picture."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.
@@ -463,8 +424,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 
 def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """Return the camera's way in the world (3,) m, by the state estimate's places and by its
-    speeds."""
+    """Return the camera's way (3,) by the estimate's places, and by its speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
@@ -480,6 +440,6 @@ def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
 
 
 def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
-    """Return the way from the vehicle's place to the camera, in the world (3,)."""
+    """Return the way from the vehicle to the camera, in the world (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -111,11 +111,11 @@ class Detections:
     t_s: float
     large: Detection | None = None
     small: Detection | None = None
-    full_frame: bool = True  # False: found in the predicted window
     mirrored: bool = False  # a marker decoded as its mirror image
     targets: int = 0  # whole targets, both markers, that a search saw
-    velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
-    flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
+    flow_px_s: dict[MarkerName, Array] = field(
+        default_factory=dict
+    )  # (4, 2), or of all corners (2,)
     edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
@@ -270,13 +270,8 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class Lock:
-    """The target that the pipeline holds on to: `track` as its last pose left it.
-
-    Attributes:
-        in_world: the track's frame.
-        frames: how many poses it has taken.
-        whole: one of them rested on both markers.
-    """
+    """The target that the pipeline holds on to: its track, in the world or not, as the last of so
+    many `frames` with a pose left it; `whole` if one of them rested on both markers."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -287,13 +282,8 @@ class Lock:
 
 @dataclass(frozen=True, eq=False)
 class Stranger:
-    """What looks like the target, but is not where the target can be.
-
-    Attributes:
-        since_s: its first frame; `frames` counts all, `whole` those that showed both markers.
-        another_range: it was nearer or farther, too; or is of another size.
-        text: where it was.
-    """
+    """What looks like the target, but is not where the target can be (`text`): since when, in how
+    many frames and in how many with both markers; and whether it is nearer or farther, too."""
 
     track: MarkerTrack
     in_world: bool
@@ -306,13 +296,8 @@ class Stranger:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """What one frame's corners gave.
-
-    Attributes:
-        poses: by ``joint``, ``large``, ``small``, in this order.
-        fed: the track that each pose of this frame goes into.
-        contradicting: the two markers exclude each other.
-    """
+    """What one frame's corners gave: poses by ``joint``, ``large``, ``small``, in this order; which
+    track each that counts goes into; and whether the two markers exclude each other."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     fed: dict[str, MarkerPose] = field(default_factory=dict)
@@ -327,10 +312,9 @@ class MeasuredMarkers:
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """What is known of a stream's fields. `kind`: of the last frame that was looked at, `skipped`
-    frames ago. `votes`: for the top field being the earlier one. `top_first`: None until it is
-    known. `periods_s`: of the last frames, the newest of which came at `last_s`. `previous`: the
-    last picture, where it was combed."""
+    """What is known of a stream's fields: the kind of the last frame that was looked at, `skipped`
+    frames ago; votes for the top field being the earlier one, None until that is known; the periods
+    of the last frames, the newest of which came at `last_s`; the last picture that was combed."""
 
     kind: PictureKind | None = None
     skipped: int = 0
@@ -348,7 +332,6 @@ class PipelineState:
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
     measured: MeasuredMarkers = MeasuredMarkers()  # of the newest frame
-    attitude: Attitude | None = None  # at the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last: Detections | None = None
     sighting: Sighting | None = None  # the last

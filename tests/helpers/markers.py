@@ -14,8 +14,8 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import MARKERS, Frame, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import Picture, follow, follow_partly
-from perchctl.vision.markers.detector import make_aruco_detector
+from perchctl.vision.markers.detect import follow, follow_partly
+from perchctl.vision.markers.detector import Picture, make_aruco_detector
 from perchctl.vision.markers.pattern import Pattern
 from perchctl.vision.types import MarkerName
 from tests.helpers.target_picture import CAMERA, pose_of, render

@@ -50,10 +50,10 @@ class Truth:
     rests: bool = False
 
 
-@pytest.fixture(scope="module")
-def setup() -> PoseSetup:
-    mount, gear_m = PROFILE.camera.mount, PROFILE.vehicle.gear_body_m
-    return PoseSetup(PROFILE.pose, PROFILE.target, mount.T_body_cam, gear_m, CAMERA)
+SETUP = PoseSetup(
+    PROFILE.pose, PROFILE.target, PROFILE.camera.mount.T_body_cam,
+    PROFILE.vehicle.gear_body_m, CAMERA,
+)  # fmt: skip
 
 
 def _flown(t_s: float, truth: Truth, phase: Array) -> tuple[Array, Array]:
@@ -70,9 +70,7 @@ def _flown(t_s: float, truth: Truth, phase: Array) -> tuple[Array, Array]:
     return place, np.array([0.03 * shake[3], 0.03 * shake[4], 1.2 * s + 0.03 * shake[2]])
 
 
-def _fly(
-    truth: Truth, setup: PoseSetup, rng: np.random.Generator, *, told_s: float = 0.0
-) -> ConsistencySums:
+def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySums:
     """The sums after a flight whose pictures are late by `told_s`, as far as the profile knows,
     and by `truth.delay_s` more."""
     phase = rng.uniform(0.0, 2.0 * math.pi, 5)
@@ -83,8 +81,8 @@ def _fly(
     noise = np.zeros((count + 1, 4))
     for k, white in enumerate(rng.normal(size=(count, 4))):
         noise[k + 1] = keep * noise[k] + kick * white
-    turned = rotation_from_rpy(*truth.turn_rad) @ setup.T_body_cam[:3, :3]
-    place_m = setup.T_body_cam[:3, 3]
+    turned = rotation_from_rpy(*truth.turn_rad) @ SETUP.T_body_cam[:3, :3]
+    place_m = SETUP.T_body_cam[:3, 3]
 
     def estimated(t_s: float) -> Attitude:
         place, rpy = _flown(t_s, truth, phase)
@@ -124,38 +122,38 @@ def _fly(
         sums = add_moment(
             sums,
             t_s,
-            *consistency_moment(pose, before, after, velocity(t_s - told_s), told_s, setup),
+            *consistency_moment(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
         )
     return sums
 
 
-def _seen(truth: Truth, setup: PoseSetup, seed: int = 0, told_s: float = 0.0) -> Consistency:
-    sums = _fly(truth, setup, np.random.default_rng(seed), told_s=told_s)
+def _seen(truth: Truth, seed: int = 0, told_s: float = 0.0) -> Consistency:
+    sums = _fly(truth, np.random.default_rng(seed), told_s)
     found = solve_consistency(sums, ATTITUDE_SIGMA_RAD)
     assert found is not None
     return found
 
 
 @pytest.mark.parametrize("delay_s", [-0.05, 0.0, 0.03, 0.08])
-def test_the_delay_is_found(delay_s: float, setup: PoseSetup) -> None:
-    found = _seen(Truth(delay_s=delay_s), setup)
-    again = _seen(Truth(delay_s=delay_s), setup, told_s=found.delay_s)
+def test_the_delay_is_found(delay_s: float) -> None:
+    found = _seen(Truth(delay_s=delay_s))
+    again = _seen(Truth(delay_s=delay_s), told_s=found.delay_s)
     assert again.delay_s == pytest.approx(delay_s, abs=0.004)
     assert again.delay_sigma_s < 0.006
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_each_turn_is_found_about_its_own_axis(axis: int, setup: PoseSetup) -> None:
+def test_each_turn_is_found_about_its_own_axis(axis: int) -> None:
     turn = [0.0, 0.0, 0.0]
     turn[axis] = math.radians(5.0)
-    found = _seen(Truth(turn_rad=(turn[0], turn[1], turn[2])), setup)
+    found = _seen(Truth(turn_rad=(turn[0], turn[1], turn[2])))
     for truth, seen, sigma in zip(turn, found.turn_rad, found.turn_sigma_rad, strict=True):
         assert abs(seen - truth) < 3.0 * sigma
         assert sigma < math.radians(1.5)
 
 
 @pytest.mark.long
-def test_what_is_claimed_is_what_is_so(setup: PoseSetup) -> None:
+def test_what_is_claimed_is_what_is_so() -> None:
     """Many flights, all errors at once: squared errors over claimed variances."""
     ratios = []
     for seed in range(24):
@@ -168,20 +166,20 @@ def test_what_is_claimed_is_what_is_so(setup: PoseSetup) -> None:
             attitude_rad=tuple(bias),
             drift_mps=tuple(rng.normal(0.0, 0.01, 2)),
         )
-        found = _seen(truth, setup, seed, told_s=delay_s + rng.uniform(-0.01, 0.01))
+        found = _seen(truth, seed, told_s=delay_s + rng.uniform(-0.01, 0.01))
         off = np.array([found.delay_s - delay_s, *(np.array(found.turn_rad) - turn)])
         ratios.append((off / [found.delay_sigma_s, *found.turn_sigma_rad]) ** 2)
     mean = np.mean(ratios, axis=0)
     assert ((mean > 0.5) & (mean < 2.0)).all(), mean
 
 
-def test_a_vehicle_at_rest_tells_nothing(setup: PoseSetup) -> None:
-    found = _seen(Truth(delay_s=0.05, turn_rad=(0.1, 0.1, 0.5), rests=True), setup)
+def test_a_vehicle_at_rest_tells_nothing() -> None:
+    found = _seen(Truth(delay_s=0.05, turn_rad=(0.1, 0.1, 0.5), rests=True))
     assert found.delay_sigma_s > 0.05
     assert min(found.turn_sigma_rad) > math.radians(3.0)
 
 
-def test_a_world_that_jumps_spoils_nothing(setup: PoseSetup) -> None:
-    found = _seen(Truth(delay_s=0.02, jump_m=0.3), setup)
+def test_a_world_that_jumps_spoils_nothing() -> None:
+    found = _seen(Truth(delay_s=0.02, jump_m=0.3))
     assert found.delay_s == pytest.approx(0.02, abs=0.006)
     assert abs(found.turn_rad[2]) < 3.0 * found.turn_sigma_rad[2]

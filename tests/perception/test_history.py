@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import Event, Outcome, PlannerState
+from perchctl.mission import Outcome
 from perchctl.perception import History, add_samples
 from perchctl.vehicle import Telemetry
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
-from tests.helpers.mission import observation, telemetry
+from tests.helpers.mission import telemetry
 
 SAFETY = PROFILE.safety
 
@@ -50,16 +50,6 @@ def test_a_step_of_the_estimate_is_a_jump_unless_it_is_small(
     assert jumped(telemetry(1.0), telemetry(1.01, **changes)) is is_jump
 
 
-def battery_age_s(*readings_v: float) -> float:
-    """After 10 s in which they came in turn, ten a second."""
-    history = History()
-    for i in range(101):
-        sample = telemetry(0.1 * i, battery_v=readings_v[i % len(readings_v)])
-        history = add_samples(history, [sample], SAFETY)
-    assert history.battery_changed_s is not None
-    return 10.0 - history.battery_changed_s
-
-
 @pytest.mark.parametrize(
     ("readings_v", "age_s"),
     [
@@ -73,28 +63,20 @@ def battery_age_s(*readings_v: float) -> float:
         ((3.8, 3.81), 0.0),
         ((3.8, 0.0, 3.81, math.nan), 0.0),
     ],
-    ids=["absent", "none", "jitters", "endless", "too large", "comes and goes", "stands still",
-         "changes", "changes between gaps"],
 )  # fmt: skip
 def test_a_battery_that_tells_nothing_new_ages(readings_v: tuple[float, ...], age_s: float) -> None:
     """Fault 7: it is landed after the grace, whatever fills the field of the reading."""
-    assert battery_age_s(*readings_v) == pytest.approx(age_s, abs=0.5)
+    history = History()
+    for i in range(101):
+        sample = telemetry(0.1 * i, battery_v=readings_v[i % len(readings_v)])
+        history = add_samples(history, [sample], SAFETY)
+    assert history.battery_age_s(10.0) == pytest.approx(age_s, abs=0.5)
 
 
-@pytest.mark.parametrize(("battery_v", "told"), [(math.nan, True), (0.0, True), (3.8, False)])
-def test_a_flight_without_a_battery_reading_says_so(battery_v: float, told: bool) -> None:
-    obs = observation(1.0, telemetry=telemetry(1.0, battery_v=battery_v))
-    events = Event.of_tick(None, PlannerState.on_ground(obs), obs, PROFILE)
-    assert any("no battery reading" in event.reason for event in events) is told
-
-
-def test_the_heading_wraps() -> None:
+def test_a_heading_that_wraps_is_no_jump_and_a_smeared_step_is_one() -> None:
+    """0.3 m over five samples, which no velocity explains."""
     a, b = telemetry(1.0, yaw_rad=math.pi - 0.01), telemetry(1.01, yaw_rad=-math.pi + 0.01)
     assert not jumped(a, b)
-
-
-def test_a_smeared_step_is_a_jump() -> None:
-    """0.3 m over five samples, which no velocity explains."""
     samples = [telemetry(1.0 + 0.01 * i, position_m=(0.06 * min(i, 5), 0.0, 1.0)) for i in range(9)]
     assert jumped(*samples)
 

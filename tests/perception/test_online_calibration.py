@@ -58,34 +58,36 @@ def test_a_sure_latency_is_taken_over_slowly() -> None:
     assert _frames(start, MEASURED, 200).used_s == pytest.approx(0.04)
 
 
-def test_an_unsure_latency_changes_nothing() -> None:
-    unsure = OnlineCalibration(newest=_seen(0.04, 1.01 * USED_SIGMA_S), used_s=0.01)
-    assert _frames(unsure, MEASURED, 30).used_s == 0.01
-    assert _frames(OnlineCalibration(), MEASURED, 30).used_s == 0.0
-
-
-def test_a_number_in_the_profile_is_not_overruled() -> None:
-    assert _frames(OnlineCalibration(newest=_seen(0.04, 0.004)), TOLD, 200).used_s == 0.0
+BEFORE_S = MEASURED.start_latency_s
 
 
 @pytest.mark.parametrize(
-    ("delay_s", "bound_s"), [(-0.3, USED_LATENCY_S[0]), (0.5, USED_LATENCY_S[1])]
+    ("newest", "camera", "used_s"),
+    [
+        (_seen(0.04, 1.01 * USED_SIGMA_S), MEASURED, 0.01),
+        (None, MEASURED, 0.01),
+        (_seen(math.nan, math.nan), MEASURED, 0.01),
+        (_seen(0.04, 0.004), TOLD, 0.01),
+        (_seen(-0.3, 0.004), MEASURED, USED_LATENCY_S[0] - BEFORE_S),
+        (_seen(0.5, 0.004), MEASURED, USED_LATENCY_S[1] - BEFORE_S),
+    ],
+    ids=["unsure", "unknown", "no number", "told by the profile", "too little", "too much"],
 )
-def test_what_is_used_stays_within_bounds(delay_s: float, bound_s: float) -> None:
-    used_s = _frames(OnlineCalibration(newest=_seen(delay_s, 0.004)), MEASURED, 600).used_s
-    assert MEASURED.start_latency_s + used_s == pytest.approx(bound_s)
+def test_only_a_sure_latency_is_used_and_within_bounds(
+    newest: Consistency | None, camera: CameraConfig, used_s: float
+) -> None:
+    start = OnlineCalibration(newest=newest, used_s=0.01)
+    assert _frames(start, camera, 600).used_s == pytest.approx(used_s)
 
 
 def test_what_is_no_number_teaches_nothing() -> None:
-    """A covariance that broke down, and an interval that did."""
+    """A covariance that broke down."""
     history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
     broken = replace(POSE, cov=np.full((4, 4), math.nan))
     start = OnlineCalibration()
     learned = update_calibration(start, 10.0, broken, history, SETUP, MEASURED, 0.005)
     assert learned.newest is None
     assert learned.sums.level is None
-    unknown = OnlineCalibration(newest=_seen(math.nan, math.nan), used_s=0.01)
-    assert _frames(unknown, MEASURED, 30).used_s == 0.01
 
 
 def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:

@@ -15,13 +15,12 @@ from perchctl.perception.visual_inertial import (
     LEAST_LATER_S,
     STEP_S,
     VisualInertialWindow,
-    drop_sights,
     estimate_motion,
 )
 from perchctl.vehicle import Telemetry
 
 TARGET_M = np.array([0.3, -0.2, 1.9])
-RATE_HZ = 30.0
+RATE_HZ, FLOWN_S = 30.0, 1.5
 LATENCY_S = 0.2  # so much newer is the telemetry than the exposure is taken to be
 
 
@@ -76,21 +75,16 @@ def watched(
     later_s: float = 0.0,
     turned_rad: float = 0.0,
     offset_g: float = 0.0,
-    for_s: float = 1.5,
-    sway_m: float = 0.0,
-    anew: bool = False,
 ) -> VisualInertialWindow:
-    """`sway_m`: what the sights wander by for another reason; `anew`: begun anew before them."""
     rng = np.random.default_rng(0)
-    watch = drop_sights(VisualInertialWindow()) if anew else VisualInertialWindow()
-    flown = [swing.sample(0.01 * k, offset_g) for k in range(int((for_s + 2.2) * 100) + 1)]
-    for i in range(int(for_s * RATE_HZ)):
+    watch = VisualInertialWindow()
+    flown = [swing.sample(0.01 * k, offset_g) for k in range(int((FLOWN_S + 2.2) * 100) + 1)]
+    for i in range(int(FLOWN_S * RATE_HZ)):
         t_s = 2.0 + i / RATE_HZ
         newest = int((t_s + LATENCY_S) * 100.0)
         samples = tuple(flown[newest - 200 : newest + 1])
         x, y, z = swing.way_m(t_s - later_s, turned_rad)
         x, y = x + float(rng.normal(0.0, 1e-3)), y + float(rng.normal(0.0, 1e-3))
-        x += sway_m * math.sin(25.0 * t_s)
         watch = estimate_motion(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0))
     return watch
 

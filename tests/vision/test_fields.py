@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision import (
-    CameraModel,
     Frame,
     PictureKind,
     Pipeline,
@@ -23,13 +19,12 @@ from perchctl.vision import (
     pictures,
     step,
 )
-from perchctl.vision.fields import FieldsMode, combing, field_picture, is_combed, separate_fields
+from perchctl.vision.fields import field_picture, is_combed, separate_fields
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
-SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
 PAL_S = 0.04
 
 Build = Callable[..., Pipeline]
@@ -81,23 +76,13 @@ def test_noise_and_snow_and_nothing_are_not_combed() -> None:
         assert not is_combed(image)
 
 
-@pytest.mark.parametrize("folder", ["scenes", "hard/progressive", "hard/true", "hard/false"])
-def test_no_shared_whole_picture_is_taken_for_two(folder: str) -> None:
-    if not (SHARED / folder).is_dir():
-        pytest.skip(f"the shared pictures are absent ({SHARED / folder})")
-    files = [f for f in (SHARED / folder).rglob("*") if f.suffix in (".jpg", ".png")]
-    measured = {f.name: combing(np.asarray(cv2.imread(str(f), 0), np.uint8)) for f in files}
-    assert len(measured) >= 16
-    assert max(measured.values()) < 1.0  # 1.4 would be combed
-
-
 # --- Order and time ----------------------------------------------------------------------------
 
 
-def kinds(state: FieldState, frames: list[Frame], mode: FieldsMode = "auto") -> list[Any]:
+def kinds(state: FieldState, frames: list[Frame]) -> list[Any]:
     found = []
     for frame in frames:
-        state, parts = separate_fields(state, frame, mode)
+        state, parts = separate_fields(state, frame)
         found.append(tuple(part.fields for part in parts))
     return found
 
@@ -118,27 +103,6 @@ def test_the_order_is_found_within_a_few_frames(
     assert set(found) <= {("woven",), (first, second)}
 
 
-def test_a_stream_of_whole_pictures_is_looked_at_in_every_third() -> None:
-    """One in which fields were seen: in each."""
-    _, (frame,) = woven_frames(1)
-    plain = replace(frame, image=np.full_like(frame.image, 90))
-    # Whichever frames a busy program takes.
-    stream = [replace(plain, index=1), *(replace(frame, index=1 + 3 * k) for k in range(1, 8))]
-    found = kinds(FieldState(), [replace(f, t_s=k * PAL_S) for k, f in enumerate(stream)])
-    assert [len(f) == 1 and f[0] for f in found[:4]] == ["whole", "whole", "whole", "woven"]
-    assert ("whole",) not in found[3:]
-
-
-def test_a_standing_picture_says_nothing_of_the_order() -> None:
-    _, (frame,) = woven_frames(1)
-    state = FieldState()
-    for k in range(8):
-        again = replace(frame, t_s=frame.t_s + k * PAL_S)
-        state, parts = separate_fields(state, again, "auto")
-        assert [part.fields for part in parts] == ["woven"]
-    assert abs(state.votes) < 0.1
-
-
 def test_a_changed_order_is_found() -> None:
     """A receiver that loses its lock may come back with its fields exchanged."""
     _, tops = woven_frames(5, "top")
@@ -156,25 +120,15 @@ def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None
     """Found from times that jitter, of frames of which some are lost."""
     rng = np.random.default_rng(6)
     _, frames = woven_frames(3)
-    state = FieldState()
+    state = FieldState(top_first=True)
     index = 0
     for k in range(40):
         index += 1 + (rng.random() < 0.1)
         t_s = index * period_s + rng.normal(0.0, 0.03 * period_s)
-        state, parts = separate_fields(state, replace(frames[k % 3], t_s=t_s), "top")
+        state, parts = separate_fields(state, replace(frames[k % 3], t_s=t_s))
     early, late = parts
     assert (early.t_s + late.t_s) / 2.0 == pytest.approx(t_s)
     assert late.t_s - early.t_s == pytest.approx(apart_s, rel=0.03)
-
-
-def test_the_profile_may_know_better() -> None:
-    _, frames = woven_frames(2, "top")
-    assert kinds(FieldState(), frames, "bottom") == [("bottom", "top")] * 2
-    assert kinds(FieldState(), frames, "top") == [("top", "bottom")] * 2
-    assert kinds(FieldState(), frames, "progressive") == [("whole",)] * 2
-    still = list(Pass().frames(2))
-    assert kinds(FieldState(), still, "auto") == [("whole",)] * 2
-    assert kinds(FieldState(), still, "top") == [("top", "bottom")] * 2
 
 
 # --- The target --------------------------------------------------------------------------------
@@ -237,31 +191,3 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
             squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
     assert 0.2 < np.mean(squares["claimed"]) < 2.0
     assert np.mean(squares["as elsewhere"]) > 3.0
-
-
-# --- Shared pictures ---------------------------------------------------------------------------
-
-
-def shared_errors(folder: str, build: Build) -> Array:
-    hard = SHARED / "hard"
-    if not hard.is_dir():
-        pytest.skip(f"the shared pictures are absent ({hard})")
-    storage = cv2.FileStorage(str(hard / "camera.yaml"), cv2.FILE_STORAGE_READ)
-    K, dist = (storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
-    setup = build(camera=CameraModel((640, 480), K, dist.ravel()))
-    errors = []
-    for name, truth in json.loads((hard / "truth.json").read_text()).items():
-        if not name.startswith(folder):
-            continue
-        image = np.asarray(cv2.imread(str(hard / folder / name), cv2.IMREAD_GRAYSCALE), np.uint8)
-        _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
-        errors.append((output.target.e_m - np.array(truth["t"])) * 1000.0)
-    assert len(errors) == 16
-    return np.sqrt(np.mean(np.square(errors), axis=0))
-
-
-def test_shared_woven_pictures_are_as_good_as_whole_ones(build: Build) -> None:
-    woven, whole = (shared_errors(folder, build) for folder in ("weave", "progressive"))
-    assert whole[2] < 0.02  # as their README has it
-    assert woven[2] < 2.0 * 0.02
-    assert woven[:2].max() < 0.03

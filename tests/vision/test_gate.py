@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -23,7 +22,14 @@ from perchctl.vision import (
 )
 from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.pipeline import follow
-from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
+from perchctl.vision.tracks import (
+    ESTABLISHED_FRAMES,
+    FORGET_S,
+    REACQUIRE_S,
+    Sight,
+    _is_clear,
+    judged,
+)
 from perchctl.vision.types import Detections, Lock, MarkerTrack, Stranger
 from tests.helpers.seen import seen_from
 
@@ -113,22 +119,19 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
 def test_what_is_clearly_the_targets_is_so_by_every_spread(
     off_m: tuple[float, float, float], off_rad: float, sigma_m: float, range_m: float
 ) -> None:
-    constants = make_filter(KalmanConfig(), in_world=True)
+    """By way of all spreads, as beside a stranger, too."""
     track = MarkerTrack(t_s=0.0, x=np.zeros(8), P=np.eye(8) * sigma_m**2)
-    z = np.array([off_rad, *off_m])
     pose = MarkerPose(
-        source="joint", t_s=0.03, rvec_rad=np.zeros(3), tvec_m=np.array([0.0, 0.0, range_m]),
-        e_m=np.zeros(3), e_yaw_rad=0.0, sigma_m=np.ones(3), sigma_yaw_rad=1.0,
-        reprojection_px=0.0, chi2=1.0, cov=np.eye(4),
+        "joint", 0.03, np.zeros(3), np.array([0.0, 0.0, range_m]), np.zeros(3), 0.0, np.ones(3),
+        1.0, 0.0,
     )  # fmt: skip
+    z = np.array([off_rad, *off_m])
     sight = Sight(0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True)
-    spread = np.array([math.radians(4.0), *[0.01 + 0.015 * range_m] * 2, 0.01 + 0.02 * range_m])
-    if float(((z / spread) ** 2).sum()) < 25.0 - 1e-6:
-        lock = Lock(track=track, pose=pose, in_world=True, frames=9, whole=True)
-        assert judged(lock, None, sight, constants).taken
-        stranger = Stranger(track, True, 0.0, 1, 1, False, "")
-        far = replace(stranger, track=replace(track, x=np.full(8, 5.0)))
-        assert judged(lock, far, sight, constants).taken  # by way of all spreads
+    constants = make_filter(KalmanConfig(), in_world=True)
+    stranger = Stranger(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
+    lock = Lock(track=track, pose=pose, in_world=True, frames=9, whole=True)
+    if _is_clear(track, sight, constants):
+        assert judged(lock, stranger, sight, constants).taken
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:
@@ -162,19 +165,15 @@ def test_no_jump_locks_the_pipeline_out_for_ever(watch: Watch) -> None:
     assert any(measured(watch.show(int(0.5 * HZ), **HALF)))
 
 
-def test_what_was_unseen_for_long_may_be_anywhere_for_a_camera_in_a_hand(build: Build) -> None:
-    watch = Watch(build(), in_world=False)
+@pytest.mark.parametrize(("in_world", "unseen_s"), [(False, 1.2), (True, 4.0)])
+def test_what_was_unseen_for_long_is_where_it_was_in_flight_but_not_in_a_hand(
+    build: Build, in_world: bool, unseen_s: float
+) -> None:
+    watch = Watch(build(), in_world=in_world)
     watch.show(LOCKED)
-    watch.show(int(1.2 * HZ), markers=())
-    assert all(measured(watch.show(3, **HALF)))
-
-
-def test_what_was_unseen_for_long_is_where_it_was_in_flight(build: Build) -> None:
-    watch = Watch(build(), in_world=True)
-    watch.show(LOCKED)
-    watch.show(int(4.0 * HZ), markers=())
-    assert not any(measured(watch.show(10, **HALF)))
-    assert all(measured(watch.show(3)))
+    watch.show(int(unseen_s * HZ), markers=())
+    assert any(measured(watch.show(10, **HALF))) is not in_world
+    assert not in_world or all(measured(watch.show(3)))
 
 
 SMALL_JUMPS_M = [(0.0, 0.0, 0.08), (0.12, 0.0, 0.0)]

@@ -16,7 +16,7 @@ RATIONAL = CameraModel(
     np.array([-0.1, 0.02, 0.0004, -0.0003, 0.001, 0.05, -0.01, 0.002]),
     "rational_polynomial",
 )
-pixels = st.tuples(st.floats(0, 639), st.floats(0, 479))
+pixels = st.tuples(st.floats(0, 639), st.floats(0, 479)) | st.just((639.0, 479.0))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, RATIONAL, FISHEYE], ids=lambda c: c.model)
@@ -25,11 +25,6 @@ pixels = st.tuples(st.floats(0, 639), st.floats(0, 479))
 def test_distort_undoes_undistort(camera: CameraModel, points: list[tuple[float, float]]) -> None:
     px = np.array(points)
     assert np.abs(distort(undistort(px, camera), camera) - px).max() < 1e-6
-
-
-def test_undistort_converges_at_the_corners_of_the_picture() -> None:
-    corners = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
-    assert np.abs(distort(undistort(corners, CAMERA), CAMERA) - corners).max() < 1e-5
 
 
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=lambda c: c.model)

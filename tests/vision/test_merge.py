@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array, wrap_rad, yaw_of
-from perchctl.profile import MergeConfig, Profile, WeightsConfig
+from perchctl.profile import Profile, WeightsConfig
 from perchctl.vision import (
     MarkerPose,
     PipelineState,
@@ -20,13 +20,10 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.merge import (
-    choose_stage,
     disagree,
     merge_pair,
-    stage_of,
     weight_matrix,
 )
-from perchctl.vision.types import Stage
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -81,28 +78,6 @@ def test_yaw_is_merged_on_the_circle(w: WeightsConfig, a: float, gap: float) -> 
     large, small = np.array([0, 0, 0, a]), np.array([0, 0, 0, wrap_rad(a + gap)])
     merged = merge_pair(large, small, w)[3]
     assert abs(wrap_rad(merged - (a + (1.0 - w.yaw) * gap))) < 1e-9
-
-
-SEEN = {
-    (False, False): Stage.NONE,
-    (True, False): Stage.LARGE,
-    (False, True): Stage.SMALL,
-    (True, True): Stage.BOTH,
-}
-
-
-@pytest.mark.parametrize("z_m", [2.0, 0.26, 0.25, 0.13, 0.12, 0.05, None])
-def test_the_stage_is_what_is_seen_or_what_the_range_asks_for_of_it(z_m: float | None) -> None:
-    """Equations 4, 6 and 11."""
-    for (large, small), stage in SEEN.items():
-        assert stage_of(large, small) is stage
-        assert choose_stage(large, small, z_m, MergeConfig()) is stage
-        asked = choose_stage(large, small, z_m, MergeConfig(stages="range"))
-        if stage is Stage.BOTH and z_m is not None:
-            far, near = z_m > 0.25, z_m <= 0.12
-            assert asked is (Stage.LARGE if far else Stage.SMALL if near else Stage.BOTH)
-        else:
-            assert asked is stage
 
 
 def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:

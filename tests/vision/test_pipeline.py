@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,7 +24,6 @@ from perchctl.geometry import (
 )
 from perchctl.profile import (
     CameraConfig,
-    DetectorConfig,
     KalmanConfig,
     MarkerConfig,
     MergeConfig,
@@ -261,14 +261,14 @@ def test_a_stream_without_the_target_is_looked_at_thoroughly_every_nth_frame(bui
     """What only the thorough look finds: a target run together by blur."""
     sharp = render(*pose_of(0.1, 0.05, 2.3, 0.4)).astype(np.float32)
     hidden = np.clip(np.rint(cv2.GaussianBlur(sharp, (0, 0), 3.0)), 0, 255).astype(np.uint8)
-    setup = build(detector=DetectorConfig(blurred_every=3))
+    setup = build()
     _, first = step(PipelineState(), Frame(7, 0.0, hidden), None, setup)
     assert first.detections.large is not None
     state, found = PipelineState(), []
-    for k in range(4):
+    for k in range(5):
         state, output = step(state, Frame(k, k / 30, EMPTY if k == 0 else hidden), None, setup)
         found.append(output.detections.large is not None)
-    assert found == [False, False, False, True]
+    assert found == [False, False, False, False, True]
     assert state.empty_frames == 0
 
 
@@ -335,12 +335,10 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
     for k in range(frames):
         attitude, pose = flight.at(k * FRAME_S)
         if not told:
-            attitude = Attitude(
-                attitude.t_s, attitude.roll_rad, attitude.pitch_rad, 0.3, attitude.position_m
-            )
+            attitude = replace(attitude, velocity_mps=None)
         if sight is not None:
             expected, _ = expected_corners(sight, pose.t_s, attitude, SETUP)
-            points = SETUP.object_points["large"]
+            points = SETUP.corners_m["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())
         sight = update_sight(sight, pose, attitude, SETUP)
@@ -357,14 +355,6 @@ def test_places_that_step_are_overruled_by_speeds(seed: int) -> None:
     both = list(errors_px(Flight(seed, 2e-3, 5e-3), 90))[LEARNED:]
     places = list(errors_px(Flight(seed, 2e-3, 5e-3), 90, told=False))[LEARNED:]
     assert rms(both) < 0.4 * rms(places)
-
-
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(st.integers(0, 2**31))
-def test_speeds_that_are_wrong_are_overruled_by_places(seed: int) -> None:
-    both = list(errors_px(Flight(seed, 1e-4, 0.15), 90))[LEARNED:]
-    places = list(errors_px(Flight(seed, 1e-4, 0.15), 90, told=False))[LEARNED:]
-    assert rms(both) < 1.5 * rms(places)
 
 
 def test_a_jump_of_the_estimates_world_spoils_one_picture() -> None:

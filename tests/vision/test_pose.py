@@ -43,7 +43,6 @@ from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 SIDES = {"large": 0.150, "small": 0.025}
-SOLVERS = ["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
 MOUNT = make_T(rotation_from_rpy(0.05, -0.03, 1.2), (0.02, -0.01, 0.015))
 GEAR = np.array([0.004, -0.003, 0.03])
 
@@ -111,15 +110,13 @@ near = st.tuples(
 )
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
 @given(values=near)
-@settings(max_examples=25, deadline=None)
-def test_every_solver_returns_the_pose_it_was_shown(solver: str, values: tuple) -> None:
+@settings(max_examples=60, deadline=None)
+def test_the_pose_is_the_one_that_was_shown(values: tuple) -> None:
     rvec, tvec = pose_of(*values)
-    setup = setup_with(solver=solver)
     for seen in (["large"], ["large", "small"]):
         detections = [marker(name, rvec, tvec) for name in seen]
-        pose = posed(detections, Attitude(0.0, *values[4:], 0.0), setup)
+        pose = posed(detections, Attitude(0.0, *values[4:], 0.0))
         assert np.allclose(pose.tvec_m, tvec, atol=2e-5)
         assert pose.source == ("joint" if len(seen) == 2 else "large")
         assert pose.reprojection_px < 0.01
@@ -127,13 +124,12 @@ def test_every_solver_returns_the_pose_it_was_shown(solver: str, values: tuple) 
         assert math.acos(min(1.0, (np.trace(R) - 1) / 2)) < 2e-3
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, math.pi, -math.pi / 4])
-def test_exactly_frontal_views_work_with_every_solver(solver: str, yaw: float) -> None:
+def test_exactly_frontal_views_are_solved(yaw: float) -> None:
     rvec, tvec = pose_of(0.0, 0.0, 0.24, yaw)
     for seen in (["large"], ["small"], ["large", "small"]):
         detections = [marker(name, rvec, tvec) for name in seen]
-        pose = posed(detections, None, setup_with(solver=solver))
+        pose = posed(detections)
         assert np.allclose(pose.e_m, tvec, atol=1e-4)
         assert abs(wrap_rad(pose.e_yaw_rad - yaw)) < 1e-3
 
@@ -219,14 +215,6 @@ def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     assert 0.8 < np.mean(squares) / 4.0 < 1.2
 
 
-def test_both_markers_together_are_surer_than_either() -> None:
-    rvec, tvec = pose_of(0.0, 0.0, 0.24, 0.3)
-    both = [marker(name, rvec, tvec) for name in ("large", "small")]
-    joint = posed(both)
-    for one in both:
-        assert (joint.sigma_m < posed([one]).sigma_m).all()
-
-
 def test_corners_that_are_no_square_are_refused() -> None:
     rvec, tvec = pose_of(0.0, 0.0, 0.3)
     detection = marker("large", rvec, tvec)
@@ -241,7 +229,6 @@ def test_corners_that_are_no_square_are_refused() -> None:
     assert estimate_pose([detection, shifted], 0.0, None, loose) is not None
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize(
     "corners",
     [
@@ -251,9 +238,9 @@ def test_corners_that_are_no_square_are_refused() -> None:
         np.array([[0.0, 0.0], [1e9, 0.0], [1e9, 1e9], [0.0, 1e9]]),
     ],
 )
-def test_useless_corners_give_no_pose_or_a_finite_one(solver: str, corners: Array) -> None:
+def test_useless_corners_give_no_pose_or_a_finite_one(corners: Array) -> None:
     detection = Detection("large", corners, 0.1, False)
-    pose = estimate_pose([detection], 0.0, None, setup_with(solver=solver))
+    pose = estimate_pose([detection], 0.0, None, PLAIN)
     if pose is not None:
         assert np.isfinite(pose.e_m).all()
         assert math.isfinite(pose.e_yaw_rad)

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from perchctl.geometry import Array, wrap_rad
 from perchctl.vision import Frame, PipelineOutput, PipelineState, step
@@ -37,24 +38,21 @@ def errors(truth: dict[str, Any], build: Any, chosen: list[dict[str, Any]], **co
     return np.array(rows)
 
 
-def rms(rows: Array) -> Array:
-    return np.asarray(np.sqrt((rows**2).mean(axis=0)))
-
-
-def test_near_and_clean(truth: dict[str, Any], build: Any) -> None:
-    near = [f for f in entries(truth, "clean", "table1", "table2") if f["tvec"][2] < 0.25]
-    assert (rms(errors(truth, build, near)) < [0.04, 0.03, 0.08, 0.06]).all()
-
-
-def test_far_and_clean(truth: dict[str, Any], build: Any) -> None:
+NEAR, FAR = (lambda z_m: z_m < 0.25), (lambda z_m: z_m >= 0.25)
+LIMITS = {
+    "near": (("clean", "table1", "table2"), NEAR, [0.04, 0.03, 0.08, 0.06]),
     # White paper clipped at 255 draws the edges inwards: these gates are the sensor's.
-    far = [f for f in entries(truth, "clean") if f["tvec"][2] >= 0.25]
-    assert (rms(errors(truth, build, far)) < [1.6, 0.7, 3.5, 0.1]).all()
+    "far": (("clean",), FAR, [1.6, 0.7, 3.5, 0.1]),
+    "noise": (("noise",), lambda _: True, [0.74, 0.42, 1.2, 0.08]),
+}
 
 
-def test_noise(truth: dict[str, Any], build: Any) -> None:
-    rows = errors(truth, build, entries(truth, "noise"))
-    assert (rms(rows) < [0.74, 0.42, 1.2, 0.08]).all()
+@pytest.mark.parametrize("name", LIMITS)
+def test_errors_by_range_and_noise(truth: dict[str, Any], build: Any, name: str) -> None:
+    categories, is_meant, limits = LIMITS[name]
+    chosen = [f for f in entries(truth, *categories) if is_meant(f["tvec"][2])]
+    rows = errors(truth, build, chosen)
+    assert (np.sqrt((rows**2).mean(axis=0)) < limits).all()
 
 
 def test_nothing_is_found_where_there_is_no_target(truth: dict[str, Any], build: Any) -> None:
@@ -83,13 +81,3 @@ def test_found_rates(truth: dict[str, Any], build: Any) -> None:
                 found[name] += output.detections.get(name) is not None
     assert found["large"] >= 0.95 * visible["large"]
     assert found["small"] >= 0.85 * visible["small"]
-
-
-def test_a_mirrored_scene_is_recognised(truth: dict[str, Any], build: Any) -> None:
-    entry = entries(truth, "table1")[0]
-    image = cv2.imread(str(truth["folder"] / entry["file"]), cv2.IMREAD_GRAYSCALE)
-    setup = build(camera=truth["camera"])
-    flipped = np.ascontiguousarray(image[:, ::-1])
-    output = step(PipelineState(), Frame(0, 0.0, flipped), None, setup)[1]
-    assert output.detections.mirrored
-    assert output.target is None

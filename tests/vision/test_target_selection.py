@@ -182,11 +182,3 @@ def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
     if not taken:  # an estimate that jumped would have it elsewhere: not for ever
         later = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(30)]
         assert any("taken up anew" in note for note in later)
-
-
-def test_a_target_with_other_ids_is_none() -> None:
-    flown = flight(Neighbour((APART_M, 0.0), 0.7, large_id=996, small_id=6))
-    for _ in range(4):
-        output = flown.at(OTHER_M, BOTH_READ_M)
-        assert place(output) == pytest.approx(OWN_M, abs=0.02)
-        assert output.detections.targets <= 1

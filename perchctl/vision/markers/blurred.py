@@ -17,18 +17,17 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     RefinedCorners,
     doubled_area,
-    from_unit,
     mapped,
     mean_side_px,
     side_lengths_px,
     to_unit,
     within,
 )
-from perchctl.vision.markers.detector import DetectorSetup, make_quadrilateral_finder
+from perchctl.vision.markers.detector import Picture, make_quadrilateral_finder
 from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
+from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance
 from perchctl.vision.markers.photometric_fit import Alignment, align
-from perchctl.vision.types import MARKERS, CameraModel, MarkerName
+from perchctl.vision.types import MARKERS, MarkerName
 
 _BLURS_PX, _BLUR_PX = (1.5, 3.0), 2.0  # to start with
 _SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # how far a prediction may be off
@@ -42,14 +41,11 @@ _SHEET = 1.3  # half sides of a marker that are surely paper
 
 
 def expected_in_blur(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    turn: int | None = None,
+    picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first of the markers that is near to where it is expected (4, 2) px. Fits that
-    begin with little and with much blur take turns; without a `turn`, both are tried."""
+    """Return the first marker near to where it is expected (4, 2) px. Fits that begin with little
+    and with much blur take turns; without a `turn`, both are tried."""
+    image, patterns = picture.image, picture.setup.patterns
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
         corners = expected.get(name)
@@ -61,21 +57,19 @@ def expected_in_blur(
         if resemblance(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
             continue
         for blur_px in blurs_px:
-            seen = aligned(image, start, patterns[name], camera, blur_px=blur_px)
+            seen = aligned(picture, name, start, blur_px=blur_px)
             if seen is not None:
                 return {name: seen}
     return {}
 
 
-def hidden_in_blur(
-    image: NDArray[np.uint8], setup: DetectorSetup, camera: CameraModel
-) -> dict[MarkerName, RefinedCorners]:
-    """Find a marker anywhere in the picture: of all its quadrilaterals, those whose grey values go
-    best with a marker's cells are verified."""
+def hidden_in_blur(picture: Picture) -> dict[MarkerName, RefinedCorners]:
+    """Return a marker anywhere: the best of all quadrilaterals."""
+    image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _best(image, quads, setup.patterns):
-        seen = aligned(image, corners_px, setup.patterns[name], camera, blur_px=_BLUR_PX)
+        seen = aligned(picture, name, corners_px, blur_px=_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
@@ -84,35 +78,31 @@ def hidden_in_blur(
 def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in the turn in
-    which they do; the most alike first, and each place once: several thresholds find the same
-    quadrilateral."""
+    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in their turn;
+    the most alike first, and each place once."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []
     found: list[tuple[float, MarkerName, Array]] = []
-    squares = np.array([from_unit(quad) for quad in quads])
     for name in MARKERS:
-        like = resemblances(image, squares, patterns[name])
+        like = np.array([resemblance(image, quad, patterns[name]) for quad in quads])
         for i in np.flatnonzero(like.max(axis=1) > _MIN_RESEMBLANCE):
             turn = int(like[i].argmax())
             found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
-        if len(chosen) == _MAX_CANDIDATES:
-            break
         middle, room_px = corners_px.mean(axis=0), _SAME * mean_side_px(corners_px)
         if not any(
             name == other and float(np.abs(there.mean(axis=0) - middle).max()) < room_px
             for other, there in chosen
         ):
             chosen.append((name, corners_px))
-    return chosen
+    return chosen[:_MAX_CANDIDATES]
 
 
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the expected corners moved to where the marker's drawing, as it would look there,
-    correlates best with the picture."""
+    """Return the expected corners moved to where the marker's drawing goes best with the
+    picture."""
     side_px = mean_side_px(corners_px)
     # Large markers are found on a picture reduced to what the search needs.
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
@@ -140,8 +130,7 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
 
 
 def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
-    """Return the drawing at points (n, n, 2) of the marker's own coordinates, softened; grey where
-    there may be anything."""
+    """Return the drawing at own coordinates (n, n, 2), softened."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -170,10 +159,9 @@ _MIN_EVENNESS = 0.6  # shortest side over the longest
 
 
 def aligned(
-    image: NDArray[np.uint8],
+    picture: Picture,
+    name: MarkerName,
     start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
     reach: float = 0.6,
     blur_px: float = 1.5,
     max_sigma: float = _MAX_SIGMA,
@@ -188,13 +176,21 @@ def aligned(
     side_px = mean_side_px(start_px)
     if not side_px >= LEAST_SIDE_PX:
         return None
-    found = align(image, start_px, pattern.drawing, camera, blur_px)
+    image, drawing = picture.image, picture.setup.patterns[name].drawing
+    found = align(image, start_px, drawing, picture.camera, blur_px)
     if (
         found is None
         or not verified(found, max_sigma)
         or (alone and not told_apart(found))
         or found.moved_px > max(reach * side_px, _MIN_REACH_PX)
-        or not _same_square(start_px, found.corners_px)
+    ):
+        return None
+    # A square is still one, of about the same size, and the same way round.
+    sides_px, areas = side_lengths_px(found.corners_px), [found.corners_px, start_px]
+    if (
+        sides_px.min() < _MIN_EVENNESS * sides_px.max()
+        or not _MIN_GROWTH < float(sides_px.mean()) / side_px < _MAX_GROWTH
+        or np.prod(doubled_area(np.stack(areas))) <= 0.0
     ):
         return None
     sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
@@ -207,9 +203,8 @@ def aligned(
 
 
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
-    """Return True if the picture looks like the drawing: the gate. On pictures without the marker
-    the pattern's correlation stays below 0.72 where its strength is as it should be; on the marker,
-    unless noise drowns it, it is above 0.95."""
+    """Return True if the picture looks like the drawing. Without the marker the pattern's
+    correlation stays below 0.72 at the right strength; on it, it is above 0.95."""
     return (
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS
@@ -220,18 +215,6 @@ def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
 
 
 def told_apart(found: Alignment) -> bool:
-    """Return True if another codeword would look different, and this one is seen. Of 36 others that
-    the gate before this one took for the marker, all had a flip above 0.5."""
+    """Return True if another codeword would look different. Of 36 others that `verified` took for
+    the marker, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA
-
-
-def _same_square(start_px: Array, corners_px: Array) -> bool:
-    """Return True if a square is still one, of about the same size, and the same way round."""
-    sides_px = side_lengths_px(corners_px)
-    growth = float(sides_px.mean()) / mean_side_px(start_px)
-    turn = float(doubled_area(corners_px[None])[0]) * float(doubled_area(start_px[None])[0])
-    return bool(
-        sides_px.min() >= _MIN_EVENNESS * sides_px.max()
-        and _MIN_GROWTH < growth < _MAX_GROWTH
-        and turn > 0.0
-    )

@@ -50,8 +50,8 @@ def mapped(H: Array, points: Array) -> Array:
 
 
 def corner_jacobian(H: Array) -> Array:
-    """Return the change (8, 8) of the four corners that H (3, 3) makes of the unit square with the
-    terms of an increment P, H (1 + P): its rows one after the other, without the last term."""
+    """Return the change (8, 8) of the corners that H (3, 3) makes of the unit square with the terms
+    of an increment P of `incremented`."""
     q = _UNIT1.dot(H.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
@@ -59,8 +59,8 @@ def corner_jacobian(H: Array) -> Array:
 
 
 def incremented(H: Array, p: Array) -> Array:
-    """Return H (1 + P), scaled to 1 in its last term: P has the terms p (8,) of an increment in the
-    order of its rows, and a last one of 0."""
+    """Return H (1 + P), scaled to 1 in its last term; p (8,) are the rows of P, but for its last
+    0."""
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     return np.asarray(H / H[2, 2])
 
@@ -77,22 +77,14 @@ def mean_side_px(corners_px: Array) -> float:
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
-def shortest_side_px(corners_px: Array) -> float:
-    """Return the shortest side of one square (4, 2); NaN where a corner is."""
-    a, b, c, d = corners_px.tolist()
-    return min(math.dist(a, b), math.dist(b, c), math.dist(c, d), math.dist(d, a))
-
-
 def doubled_area(corners: Array) -> Array:
-    """Return twice the area, positive for corners (m, 4, 2) that run clockwise as the picture is
-    seen, (m,)."""
+    """Return twice the area (m,) of corners (m, 4, 2), positive if clockwise."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Return True if all corners (4, 2) are finite and inside a picture of that shape, at least
-    `room_px` from its edge."""
+    """Return True if all corners (4, 2) are `room_px` or more inside a picture."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
     # False for NaN.
@@ -101,7 +93,7 @@ def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> b
 
 def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
     """Return the corners (4, 2) of a square `ratio` times as large with the same centre and plane;
-    without a camera, as if the lens did not bend the square's sides."""
+    without a camera, as if no lens bent it."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = mapped(from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
     return found if camera is None else distort(found, camera)
@@ -110,8 +102,7 @@ def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -
 def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Return both markers, the other where the one that is expected puts it; `ratio` is the small
-    marker's side over the large one's."""
+    """Return both markers, one perhaps where the other puts it."""
     both = dict(expected)
     if "small" not in both and "large" in both:
         both["small"] = nested(both["large"], ratio, camera)
@@ -121,23 +112,20 @@ def with_missing_marker(
 
 
 # --- A marker's corners as they were refined, and each by its own neighbourhood ---
-# That is the way where no lines can be fitted (`perchctl.vision.markers.edge_fit`): such a
-# corner is pulled inwards (0.15 to 0.55 px), which makes the target look far.
+# Such a corner is pulled inwards (0.15 to 0.55 px), which makes the target look far.
 
 
 RAW_SIGMA_PX = 0.6
 SUBPIX_SIGMA_PX = 0.25
 NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothing
-_PICTURES = 5  # for which a measured shift of all edges holds
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread
-    of a shift that is common to all sides (outwards), the edges' blur, in px, the shift
-    that was taken out, where the corners follow from a part of the drawing their covariance
-    (8, 8) in pixels of a pinhole, x and y of each corner by turns, the spread by rows that
-    shake along themselves, and the blur of the sharpest side."""
+    """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread of a
+    shift that all sides share (outwards), the edges' blur, px, the shift that was taken out,
+    perhaps a covariance (8, 8) as of a `Detection`, the spread of rows that shake, and the sharpest
+    side's blur."""
 
     corners_px: Array
     sigma_px: float
@@ -151,8 +139,7 @@ class RefinedCorners:
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Return the corners (4, 2) of a marker `cells` wide by `cv2.cornerSubPix`; the raw ones where
-    it leads away."""
+    """Return the corners (4, 2) by `cv2.cornerSubPix`, or the raw ones."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)
@@ -163,11 +150,3 @@ def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedC
     if not np.isfinite(moved_px) or moved_px > half + 1.0:
         return RefinedCorners(raw_px, RAW_SIGMA_PX, False)
     return RefinedCorners(moved, SUBPIX_SIGMA_PX, False)
-
-
-def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
-    """Return what an earlier picture's shift still gives a picture later; None once it is too old:
-    light, lens and ink change slowly."""
-    if earlier is None or earlier.age + 1 >= _PICTURES:
-        return None
-    return EdgeShift(earlier.shift_px, earlier.sigma_px, earlier.age + 1)

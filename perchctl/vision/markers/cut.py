@@ -1,10 +1,9 @@
 """The target so near, or so far aside, that no marker is wholly in the picture.
 
 What is left of the drawing is aligned from where the target is expected, and one marker's
-corners follow, of which some are outside of the picture: with the covariance of what was seen,
-since some directions may be hardly known. A part of a drawing looks like many things. So it is
-never a first sight of the target, and it counts only if the picture looks like the drawing all
-over and nearly all edges that should be in view are.
+corners follow, with the covariance of what was seen. A part of a drawing looks like many things. So
+it is never a first sight of the target, and it counts only if the picture looks like the drawing
+all over and nearly all edges that should be in view are.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import UNIT, RefinedCorners, mapped, within
-from perchctl.vision.markers.detector import Covered, hides, make_aruco_detector
+from perchctl.vision.markers.detector import Covered, Picture, hides, make_aruco_detector
 from perchctl.vision.markers.edge_fit import MIDDLES, sample
 from perchctl.vision.markers.pattern import Drawing, Pattern, drawn
 from perchctl.vision.markers.photometric_fit import likeness, make_grid
-from perchctl.vision.types import CameraModel, Detections, MarkerName
+from perchctl.vision.types import CameraModel, MarkerName
 
 MOST_AGE_S = 0.5
 """Since the target was last measured; after that what shows a part of it is no evidence."""
@@ -46,50 +45,29 @@ _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its 
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Make what `cut_markers` keeps of a target and a camera, before it is in a hurry."""
-    drawing = patterns["large"].drawing
-    outline_of(drawing), texture_of(drawing), lattice_of(camera)
+    """Make what `cut_markers` keeps, before it is in a hurry."""
+    _outline(patterns), texture_of(patterns["large"].drawing), lattice_of(camera)
 
 
 def is_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """Return True if none of the markers expected at corners (4, 2) px is wholly in the picture and
-    free of the vehicle's gear, or may not be if the prediction is a little off."""
-    h, w = shape[:2]
-    inner = (h - 2 * _EDGE_PX, w - 2 * _EDGE_PX)
-    whole = [c for c in expected.values() if within(c - _EDGE_PX, inner)]
+    """Return True if none of the expected markers (4, 2) px is surely in the picture and free of
+    the vehicle's gear."""
+    whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(hides(hidden, c) for c in whole)
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
-    """Return True if one of the markers expected at corners (4, 2) px is wholly in the picture, or
-    may be if the prediction is a little off: a search finds no others."""
-    h, w = shape[:2]
-    outer = (h + 2 * _EDGE_PX, w + 2 * _EDGE_PX)
-    return any(within(corners + _EDGE_PX, outer) for corners in expected.values())
-
-
-def measured_lately(previous: Detections | None, t_s: float) -> bool:
-    """Return True if the target was measured so short a time ago that a part of it is known
-    again."""
-    if previous is None or not previous.markers:
-        return False
-    return 0.0 < t_s - previous.t_s <= MOST_AGE_S
+    """Return True if one of the expected markers (4, 2) px may be wholly in the picture."""
+    return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
 
 
 def cut_markers(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    patterns: Mapping[MarkerName, Pattern],
-    camera: CameraModel,
-    hidden: Covered | None = None,
+    picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker that what is in view of the target stands for, or none.
-
-    `expected` are corners (4, 2) px, of one marker at least; `hidden` (h, w) is where the vehicle's
-    own gear covers the picture.
-    """
+    """Return the marker that what is in view stands for; `expected` are corners (4, 2) px."""
+    image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
     start = _start(expected, ratio, camera)
@@ -97,13 +75,12 @@ def cut_markers(
         return {}
     if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_CELL_PX:
         return {}
-    covered = None if hidden is None else hidden.astype(np.uint8)
-    view = overview_of(image, camera, covered)
-    outline, texture = outline_of(drawing), texture_of(drawing)
+    covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
+    view, texture = overview_of(image, camera, covered), texture_of(drawing)
     near = _moved_near(start, texture, view)
     if near is None:
         return {}
-    found = fitted(image, near, outline, _print_sigma(patterns), camera, covered)
+    found = fitted(image, near, _outline(patterns), camera, covered)
     if found is None or not _trusted(found):
         return {}
     like, gain = looks_like(found.pose.H, texture, view)
@@ -121,11 +98,10 @@ def shows_enough_of_target(
     marker's axes (3, 3) and centre (3,) so in the camera."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
-    drawing = patterns["large"].drawing
-    found = foreseen(pose, outline_of(drawing), _print_sigma(patterns), camera)
+    found = foreseen(pose, _outline(patterns), camera)
     if found is None or not _trusted(found):
         return False
-    half = drawing.ratio if _stands_for(found) == "small" else 1.0
+    half = patterns["large"].drawing.ratio if _stands_for(found) == "small" else 1.0
     return _corners(found, half, camera) is not None
 
 
@@ -135,11 +111,10 @@ def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
     return make_aruco_detector(DetectorConfig(), target).patterns
 
 
-def _print_sigma(patterns: Mapping[MarkerName, Pattern]) -> Array:
-    """Return how far the line at each place of the outline may be printed off its place, (n,)."""
-    outline = outline_of(patterns["large"].drawing)
-    small, large = (patterns[name].rim.tolerance for name in ("small", "large"))
-    return np.where(outline.small, small, large) * outline.cell
+def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
+    """Return the outline of both markers, as they are printed."""
+    large, small = patterns["large"], patterns["small"]
+    return outline_of(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
 
 def _stands_for(found: Visible) -> MarkerName:
@@ -150,43 +125,43 @@ def _stands_for(found: Visible) -> MarkerName:
 def _start(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    """Return the pose that goes with expected corners. The small marker's are nearer to the
-    picture, where the lens is known; its own are preferred."""
+    """Return the pose that goes with expected corners."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
     if not np.isfinite(rays).all():
         return None
     half = ratio if name == "small" else 1.0
     H = cv2.getPerspectiveTransform((half * UNIT).astype(np.float32), rays.astype(np.float32))
-    if not np.isfinite(H).all():
-        return None
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
-    if scale < 1e-9:
+    if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
         return None
     H = np.asarray(H, dtype=np.float64) / math.copysign(scale, H[2, 2])
-    if H[2, 2] <= 0.0:
-        return None
     U, _, V = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
     R = np.asarray(U @ V, dtype=np.float64)
     return RigidPose(R, np.asarray(H[:, 2])) if np.linalg.det(R) > 0.0 else None
 
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
-    """Return the prediction moved to where the picture goes best with the drawing, None if it does
-    nowhere near."""
-    best, pose = _MIN_GLANCE, None
+    """Return the prediction moved to where the picture is like it, if it is."""
+    best, pose, lattice = _MIN_GLANCE, None, view.lattice
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
-        drift, glance = drift_of(RigidPose(start.R, t).H, texture, view)
-        if glance > best:
-            best, pose = glance, RigidPose(start.R, t + np.append(drift * t[2], 0.0))
+        wide = drawn_over(RigidPose(start.R, t).H, texture, lattice, _SEARCHED)
+        mask = view.seen.astype(np.float32)
+        score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
+        score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
+        row, column = np.unravel_index(int(score.argmax()), score.shape)
+        drift = (_SEARCHED - np.array([column, row], dtype=np.float64)) * lattice.step
+        if score[row, column] > best:
+            best = float(score[row, column])
+            pose = RigidPose(start.R, t + np.append(drift * t[2], 0.0))
         if best > _GOOD_GLANCE:
             break
     return pose
 
 
 def _trusted(found: Visible) -> bool:
-    """Return True if nearly all edges in view are there, and tell enough of where the target is."""
+    """Return True if nearly all edges are there, and tell enough of the place."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.shown >= _MIN_SHOWN * found.in_view
@@ -196,12 +171,18 @@ def _trusted(found: Visible) -> bool:
 
 
 def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
-    """Return the corners of the marker of that half side; None where the lens model does not reach
-    as far."""
-    found_at = corners_of(found.pose, half, camera)
-    if found_at is None:
-        return None
-    x, J = found_at
+    """Return the corners of the marker of that half side, if the lens reaches."""
+    r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
+    X = r + found.pose.t
+    if X[:, 2].min() <= 0.0:
+        return None  # one is beside or behind the camera
+    x = X[:, :2] / X[:, 2:]
+    J = np.zeros((8, 6))  # pixels of a pinhole, with turn and move
+    for k in range(4):
+        P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
+        P = camera.K[:2, :2] @ P
+        J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
+        J[2 * k : 2 * k + 2, 3:] = P
     corners_px = distort(x, camera)
     if not np.abs(undistort(corners_px, camera) - x).max() < _INVERTED:
         return None
@@ -211,8 +192,6 @@ def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners
 
 
 # --- A picture at a glance: small, through a pinhole, beside what a drawing would look like there
-# It tells how far a prediction is off, and whether the picture looks like the drawing, where
-# too little of a marker is in view for its corners.
 
 
 Grey = NDArray[np.float32]
@@ -228,10 +207,9 @@ _LEAST_NODES = 200  # that show paper
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a pinhole's picture, `step` apart in normalised coordinates, the first at
-    `first`; how far from the axis the picture `reaches`, beyond which a lens model may fold
-    back; where the samples that make up a node are read in the reduced picture, which has
-    `size` (width, height); and the nodes that are in the picture (rows, columns)."""
+    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on; how far
+    from the axis the picture `reaches`, beyond which a lens model may fold back; where a node's
+    samples are read in the reduced picture of `size` (width, height); and which nodes are in it."""
 
     first: Array
     step: float
@@ -244,8 +222,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """Grey values at a lattice's nodes (rows, columns), and which of them are the picture's and
-    not covered."""
+    """Grey values at a lattice's nodes (rows, columns), and which are seen."""
 
     lattice: Lattice
     grey: Grey
@@ -291,7 +268,7 @@ def lattice_of(camera: CameraModel) -> Lattice:
 def overview_of(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """Return a picture at a glance; what `mask` (its shape, 0: free) covers is not seen."""
+    """Return a picture at a glance, where `mask` (its shape) is 0."""
     lattice = lattice_of(camera)
     seen = lattice.inside
     if mask is not None:
@@ -314,8 +291,8 @@ def _coarse(fine: Grey) -> Grey:
 
 
 def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the whiteness of the drawing at the lattice's nodes and `margin` more all around; H
-    (3, 3) maps own coordinates to normalised ones."""
+    """Return the whiteness of the drawing through H (3, 3) at the nodes and `margin` more
+    around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -336,22 +313,9 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
     return _coarse(np.asarray(fine, np.float32))
 
 
-def drift_of(H: Array, texture: Texture, view: Overview) -> tuple[Array, float]:
-    """Return how far the picture is from the drawing through H, (2,) normalised, to a node; and the
-    correlation there."""
-    lattice = view.lattice
-    wide = drawn_over(H, texture, lattice, _SEARCHED)
-    mask = view.seen.astype(np.float32)
-    score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
-    score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
-    row, column = np.unravel_index(int(score.argmax()), score.shape)
-    drift = (_SEARCHED - np.array([column, row], dtype=np.float64)) * lattice.step
-    return drift, float(score[row, column])
-
-
 def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Return the likeness of the picture with the drawing through H in its best light, where there
-    is paper; and that light's gain, grey levels from black to white."""
+    """Return the likeness of the picture with the drawing through H in its best light, and that
+    light's gain, grey levels from black to white."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -363,15 +327,10 @@ def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
-    gain = float(light[3])
-    if not math.isfinite(gain):
-        return 0.0, 0.0
-    return likeness(grey, grey - A @ light), gain
+    return likeness(grey, grey - A @ light), float(light[3])
 
 
 # --- The drawing of the whole target: its edges between black and white, and its picture ---
-# Both markers share a centre and a plane, so their cells make one drawing, in the large marker's
-# own coordinates (see `perchctl.vision.markers.corners`).
 
 
 PAPER = 1.25  # half sides of the large marker that are surely paper
@@ -383,13 +342,14 @@ _TEXELS = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each
-    lies on (n,), since a line is printed as a whole; the width of the cells beside it (n,); and
-    whether it is the small marker's (n,)."""
+    """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each lies
+    on (n,), and how far that may be printed off (n,); the cells' width beside it (n,); and whether
+    it is the small marker's (n,)."""
 
     at: Array
     normal: Array
     line: NDArray[np.intp]
+    print_sigma: Array
     cell: Array
     small: NDArray[np.bool_]
 
@@ -400,8 +360,8 @@ pixels."""
 
 
 @lru_cache(maxsize=8)
-def outline_of(drawing: Drawing) -> Outline:
-    """Return the outline of a large marker with the small one in its centre."""
+def outline_of(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
+    """Return the outline of both markers; tolerances are in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -414,12 +374,15 @@ def outline_of(drawing: Drawing) -> Outline:
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
     places = np.array([len(each) for each in at])
+    cell = np.repeat(cells, places)
+    small = np.repeat(np.arange(len(edges)) >= large, places)
     return Outline(
         at=np.concatenate(at),
         normal=np.repeat(normals, places, axis=0),
         line=np.repeat([numbers[name] for name in names], places),
-        cell=np.repeat(cells, places),
-        small=np.repeat(np.arange(len(edges)) >= large, places),
+        print_sigma=np.where(small, small_tolerance, large_tolerance) * cell,
+        cell=cell,
+        small=small,
     )
 
 
@@ -438,8 +401,8 @@ def texture_of(drawing: Drawing) -> Texture:
 def _edges(
     cells: Array, half: float, places: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
-    """Return the sides at which a marker's cells (or the paper around it) differ: places along it
-    and its normal, as an `Outline` has them, a name for its line, and the cell's width."""
+    """Return the sides at which cells differ: places along each and its normal, as an `Outline` has
+    them, a name for its line, and the width of the cells."""
     width = 2.0 * half / len(cells)
     s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
     for across in (0, 1):
@@ -456,13 +419,10 @@ def _edges(
 
 
 # --- The target's pose from the edges that are in view, where its markers are cut by the picture
-# The drawing of both markers is laid over the picture: at
-# places along its edges the edge of the picture is looked for across them, and Gauss-Newton
-# turns and moves the drawing until both agree. Its unknowns are those of a rigid body, not those
-# of a homography: a part of a drawing does not show eight of them. What it does not show of the
-# tilt is taken from the prediction, with that one's spread.
-#
-# Lengths are in units of the large marker's half side.
+# At places along the drawing's edges the edge of the picture is looked for across them, and
+# Gauss-Newton turns and moves the drawing until both agree. Its unknowns are a rigid body's: a part
+# of a drawing does not show the eight of a homography, and what it does not show of the tilt is
+# taken from the prediction. Lengths are in units of the large marker's half side.
 
 
 # Of the profiles, by rounds. An ascent blurs edges near the picture's rim by several pixels.
@@ -476,7 +436,7 @@ _TAILS = 1.3  # what robust weights take away from a residual's square
 _LENS_PX = 0.02  # by which a whole line may be off, of lens and light
 _TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
 _SHIFT_PX = 0.15  # by which white may have grown over black
-_PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, _PLACE, _PLACE, _PLACE]) ** -2.0
+_PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT_PX]) ** -2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,9 +454,8 @@ class RigidPose:
 
 @dataclass(frozen=True, eq=False)
 class Visible:
-    """A pose with its covariance (6, 6) of turn and move; how many places along edges were in
-    view, how many showed their edge, how many of these are the small marker's; and the spread
-    of a single place."""
+    """A pose with its covariance (6, 6) of turn and move; how many places were in view, how many
+    showed their edge, how many of these are the small marker's; and the spread of one."""
 
     pose: RigidPose
     cov: Array
@@ -509,8 +468,8 @@ class Visible:
 @dataclass(frozen=True, eq=False)
 class _Places:
     """Of an outline, in the picture: at (n, 2) px and unit normal (n, 2) from black to white,
-    changes J (n, 6) along it with turn and move, px for a unit across (n,), and which of the
-    outline's they are (n,)."""
+    changes J (n, 7) along it with turn, move and the shift of all edges (white over black), px for
+    a unit across (n,), and which of the outline's they are (n,)."""
 
     at: Array
     normal: Array
@@ -519,32 +478,20 @@ class _Places:
     index: NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
-class _Round:
-    """The step of all unknowns (7,), the inverse of their normal matrix, the places' weights
-    (n,) and changes J (n, 7), and the variance of one place, px^2."""
-
-    step: Array
-    inverse: Array
-    weight: Array
-    J: Array
-    variance: float
+_Round = tuple[Array, Array, Array, float]
+"""The step of all unknowns (7,), the inverse of their normal matrix, the places' weights (n,), and
+the variance of one place, px^2."""
 
 
 def fitted(
     image: NDArray[np.uint8],
     start: RigidPose,
     outline: Outline,
-    print_sigma: Array,
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> Visible | None:
-    """Fit the pose in which the outline's edges are the picture's, from one a few pixels off.
-
-    `print_sigma` (n,) is how far each place's line may be printed off its place. None where too few
-    edges are in view, or the fit breaks down.
-    """
-    pose, total, found, moved_px = start, np.zeros(6), None, math.inf
+    """Fit the pose in which the outline's edges are the picture's."""
+    pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
         if len(places.index) < _LEAST_PLACES:
@@ -556,26 +503,26 @@ def fitted(
         found = _solved(places, offset_px, shows, total)
         if found is None:
             return None
-        turn = np.asarray(cv2.Rodrigues(found.step[:3])[0], dtype=np.float64)
-        pose, total = RigidPose(turn @ pose.R, pose.t + found.step[3:6]), total + found.step[:6]
-        moved_px = float(np.abs(places.J @ found.step[:6]).max())
+        step = found[0][:6]
+        turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
+        pose = RigidPose(turn @ pose.R, pose.t + step[3:])
+        total[:6] += step
+        moved_px = float(np.abs(places.J[:, :6] @ step).max())
         if moved_px < _STILL_PX:
             break
     if found is None or moved_px > _SETTLED_PX or pose.t[2] <= 0.0:
         return None
-    return _visible(pose, found, places, outline, print_sigma)
+    return _visible(pose, found, places, outline)
 
 
-def foreseen(
-    pose: RigidPose, outline: Outline, print_sigma: Array, camera: CameraModel
-) -> Visible | None:
-    """Return what `fitted` would make of a picture without a flaw, taken in that pose."""
+def foreseen(pose: RigidPose, outline: Outline, camera: CameraModel) -> Visible | None:
+    """Return what `fitted` would make of a flawless picture in that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
         return None
-    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(6))
-    return None if found is None else _visible(pose, found, places, outline, print_sigma)
+    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
+    return None if found is None else _visible(pose, found, places, outline)
 
 
 def _in_view(
@@ -586,7 +533,7 @@ def _in_view(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None,
 ) -> _Places:
-    """Return the places at which a whole profile is in the picture, and not covered."""
+    """Return the places at which a whole profile is in view."""
     h, w = shape[:2]
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
@@ -626,20 +573,14 @@ def _in_view(
         for way in (-1.0, -0.5, 0.0, 0.5, 1.0):
             x_px, y_px = np.rint(at + way * reach_px * normal).astype(np.intp).T
             free &= mask[y_px, x_px] == 0
-    return _Places(
-        at=at[free],
-        normal=normal[free],
-        J=np.concatenate([turn, move], axis=1)[free],
-        px=np.abs(px)[free],
-        index=near[free],
-    )
+    J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
+    return _Places(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
 
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return how far along its normal each place's edge is in the picture, (n,) px, and whether
-    there is one from dark to bright."""
+    """Return how far along its normal each place's edge is (n,) px, if it is."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -656,13 +597,9 @@ def _offsets(
 def _solved(
     places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
 ) -> _Round | None:
-    """Return a robust step of turn, move and the common shift of edges (white over black)."""
-    J = np.concatenate([places.J, -np.ones((len(offset_px), 1))], axis=1)
-    prior = np.append(_PRIOR, _SHIFT_PX**-2.0)
-    pull = np.append(-_PRIOR * total, 0.0)
-    weight = shows.astype(np.float64)
-    variance = 1.0
-    step = np.zeros(7)
+    """Return a robust step, after those before, in `total` (7,)."""
+    J, weight = places.J, shows.astype(np.float64)
+    variance, step = 1.0, np.zeros(7)
     for _ in range(4):
         error = offset_px - J @ step
         size = np.abs(error)
@@ -672,30 +609,21 @@ def _solved(
         if mass < 0.5 * _LEAST_PLACES:
             return None
         variance = max(_TAILS * float(weight @ error**2) / mass, 1e-3)
-        N = (J * weight[:, None]).T @ J / variance + np.diag(prior)
-        try:
-            inverse = np.linalg.inv(N)
-        except np.linalg.LinAlgError:
-            return None
-        step = inverse @ (J.T @ (weight * offset_px) / variance + pull)
-        if not np.isfinite(step).all():
-            return None
-    return _Round(step, inverse, weight, J, variance)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(_PRIOR)
+        inverse = np.asarray(np.linalg.inv(N), np.float64)
+        step = inverse @ (J.T @ (weight * offset_px) / variance - _PRIOR * total)
+    return step, inverse, weight, variance
 
 
-def _visible(
-    pose: RigidPose, found: _Round, places: _Places, outline: Outline, print_sigma: Array
-) -> Visible:
-    """Return the pose with its covariance: of each place's own noise, of what moves a line as a
-    whole, and of the prediction."""
-    J, w, variance = found.J, found.weight, found.variance
+def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> Visible:
+    """Return the pose with its covariance."""
+    J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
-    common_px = np.hypot(print_sigma[places.index] * places.px, _LENS_PX)
+    common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
-    prior = np.diag(np.append(_PRIOR, _SHIFT_PX**-2.0))
-    cov = found.inverse @ (middle / variance**2 + prior) @ found.inverse
+    cov = inverse @ (middle / variance**2 + np.diag(_PRIOR)) @ inverse
     shown = w > 0.0
     return Visible(
         pose=pose,
@@ -705,20 +633,3 @@ def _visible(
         small=int(np.count_nonzero(shown & outline.small[places.index])),
         residual_px=math.sqrt(variance),
     )
-
-
-def corners_of(pose: RigidPose, half: float, camera: CameraModel) -> tuple[Array, Array] | None:
-    """Return the corners (4, 2) of the square of that half side, normalised, and their changes (8,
-    6) with turn and move, pixels of a pinhole; None where one is beside or behind the camera."""
-    r = np.column_stack([half * UNIT, np.zeros(4)]) @ pose.R.T
-    X = r + pose.t
-    if X[:, 2].min() <= 0.0:
-        return None
-    x = X[:, :2] / X[:, 2:]
-    J = np.zeros((8, 6))
-    for k in range(4):
-        P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
-        P = camera.K[:2, :2] @ P
-        J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
-        J[2 * k : 2 * k + 2, 3:] = P
-    return x, J

@@ -5,43 +5,39 @@
 3. by a search in a window around that place, then in the whole picture (`search`);
 4. where blur may hide them (`blurred`).
 
-A marker of which the picture's edge, light that glares, or the vehicle's own gear (`detector`)
-hides a part is measured by what is seen of it (`partial`). Each step takes place within the same
-frame, and only where the one before saw too little.
+A marker of which a part is hidden is measured by what is seen of it (`partial`). Each step takes
+place within the same frame, and only where the one before saw too little.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.profile import DetectorConfig
 from perchctl.values import replace
 from perchctl.vision.fields import halves, interpolated_sigma_px
 from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import (
     NESTED_SIGMA_PX,
     RefinedCorners,
-    known_from,
     mean_side_px,
-    nested,
-    shortest_side_px,
+    refine_each,
     side_lengths_px,
     with_missing_marker,
     within,
 )
 from perchctl.vision.markers.cut import (
+    MOST_AGE_S,
     cut_markers,
     is_cut,
     may_be_whole,
-    measured_lately,
 )
-from perchctl.vision.markers.detector import Covered, DetectorSetup, filled, hidden_in, hides
-from perchctl.vision.markers.edge_fit import refine, refine_lines
+from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_in, hides
+from perchctl.vision.markers.edge_fit import refine_lines
 from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen
 from perchctl.vision.markers.pattern import (
     LEAST_SIDE_PX,
@@ -51,7 +47,7 @@ from perchctl.vision.markers.pattern import (
     resembles,
 )
 from perchctl.vision.markers.search import Found, Look, search, search_halved
-from perchctl.vision.target_selection import TargetSelector
+from perchctl.vision.target_selection import AsideOf
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -64,6 +60,7 @@ from perchctl.vision.types import (
 )
 
 _SEARCHED_SIDE_PX = 13.0  # smaller markers are not found by a search
+_SHIFT_PICTURES = 5  # for which a measured shift of all edges holds: light changes slowly
 _Seen = dict[MarkerName, RefinedCorners]
 
 
@@ -74,30 +71,28 @@ def detect_markers(
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: TargetSelector | None = None,
+    own: AsideOf | None = None,
 ) -> Detections:
-    """Find and refine the target's markers in one frame.
-
-    `previous` is what an earlier frame gave (the last one that saw something is best);
-    it gives the place to look at first and decides between look-alikes. `expected` are better
-    predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
-    `empty_frames` is how many frames in a row have shown nothing: in a stream the searches take
-    turns by it, since all of them in one frame take longer than a frame may. None searches by
-    all. `own` chooses among several targets where none is expected. In a frame of two fields each
-    is looked at, and the result is the mean: where the markers were at the frame's own time.
-    """
+    """Find and refine the target's markers in one frame. `previous` is what the last frame that saw
+    something gave: it gives the place to look at first, where no corners (4, 2) px are `expected`
+    by the vehicle's motion. `empty_frames` is how many frames in a row have shown nothing: in a
+    stream the searches take turns by it; None searches by all. `own` chooses among several targets
+    where none is expected. Of a frame of two fields the result is the mean."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     both = with_missing_marker(expected, setup.ratio, camera)
-    look = _look(empty_frames, bool(expected), setup)
+    look = _look(empty_frames, bool(expected), setup.by_lines)
     turn = None
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
-    lately = measured_lately(previous, frame.t_s)
-    was_cut = False
-    if previous is not None and lately and setup.cut:
-        last = {each.marker: each.corners_px for each in previous.markers}
-        was_cut = not may_be_whole(last, frame.image.shape)
-    shift = known_from(None if previous is None else previous.edge_shift)
+    # A part of the target is known again where it was measured a short time ago.
+    last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
+    lately = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
+    lately = lately and setup.by_lines and bool(last)
+    was_cut = lately and not may_be_whole(last, frame.image.shape)
+    shift = None if previous is None else previous.edge_shift
+    if shift is not None:
+        age = shift.age + 1
+        shift = replace(shift, age=age) if age < _SHIFT_PICTURES else None
 
     def detected(frame: Frame) -> Detections:
         """Return what is in a frame of one moment."""
@@ -105,26 +100,27 @@ def detect_markers(
         image = frame.image if hidden is None else filled(frame.image, hidden)
         picture, found = Picture(image, hidden, setup, camera), Found()
         seen: _Seen = {}
-        if look != "fits" and setup.config.window and both and setup.by_lines:
+        if look != "fits" and both and setup.by_lines:
             seen, found = _followed(picture, both, shift)
-        if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
-            seen = cut_markers(image, expected, setup.patterns, camera, hidden)
+        if not seen and lately and is_cut(both, image.shape, hidden):
+            seen = cut_markers(picture, expected)
         findable = not was_cut or may_be_whole(both, image.shape)
         if look not in ("blurred", "fits") and (
             (not seen and findable) or _missing(picture, seen, expected)
         ):
-            found = search(image, expected, setup, look, own)
+            found = search(picture, expected, look, own)
             if len(found.corners_px) >= len(seen):
                 seen = _refined(picture, found)
-        if not seen and look not in ("sharp", "window") and setup.blurred:
-            seen = _in_blur(picture, expected, turn)
+        if not seen and look not in ("sharp", "window") and setup.by_lines:
+            bare = replace(picture, hidden=None)
+            seen = expected_in_blur(bare, expected, turn) if expected else hidden_in_blur(bare)
+            seen = improved(bare, seen)
         shifts = (r.edge_shift for r in seen.values())
         return Detections(
             frame_index=frame.index,
             t_s=frame.t_s,
             large=_detection("large", seen, frame.fields),
             small=_detection("small", seen, frame.fields),
-            full_frame=found.full_frame,
             mirrored=found.mirrored and not seen,
             targets=found.targets,
             edge_shift=next((each for each in shifts if each is not None), None),
@@ -135,65 +131,31 @@ def detect_markers(
     return with_motion(detected(frame), previous)
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
-    where something else is before the target; None: nowhere."""
-
-    image: NDArray[np.uint8]
-    hidden: Covered | None
-    setup: DetectorSetup
-    camera: CameraModel
-
-    def seen_partly(
-        self,
-        name: MarkerName,
-        start_px: Array,
-        known_by: KnownBy,
-        shift: EdgeShift | None = None,
-    ) -> RefinedCorners | None:
-        """Return the marker near to `start_px` (4, 2) by what is seen of it
-        (`partial.seen_partly`)."""
-        pattern = self.setup.patterns[name]
-        return seen_partly(self.image, start_px, pattern, self.camera, known_by, self.hidden, shift)
-
-    def nested(self, corners_px: Array, name: MarkerName) -> Array:
-        """Return where the other marker's corners (4, 2) put those of this one."""
-        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
-        return nested(corners_px, ratio, self.camera)
-
-
-def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
+def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
     """Return how to search this frame. After a loss the place where the target should be and the
     whole picture take turns, and there the search and the fits of a blurred target do; later a
-    sharp target and, in every Nth frame, a blurred one. The first frame without it may only be
-    blurred: that has both."""
+    sharp target and a blurred one. The first frame without it has both."""
     if empty_frames is None:
         return "all"
-    fits = setup.blurred
-    if expected and setup.config.window:
-        if empty_frames % 2:
-            return "sharp"
-        if empty_frames == 0 or not fits:
+    if not by_lines or (expected and empty_frames % 2):
+        return "sharp"
+    if expected:
+        if empty_frames == 0:
             return "near"
         return "fits" if empty_frames % 4 else "window"
-    if not fits:
-        return "sharp"
-    if setup.config.blurred_every == 1:
-        return "all"
     # At 0 something was seen, though not where the target should be.
-    return "blurred" if empty_frames and empty_frames % setup.config.blurred_every == 0 else "sharp"
+    every = DetectorConfig.blurred_every
+    return "blurred" if empty_frames and empty_frames % every == 0 else "sharp"
 
 
 def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Seen, Found]:
     """Return what is where both are expected, or nearby: where no side was met, a near target has
-    most often moved on further than a side is looked for, and a look around costs less than to fit
-    what may be seen of it in the old place."""
+    most often moved on further than a side is looked for."""
     seen = follow(picture, expected, shift)
     if not seen:
-        found = search_halved(picture.image, expected, picture.setup)
+        found = search_halved(picture, expected)
         again = {} if found is None else _refined(picture, found)
         if found is not None and again:
             return again, found
@@ -204,8 +166,7 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
-    """Return True if a marker that should be in the picture, and not hidden, was not verified,
-    other than one too far away to be found by a search."""
+    """Return True if a marker that should be found was not verified."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -216,26 +177,26 @@ def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]
 
 
 def _refined(picture: Picture, found: Found) -> _Seen:
-    """Return what the search found, by the profile's refinement. Those without four lines for sides
-    are measured by what of these is seen: a search takes the picture's edge for the side of a
-    marker that is cut off there."""
+    """Return what the search found with better corners. Those without four lines for sides are
+    measured by what of these is seen: a search takes the picture's edge for a side."""
     image, setup = picture.image, picture.setup
-    names = [name for name in MARKERS if name in found.corners_px]
-    raw = np.array([found.corners_px[name] for name in names]).reshape(-1, 4, 2)
-    rims = [setup.patterns[name].rim for name in names]
-    refined = refine(image, raw, rims, picture.camera, setup.config.refinement)
-    seen = dict(zip(names, refined, strict=True))
+    raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
+    lines = fit_lines(picture, raw) if setup.by_lines else {}
+    seen = {
+        name: lines.get(name) or refine_each(image, corners, setup.patterns[name].rim.cells)
+        for name, corners in raw.items()
+    }
     if not setup.by_lines:
         return seen
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
-        if r.refined and wholly_seen(r, image.shape, picture.hidden):
+        if r.refined and wholly_seen(picture, r):
             continue
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
             starts.insert(0, picture.nested(small.corners_px, "large"))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        tried = (picture.seen_partly(name, start, known_by) for start in starts)
+        tried = (seen_partly(picture, name, start, known_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
@@ -246,18 +207,8 @@ def _refined(picture: Picture, found: Found) -> _Seen:
     return improved(picture, fitted, searched=True)
 
 
-def _in_blur(picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None) -> _Seen:
-    """Return what only the drawing shows: near to where it is expected, or anywhere."""
-    image, setup, camera = picture.image, picture.setup, picture.camera
-    if expected:
-        seen = expected_in_blur(image, expected, setup.patterns, camera, turn)
-    else:
-        seen = hidden_in_blur(image, setup, camera)
-    return improved(replace(picture, hidden=None), seen)
-
-
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
-    """Return the marker's detection in a picture of that kind, None where it was not seen."""
+    """Return the marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -282,39 +233,34 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """Return the last corners (4, 2) px, moved on as they moved before; empty if there are none."""
+    """Return the last corners (4, 2) px, moved on as they moved before."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
     moves = 0.0 < gap_s <= _MAX_GAP_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
-        flow = previous.flow_px_s.get(d.marker, previous.velocity_px_s)
+        flow = previous.flow_px_s.get(d.marker)
         corners[d.marker] = d.corners_px + (flow * gap_s if moves and flow is not None else 0)
     return corners
 
 
 def with_motion(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with velocity_px_s and flow_px_s, where markers were seen a short time
-    before."""
-    if previous is None:
-        return now
-    gap_s = now.t_s - previous.t_s
-    if not 0.0 < gap_s <= _MAX_GAP_S:
+    """Return `now` with the flow of its markers since a short time before."""
+    if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
     flow: dict[MarkerName, Array] = {}
     for name in MARKERS:
         a, b = previous.get(name), now.get(name)
         if a is not None and b is not None:
-            flow[name] = (b.corners_px - a.corners_px) / gap_s
+            flow[name] = (b.corners_px - a.corners_px) / (now.t_s - previous.t_s)
     if not flow:
         return now
-    first = next(iter(flow.values()))
-    return replace(now, velocity_px_s=_QUARTERS @ first, flow_px_s=flow)
+    mean = _QUARTERS @ next(iter(flow.values()))
+    return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
-# --- What lines alone left vague, or one of the two markers unseen: measured by the drawing, ---
-# where the other marker puts it.
+# --- What lines left vague or unseen, by the drawing --------------------
 
 
 _GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster
@@ -324,8 +270,7 @@ _REACH = 0.3  # of the side
 _MAX_SIGMA_ALONE, _MAX_SIGMA = 0.06, 0.12  # of the side
 _BLUR_PX = 1.5  # to start with, where it is not known
 _ACROSS_PX = 0.37
-"""Sigma. Sides have a pixel's own width and that of reading it in their blur, the drawing has not:
-0.81 px where it settles at 0.72, of far markers in flight."""
+"""Sigma: sides have the width of pixels and of reading them in their blur, a drawing has not."""
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
@@ -337,10 +282,8 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
 
 def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
     """Return the markers that were seen, with better corners and with the other marker if it shows.
-
-    A drawing is not laid over what is hidden. What a search found, its bits read one by one,
-    stays only where lines suffice, the drawing confirms it, or the other marker was seen with
-    it."""
+    What a search found stays only where lines suffice, the drawing confirms it, or the other marker
+    was seen with it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = around(picture, better["small"])
@@ -352,16 +295,8 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
             continue
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
-        exact = aligned(
-            image,
-            start,
-            patterns[name],
-            picture.camera,
-            _REACH,
-            _blur_px(better.get(name)),
-            max_sigma=max_sigma,
-            alone=alone,
-        )
+        blur_px = _blur_px(better.get(name))
+        exact = aligned(picture, name, start, _REACH, blur_px, max_sigma, alone)
         if exact is not None:
             better[name] = exact
         elif alone and searched:
@@ -372,16 +307,14 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """Return the blur of the sides, where lines were fitted: the fit of the drawing gets there
-    sooner."""
+    """Return the blur to start with: of the sides, where lines were fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
-    """Return the corners (4, 2) px from which the drawing should be aligned, None where that is of
-    no use."""
+    """Return the corners (4, 2) px from which to align the drawing, if any."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -396,39 +329,40 @@ def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
 
 
 # --- Markers where they are expected: no search, only verification ----
-# Sides are fitted at the predicted corners, and every cell is read through the result's
-# homography: a strict check (all cells right, none nearly wrong) at a tenth of the price of
-# a search.
 
 
 _LEAST_CELL_PX = 2.5  # for lines
 _ANCHOR = 0.12  # of the small marker's side
 
 
+def fit_lines(
+    picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
+) -> _Seen:
+    """Return the markers near to corners (4, 2) px that have lines for sides."""
+    if not places:
+        return {}
+    rims = [picture.setup.patterns[name].rim for name in places]
+    raw = np.array(list(places.values()))
+    fitted = refine_lines(picture.image, raw, rims, picture.camera, shift)
+    return {name: found for name, found in zip(places, fitted, strict=True) if found is not None}
+
+
 def follow(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
-    """Return the expected markers (corners (4, 2) px) that are verified by all sides and cells;
-    `shift` is what was measured of the edges in an earlier picture."""
+    """Return the expected markers that are verified by all sides and cells."""
     image, patterns = picture.image, picture.setup.patterns
-    names = [
-        name
+    places = {
+        name: expected[name]
         for name in MARKERS
         if name in expected
         and within(expected[name], image.shape, ROOM_PX)
-        and shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].rim.cells
-    ]
-    if not names:
-        return {}
-    raw = np.array([expected[name] for name in names])
-    rims = [patterns[name].rim for name in names]
-    fitted = refine_lines(image, raw, rims, picture.camera, shift)
+        and side_lengths_px(expected[name]).min() > _LEAST_CELL_PX * patterns[name].rim.cells
+    }
     return {
-        name: result
-        for name, result in zip(names, fitted, strict=True)
-        if result is not None
-        and wholly_seen(result, image.shape, picture.hidden)
-        and cells_agree(image, result.corners_px, patterns[name])
+        name: found
+        for name, found in fit_lines(picture, places, shift).items()
+        if wholly_seen(picture, found) and cells_agree(image, found.corners_px, patterns[name])
     }
 
 
@@ -438,15 +372,14 @@ def follow_partly(
     seen: _Seen,
     shift: EdgeShift | None = None,
 ) -> _Seen:
-    """Return the markers of `follow` with those that it did not verify, by what is seen of them.
-    Where the small marker was met, the large one is looked for around it instead of where it was
-    expected."""
+    """Return the markers of `follow` with the others by what is seen of them. Where the small
+    marker was met, the large one is looked for around it."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
         places["large"] = picture.nested(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = picture.seen_partly(name, places[name], "track", shift)
+            partly = seen_partly(picture, name, places[name], "track", shift)
             if partly is not None:
                 seen[name] = partly
     if "large" in seen and "small" not in seen:
@@ -460,9 +393,8 @@ def follow_partly(
 
 
 def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """Return the large marker around a small one that was found: something may cover a part of it,
-    and it may be cut off by the picture's edge, so long as its sides are lines where they are seen
-    and most cells show."""
+    """Return the large marker around a small one that was found, of which a part may be covered or
+    cut off."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
@@ -476,19 +408,15 @@ def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
 
     if within(start, image.shape, ROOM_PX):
         # A small marker gives a rough place; the first fit is where to look closely.
-        found = refine_lines(image, start[None], [pattern.rim], picture.camera)[0]
+        found = fit_lines(picture, {"large": start}).get("large")
         if found is not None:
-            found = refine_lines(image, found.corners_px[None], [pattern.rim], picture.camera)[0]
+            found = fit_lines(picture, {"large": found.corners_px}).get("large")
         if found is not None:
             start = found.corners_px
-        if (
-            found is not None
-            and wholly_seen(found, image.shape, picture.hidden)
-            and is_centred(found)
-            and cells_mostly_agree(image, found.corners_px, pattern)
-        ):
-            return found
-    partly = picture.seen_partly("large", start, "other")
+            good = wholly_seen(picture, found) and is_centred(found)
+            if good and cells_mostly_agree(image, start, pattern):
+                return found
+    partly = seen_partly(picture, "large", start, "other")
     return partly if partly and is_centred(partly) else None
 
 
@@ -499,11 +427,8 @@ _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def between(a: Detections, b: Detections) -> Detections:
-    """Return the mean of both fields' corners, which is right for either order of the fields.
-
-    A marker that only one field shows is left out where the other marker is in both: the
-    two would belong to different moments. Nothing lies between two different targets.
-    """
+    """Return the mean of both fields' corners, which is right for either order of the fields. A
+    marker that only one field shows is left out where the other is in both."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = a.get(name), b.get(name)
@@ -519,8 +444,7 @@ def between(a: Detections, b: Detections) -> Detections:
 
 
 def _middle(a: Detection, b: Detection) -> Detection:
-    """Return the mean of two fields' detections. Each field has its own noise, so the mean is
-    surer than either."""
+    """Return the mean of two fields' detections, each with its own noise."""
 
     def half(one: float, other: float) -> float:
         return float(((one**2 + other**2) / 4.0) ** 0.5)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.vision.markers.corners import nested
 from perchctl.vision.markers.pattern import Pattern, drawing_of, pattern_of, rim_of_bits
-from perchctl.vision.types import Frame, MarkerName
+from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
 _PRINT_M = 1e-6  # of an edge: over its hundreds of dots what each errs by averages out
@@ -35,38 +36,21 @@ _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """What `detect_markers` needs, made once by `make_aruco_detector`; nothing in it changes later.
-
-    `dictionaries` are the large and the small marker's, each with the marker and, behind it
-    (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
-    itself; `patterns` is how each marker looks, `ratio` the small marker's side over the
-    large one's, `mask` what the vehicle covers; `config` is the profile's.
-    """
+    """What `detect_markers` needs, made once by `make_aruco_detector`. `dictionaries` are the large
+    and the small marker's, each with the marker and, behind it (`MIRROR_INDEX`), perhaps its mirror
+    image; `patterns` is how each marker looks, `ratio` the small marker's side over the large
+    one's, `mask` what the vehicle covers. `by_lines`: lines are fitted to the sides; else there are
+    no other fits either, and no place is looked at first."""
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
     ratio: float
-    config: DetectorConfig
-    mask: GearMask | None = None
-
-    @property
-    def by_lines(self) -> bool:
-        """True if lines are fitted to the sides; else there are no other fits either."""
-        return self.config.refinement == "line"
-
-    @property
-    def cut(self) -> bool:
-        """True if a target is measured of which the picture cuts both markers."""
-        return self.config.cut and self.by_lines
-
-    @property
-    def blurred(self) -> bool:
-        """True if drawings are laid over pictures that show no edges."""
-        return self.config.blurred and self.by_lines
+    by_lines: bool
+    mask: Covered | None = None
 
 
 def make_aruco_detector(
-    config: DetectorConfig, target: TargetConfig, mask: GearMask | None = None
+    config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
 ) -> DetectorSetup:
     """Return dictionaries of just the target's ids, and how its markers look."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
@@ -87,7 +71,7 @@ def make_aruco_detector(
             ),
         },
         ratio=ratio,
-        config=config,
+        by_lines=config.refinement == "line",
         mask=mask,
     )
 
@@ -95,8 +79,7 @@ def make_aruco_detector(
 def make_marker_decoder(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
-    """Return OpenCV's detector of markers that it can decode, for one pass over a picture of that
-    size. Making one takes about a microsecond, a pass a thousand times as long."""
+    """Return OpenCV's detector of markers for a pass."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
     parameters.minDistanceToBorder = 0
@@ -107,8 +90,7 @@ def make_marker_decoder(
 
 
 def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
-    """Return OpenCV's detector, set so that it takes nearly any quadrilateral for a candidate, for
-    blurred pictures: round corners, wide dark borders, small sides."""
+    """Return OpenCV's detector, set to take nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -127,9 +109,10 @@ def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
 
 
 def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
-    """Return a dictionary of the marker and, where these cannot be confused, its mirror image."""
+    """Return a dictionary of the marker and perhaps its mirror image."""
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
-    if _distance(mirror, bits) > 2 * correction_bits + 1:
+    distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
+    if distance > 2 * correction_bits + 1:
         patterns.append(mirror)
     rows = [cv2.aruco.Dictionary.getByteListFromBits(np.ascontiguousarray(p)) for p in patterns]
     return cv2.aruco.Dictionary(
@@ -137,15 +120,9 @@ def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
     )
 
 
-def _distance(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> int:
-    """Return the fewest bits in which a, in any turn, differs from b."""
-    return min(int((np.rot90(a, turn) != b).sum()) for turn in range(4))
-
-
 # --- The vehicle's own gear in the picture: where it is, nothing is to be seen of a target ---
-# Legs and guards do not move in the picture, so what they cover is known (`camera.mask`). There the
-# picture is filled with what is around it, so that no threshold joins the gear to a marker's rim,
-# and no side or cell is measured.
+# The picture is filled there with what is around it, so that no threshold joins the gear to a
+# marker's rim, and no side or cell is measured.
 
 
 Covered = NDArray[np.bool_]
@@ -156,30 +133,16 @@ _REDUCED, _SPREAD = 8, 2.0  # times smaller, and there the spread of what fills
 _TINY = 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class GearMask:
-    """Where the vehicle covers a picture (h, w), and where it has a part in one made of a
-    single field, whose missing rows are interpolated."""
-
-    whole: Covered
-    field: Covered
-
-
-def make_mask(covered: Covered) -> GearMask:
-    """Return the mask, from where the gear is in the picture (h, w)."""
-    rows = np.ones((_FIELD_ROWS, 1), np.uint8)
-    return GearMask(covered, cv2.dilate(covered.astype(np.uint8), rows) > 0)
-
-
-def hidden_in(frame: Frame, mask: GearMask | None) -> Covered | None:
-    """Return where a frame of one moment shows the vehicle."""
-    if mask is None:
-        return None
-    return mask.field if frame.fields in ("top", "bottom") else mask.whole
+def hidden_in(frame: Frame, mask: Covered | None) -> Covered | None:
+    """Return where a frame shows the vehicle, which covers `mask` (h, w) of a whole picture: in a
+    single field, whose missing rows are interpolated, beside it too."""
+    if mask is None or frame.fields not in ("top", "bottom"):
+        return mask
+    return cv2.dilate(mask.astype(np.uint8), np.ones((_FIELD_ROWS, 1), np.uint8)) > 0
 
 
 def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """Return the picture with what is hidden replaced by the mean of what is around it."""
+    """Return the picture with what is hidden replaced by what is around it."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
@@ -195,8 +158,7 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
 
 
 def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """Return True if a part of the marker with these corners (4, 2) is hidden, as far as `reach`
-    half sides from its centre."""
+    """Return True if a part of the marker is hidden, up to `reach` half sides."""
     if hidden is None:
         return False
     h, w = hidden.shape
@@ -212,3 +174,19 @@ def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) 
     inside = np.zeros(part.shape, np.uint8)
     cv2.fillConvexPoly(inside, np.rint(wide - low).astype(np.int32), 1)
     return bool((part & (inside > 0)).any())
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
+    where something is before the target."""
+
+    image: NDArray[np.uint8]
+    hidden: Covered | None
+    setup: DetectorSetup
+    camera: CameraModel
+
+    def nested(self, corners_px: Array, name: MarkerName) -> Array:
+        """Return where the other marker's corners (4, 2) put those of this one."""
+        ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
+        return nested(corners_px, ratio, self.camera)

@@ -1,16 +1,11 @@
 """Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected.
 
-A side is hundreds of gradient samples instead of one point, and a blur that is equal on
-both of its flanks does not move it. So each side's edge points are undistorted, a line is fitted
-to them by total least squares in normalised coordinates, and neighbours are intersected.
+A blur that is equal on both flanks of a side does not move it. So each side's edge points are
+undistorted, a line is fitted to them by total least squares, and neighbours are intersected.
 
-White that is clipped, glares or went through a gamma curve does move edges: all of
-them, from white towards black, by the same number of pixels. The inner edge of a
-marker's border moves the opposite way, so the border's width, known to be one cell,
-gives the shift, and it is taken out.
-
-Where a residual shows that the sides are not lines (blur, occlusion, false
-candidates), each corner is refined on its own (`perchctl.vision.markers.corners`).
+White that is clipped, glares or went through a gamma curve does move edges: all of them, from white
+towards black, by the same number of pixels. The inner edge of a marker's border moves the opposite
+way, so the border's width, known to be one cell, gives the shift, and it is taken out.
 """
 
 from __future__ import annotations
@@ -29,13 +24,11 @@ from perchctl.vision.markers.corners import (
     BEFORE,
     NEXT,
     OUT,
-    RAW_SIGMA_PX,
     UNIT,
     RefinedCorners,
     doubled_area,
     from_unit,
     mapped,
-    refine_each,
     side_lengths_px,
     to_unit,
 )
@@ -43,9 +36,6 @@ from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
 
 # --- Grey profiles across the sides of markers ------------------------
-# They are sampled along each side's image through the lens, so that distortion does not
-# bend the side away from the samples. All rows (a row is one side of one marker) run
-# through the same arrays.
 
 
 PROFILES = 24  # across each side
@@ -67,8 +57,8 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """Return where along sides of these lengths (rows,) the brightness is sampled across them, as
-    shares of the side (rows, n), 0..1; not near the corners, where the next side's blur begins."""
+    """Return where along sides of these lengths (rows,) profiles are, as shares of the side (rows,
+    n): not near the corners, where the next side blurs."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -121,7 +111,7 @@ def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Arra
     return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
 
 
-# --- Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected ---
+# --- Lines fitted to a marker's sides, intersected --------------------
 
 
 MIN_LINE_SIGMA_PX = 0.015
@@ -153,33 +143,6 @@ _PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
 _BOWED = 3.0  # standard deviations
 
 
-def refine(
-    image: NDArray[np.uint8],
-    corners_px: Array,
-    rims: Sequence[Rim],
-    camera: CameraModel,
-    method: str,
-) -> list[RefinedCorners]:
-    """Refine the corners of m markers.
-
-    Args:
-        image: grey picture (h, w).
-        corners_px: raw corners (m, 4, 2), in order around each marker.
-        rims: for each marker what lies inside of its border.
-        method: ``line``, ``subpix`` or ``none`` (the profile's `detector.refinement`).
-    """
-    corners_px = np.asarray(corners_px, dtype=np.float64).reshape(-1, 4, 2)
-    if method == "none":
-        return [RefinedCorners(raw, RAW_SIGMA_PX, False) for raw in corners_px]
-    by_lines: list[RefinedCorners | None] = [None] * len(corners_px)
-    if method == "line" and len(corners_px):
-        by_lines = refine_lines(image, corners_px, rims, camera)
-    return [
-        result if result is not None else refine_each(image, raw, rim.cells)
-        for result, raw, rim in zip(by_lines, corners_px, rims, strict=True)
-    ]
-
-
 def refine_lines(
     image: NDArray[np.uint8],
     raw_px: Array,
@@ -187,10 +150,9 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2); None where residual, inliers, contrast, blur
-    or movement show that these are not a marker's sides. The shift of all edges is measured unless
-    it is known. Wide edges, and those near to the profiles' ends, are looked at twice, the second
-    time with the profiles centred on them."""
+    """Fit lines to the sides of m markers (m, 4, 2); None where these are not a marker's sides. The
+    shift of all edges is measured unless it is known. Wide edges, and those near to the profiles'
+    ends, are looked at twice, the second time with the profiles centred on them."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -212,13 +174,14 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides near to the raw corners, as `refine_lines` does, once."""
+    """Fit lines to the sides near to the raw corners, once."""
     found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = markers_of(raw_px, rims, camera)
     if markers is None:
         return found
     sides, inner = measure(image, markers, camera, with_inner=known is None)
-    clipped = _clipped(sides) > CLIPPED_SHARE
+    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
+    clipped = glaring.reshape(-1, 4) @ _QUARTERS > CLIPPED_SHARE
     if known is not None and clipped.any():
         # How far clipping moves edges changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
@@ -229,7 +192,7 @@ def _refined_once(
         if not finite(corners):
             return found
         shift = _measured_shift(markers, sides, inner, lines, residual_px, corners)
-    applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
+    applied = shift or EdgeShift(0.0, shift_prior_px(float(sides.grey[:, :, -1].mean())))
     if applied.shift_px != 0.0:
         lines = lines.copy()
         lines[:, 2] += _outwards(markers, lines) * (applied.shift_px / markers.px_per_unit)
@@ -238,8 +201,7 @@ def _refined_once(
         return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, residual_px, corners_px)
-    # Variance of the ends of the sides: a line fitted to n samples spreads twice as far there as
-    # in its middle.
+    # A line fitted to n samples spreads twice as far at its ends as in its middle.
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
     ends_px2 = (4.0 * _TAILS * residual_px * residual_px / independent).tolist()
     blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
@@ -263,8 +225,8 @@ def _refined_once(
 
 
 def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
-    """Return the lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, by total least
-    squares on the points of each side; and the weighted RMS distance of these, px (4m,)."""
+    """Return the lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
+    RMS distance of the points from these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -280,7 +242,7 @@ def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
 
 
 def _intersect(lines: Array) -> Array:
-    """Return the corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
+    """Return where side i - 1 of each marker meets side i: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -293,11 +255,9 @@ def _intersect(lines: Array) -> Array:
     return corners
 
 
-def _shift_prior_px(sides: Samples) -> float:
-    """Return how far edges are shifted before that is measured: by white as the camera sees it
-    beyond the sides."""
-    clipped = float(sides.grey[:, :, -1].mean()) > CLIPPED_GREY
-    return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
+def shift_prior_px(white_grey: float) -> float:
+    """Return the spread of a shift that is not measured, by how white paper is."""
+    return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
 def _measured_shift(
@@ -316,7 +276,7 @@ def _measured_shift(
     """
     if inner is None:
         return None
-    k, prior_px = markers.widest, _shift_prior_px(sides)
+    k, prior_px = markers.widest, shift_prior_px(float(sides.grey[:, :, -1].mean()))
     rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
     r = 1.0 - 2.0 / rim.cells
     own = mapped(to_unit(corners[k]), inner.points)
@@ -328,8 +288,7 @@ def _measured_shift(
     some = mass > _MIN_PROFILES
     if not some.any():
         return EdgeShift(0.0, prior_px)
-    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
-    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
+    # A sheet that curls moves outer edges farther than inner ones, and ends farther than middles.
     bent_px = 8.0 * r / (3.0 * rim.cells) * _bow_px(markers, sides, lines, residual_px)
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -352,8 +311,8 @@ def _measured_shift(
 
 
 def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides lie further out than their middles, the
-    mean of its sides, as far as noise does not explain it."""
+    """Return how far the ends of the widest marker's sides lie further out than their middles, as
+    far as noise does not explain it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -365,8 +324,7 @@ def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) 
 
 
 def _outwards(markers: Markers, lines: Array) -> Array:
-    """Return +1 where a line's normal, which may point either way, points out of its marker, else
-    -1, (4m,)."""
+    """Return +1 where a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
@@ -374,50 +332,24 @@ def _outwards(markers: Markers, lines: Array) -> Array:
 
 def _accepted(
     markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
-) -> list[bool]:
-    """Return which of the m markers have lines for sides, near to where they were expected."""
-    inliers = (sides.weight > 0.0).dot(_ONES32)
+) -> NDArray[np.bool_]:
+    """Return which of the m markers have lines for sides, as expected."""
+    inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
-    sharp = sides.blur_px < 0.9 * sides.near_px
-    good = [
-        residual < _MAX_RESIDUAL_PX
-        and count >= _MIN_INLIERS * PROFILES
-        and grey > _MIN_CONTRAST * PROFILES
-        and is_sharp
-        for residual, count, grey, is_sharp in zip(
-            residual_px.tolist(),
-            inliers.tolist(),
-            contrast.tolist(),
-            sharp.tolist(),
-            strict=True,
-        )
-    ]
-    return [
-        cell_px > _MIN_CELL_PX
-        and all(good[4 * i : 4 * i + 4])
-        # False for NaN.
-        and all(math.dist(a, b) < max(1.6, 0.6 * cell_px) for a, b in zip(*both, strict=True))
-        for i, (cell_px, *both) in enumerate(
-            zip(markers.cell_px.tolist(), corners_px.tolist(), markers.raw_px.tolist(), strict=True)
-        )
-    ]
-
-
-def _clipped(sides: Samples) -> Array:
-    """Return the share of the profiles of the m markers that end in clipped white, (m,)."""
-    ends = sides.grey[:, :, -1]
-    if ends.max() <= CLIPPED_GREY:
-        return np.zeros(len(ends) // 4)
-    glaring = np.count_nonzero(ends > CLIPPED_GREY, axis=1) / PROFILES
-    return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
+    lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIERS * PROFILES)
+    lines &= (contrast > _MIN_CONTRAST * PROFILES) & (sides.blur_px < 0.9 * sides.near_px)
+    way = corners_px - markers.raw_px
+    moved_px = np.hypot(way[..., 0], way[..., 1]).max(axis=1)
+    good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
+    return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
 
 
 def _sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
-    """Return the spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
-    `tolerance` that of the print, in cells."""
+    """Return the spread of a marker's corners, by the variance of its sides' ends and the tolerance
+    of the print, in cells."""
     blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
     bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
@@ -430,9 +362,8 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Return the spread of a marker's corners by what shakes a picture's rows, each along itself,
-    as the residuals of its four sides show it: it moves upright sides, both of a marker's alike,
-    and lying ones not. 0 where the marker stands on a corner and nothing shows."""
+    """Return the spread of a marker's corners by what shakes a picture's rows: it moves upright
+    sides and not lying ones."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -445,8 +376,7 @@ def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
 
 
 # --- The sides of markers, measured: the edge's place on profiles across each of them ---
-# A row is one side of one marker: rows 4 i to 4 i + 3 belong to marker i. After all of
-# them the inner edges of one marker's border may follow.
+# Rows 4 i to 4 i + 3 are of marker i; then the inner edges of one marker's border may follow.
 
 
 _MIN_SHIFT_CELL_PX = 6.0  # of a border whose inner edge is measured too
@@ -455,10 +385,10 @@ _SIDES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """What is to be measured: raw_px (m, 4, 2), the same normalised, the lengths of their
-    sides and the width of the cells behind each of them (m, 4), the mean width of a marker's
-    cells (m,), the number of the marker with the widest, +1 or -1 as its corners run (m,), and
-    pixels for a unit of normalised coordinates along each side (4m,)."""
+    """What is to be measured: raw_px (m, 4, 2), the same normalised, the sides' lengths and the
+    width of the cells behind each (m, 4), the mean width of cells (m,), the number of the marker
+    with the widest, +1 or -1 as corners run (m,), and pixels for a normalised unit along sides
+    (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
@@ -484,8 +414,7 @@ class Samples:
 
 
 def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """Return what is to be measured of markers with these raw corners; None where one of them is no
-    square at all."""
+    """Return what is to be measured of markers; None where one is no square."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -513,9 +442,8 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
 def measure(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
-    """Return the edges' places on profiles across all sides; and, on request, across the inner
-    edges of the border with the widest cells, which shows best by how much all edges are shifted.
-    None where these cells are too small."""
+    """Return the edges' places on profiles across all sides and, on request, across the inner edges
+    of the border with the widest cells, if these are wide enough."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -538,36 +466,28 @@ def measure(
     normal *= sign[:, None, None]
     near_px, half_px = (each[of] for each in reaches_px(markers.cell_px))
     grey = sample(image, origin, normal, half_px)
-    edges = locate(grey, half_px, near_px, surroundings(s, markers.rims, rim, depth_px.ravel()))
-    points = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
+    around = surroundings(s, markers.rims, rim, depth_px.ravel())
+    offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
+    points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES, 2)
-    if not finite(points):
-        points = np.nan_to_num(points)
-
-    def part(chosen: slice) -> Samples:
-        return Samples(
-            grey=grey[chosen],
-            near_px=near_px[chosen],
-            points=points[chosen],
-            weight=edges.weight[chosen],
-            blur_px=edges.blur_px[chosen],
-        )
-
+    points = points if finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_px)
-    return part(slice(0, n)), part(slice(n, None)) if with_inner else None
+    sides, inner_edges = (
+        Samples(grey[part], near_px[part], points[part], weight[part], blur_px[part])
+        for part in (slice(0, n), slice(n, None))
+    )
+    return sides, inner_edges if with_inner else None
 
 
 def reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return how far from an edge the window around it and the profile across it reach, by the
-    width of the cells beside it."""
+    """Return how far the windows around edges and the profiles across reach."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> Surroundings:
-    """Return which profiles at places `s` (rows, n) have a neighbouring edge, `depth_px` (rows,)
-    away, and which have an edge: four rows a rim, and then perhaps the border's inner edges of one.
-    """
+    """Return the `Surroundings` of profiles at places `s` (rows, n): four rows a rim, and then
+    perhaps the inner edges of one border."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -584,41 +504,29 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
-# The edge in each profile is the gradient's windowed centroid; this is repeated with the
-# window centred on the side's own line (narrow, hence calm in noise). A blur that is equal
-# on both flanks of an edge does not move its centroid.
-#
-# All that a row (one side of one marker) shares is (rows,), what differs from profile to
-# profile (rows, n). Single precision suffices.
-
-
-def _single(value: float) -> Floats:
-    """Return a number as arrays meet it soonest: beside one of numpy's scalars they take twice as
-    long."""
-    return np.array(value, dtype=np.float32)
+# The edge in each profile is the gradient's windowed centroid, at first by a wide window, then by
+# one that is centred on the side's own line: narrow, hence calm in noise. All that a row (one side
+# of one marker) shares is (rows,), what differs from profile to profile (rows, n).
 
 
 _ALONG32 = ALONG.astype(np.float32)
-_ZERO, _ONE, _TINY = _single(0.0), _single(1.0), _single(1e-9)
-_QUARTER_OF, _MINUS_HALF = _single(0.25), _single(-0.5)
-_WINDOW2, _MOST_SHARE = _single(2.25), _single(0.9)
-_LEAST_MOMENT2, _MOST_MOMENT = _single(0.01), _single(0.8)
-_PER_NEAR = _single(1.0 / 0.6)  # of the wide window's spread
-_TUKEY = _single(3.5 * 1.4826)
+_WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81  # squares of its sigma: of the blur's, and px^2
+_MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
+_PER_NEAR = 1.0 / 0.6  # of the wide window's spread
+_TUKEY = 3.5 * 1.4826
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
 _STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)
-_LEAST_SHARE = _single(0.3)  # of the row's mean gradient, for a profile to count
-_TUKEY_FLOOR_PX = _single(3.5 * 0.05)  # of the scatter that is taken for noise
+_LEAST_SHARE = 0.3  # of the row's mean gradient, for a profile to count
+_TUKEY_FLOOR_PX = 3.5 * 0.05  # of the scatter that is taken for noise
 _ONE_ROUND_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _SETTLED_PX = 0.06
 _ROUNDS = 3
-_LEAST_WINDOW2 = _single(0.81)  # square of its sigma, px^2
-_FAR = _single(1e6)
+_FAR = 1e6
 _QUARTER = PROFILES // 4
 _QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
 # The line through values in the middles of both halves of the profiles, (2, n).
-_SLOPE: Floats = _ALONG32 * _single(0.5 / float(ALONG[PROFILES // 2 :].mean()))
-_THROUGH_HALVES: Floats = np.stack([_single(0.5) - _SLOPE, _single(0.5) + _SLOPE])
+_SLOPE: Floats = _ALONG32 * (0.5 / float(ALONG[PROFILES // 2 :].mean()))
+_THROUGH_HALVES: Floats = np.stack([0.5 - _SLOPE, 0.5 + _SLOPE])
 _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
 
 
@@ -636,26 +544,14 @@ class Surroundings:
     outside: Floats
     possible: NDArray[np.bool_]
 
-    def only(self, kept: NDArray[np.intp]) -> Surroundings:
-        """Return the surroundings of some of the rows."""
-        return Surroundings(
-            self.depth_px[kept], self.inside[kept], self.outside[kept], self.possible[kept]
-        )
 
+def locate(
+    grey: Floats, half_px: Array, near_px: Array, around: Surroundings
+) -> tuple[Array, Array, Array]:
+    """Return where on each profile the edge is that rises along it.
 
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """offset_px: an edge's place along the profile's normal, (rows, n). weight: of the
-    profiles, 0 for outliers, (rows, n). blur_px: of each row, a standard deviation, (rows,).
-    """
-
-    offset_px: Array
-    weight: Array
-    blur_px: Array
-
-
-def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> Edges:
-    """Return the place of an edge that rises along the profile.
+    These are its place along the profile's normal, px (rows, n), the weight of the profiles, 0 for
+    outliers (rows, n), and each row's blur, a standard deviation, px (rows,).
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
@@ -670,16 +566,11 @@ def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -
         if k == 1 and moved_px < _ONE_ROUND_PX:
             continue
         edge, usable, blur2 = profiles.narrow(line, blur2)
-        rounds = 2 if k == _ROUNDS - 1 else 1
-        centre, weight = _robust_line(edge, usable, rounds)
+        centre, weight = _robust_line(edge, usable, 2 if k == _ROUNDS - 1 else 1)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break
-    return Edges(
-        offset_px=edge.astype(np.float64),
-        weight=weight.astype(np.float64),
-        blur_px=np.sqrt(blur2).astype(np.float64),
-    )
+    return edge.astype(np.float64), weight.astype(np.float64), np.sqrt(blur2).astype(np.float64)
 
 
 class _Profiles:
@@ -689,62 +580,59 @@ class _Profiles:
         self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
         self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # where, (rows, steps)
         self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
-        self.most2 = _QUARTER_OF * self.near * self.near  # square of a window's largest sigma
+        self.most2 = 0.25 * self.near * self.near  # square of a window's largest sigma
         # The flanks with a neighbouring edge: both, and outside less inside.
         self.both, self.side = around.inside + around.outside, around.outside - around.inside
         self.can = around.possible.astype(np.float32)
         # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), _ONE)
+        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), 1.0)
 
     def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the edges by one window around the middle of all profiles, and which count."""
+        """Return the edges by one window around all middles, and which count."""
         spread = self.u * (_PER_NEAR / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
-        np.exp(_MINUS_HALF * spread, out=window[..., 0])
+        np.exp(-0.5 * spread, out=window[..., 0])
         np.multiply(window[..., 0], self.u, out=window[..., 1])
-        moments: Floats = np.maximum(self.gradient, _ZERO) @ window
+        moments: Floats = np.maximum(self.gradient, 0.0) @ window
         total = moments[..., 0] * self.can
         usable = total > (total.dot(_ONES32) * self.part)[:, None]
-        return np.divide(moments[..., 1], np.where(usable, total, _ONE)), usable
+        return np.divide(moments[..., 1], np.where(usable, total, 1.0)), usable
 
     def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Return the edges by a window around the row's line (rows, n), as wide as its blur so
-        far demands, which of them count, and the blur's square."""
+        """Return the edges by a window around the row's line, which count, blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
         squared = relative * relative
-        mass = squared * (_MINUS_HALF / w2)[:, None, None]
+        mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
         mass *= self.gradient
         total = (mass @ _STEP_ONES) * self.can
-        usable = total > np.maximum(total.dot(_ONES32) * self.part, _TINY)[:, None]
-        # A neighbour seen through the window has this share, at this place, with this
-        # spread; the one outside lies at the same distance on the other flank.
+        usable = total > np.maximum(total.dot(_ONES32) * self.part, 1e-9)[:, None]
+        # A neighbour seen through the window has this share, at this place, with this spread.
         wide2 = w2 + blur2
         place = self.depth * w2 / wide2
-        lost = np.exp(_MINUS_HALF * self.depth * self.depth / wide2)
+        lost = np.exp(-0.5 * self.depth * self.depth / wide2)
         share = np.minimum(self.both * lost[:, None], _MOST_SHARE)
-        total = np.where(usable, total / (_ONE - share), _ONE)
+        total = np.where(usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = relative @ _STEP_ONES + total * self.side * (lost * place)[:, None]
         mass *= squared
         second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
         moment = (second * usable).dot(_ONES32)
-        moment /= np.maximum((total * usable).dot(_ONES32), _TINY)
+        moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
         moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
         found2 = moment * w2 / (w2 - moment)
         # The window pulls the centroid towards its own middle: undo that.
-        centroid = first / total * (_ONE + found2 / w2)[:, None]
+        centroid = first / total * (1.0 + found2 / w2)[:, None]
         limit = self.near[:, None]
         return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return straight lines (rows, n) through the middles of the two halves of each row: where a
-    window is put, whatever a quarter of either half shows. A half that shows nothing is taken to
-    lie where the other does."""
+    """Return straight lines (rows, n) through the middles of the halves of each row, whatever a
+    quarter of either shows."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2
@@ -752,36 +640,33 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     # Left out before the sum: beside the others' size an edge's place is rounded away.
     shown = np.abs(middle) < _FAR
     count = shown @ _QUARTER_ONES
-    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, _ONE)
+    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, 1.0)
     return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _THROUGH_HALVES)
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
-    """Return straight lines edge(s) a row with Tukey's weights, and these weights."""
+    """Return straight lines (rows, n) with Tukey's weights, and these."""
     line = median(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
         size /= np.maximum(_TUKEY * median(size, usable), _TUKEY_FLOOR_PX)[:, None]
         size *= size
-        weight = np.maximum(_ONE - size, _ZERO)
+        weight = np.maximum(1.0 - size, 0.0)
         weight *= weight
         weight *= usable
         w = weight.dot(_POWERS)
         e = (weight * edge).dot(_POWERS)
-        w0, w1 = np.maximum(w[:, 0], _TINY), w[:, 1]
+        w0, w1 = np.maximum(w[:, 0], 1e-9), w[:, 1]
         mean, middle = e[:, 0] / w0, w1 / w0
-        slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, _TINY)
+        slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, 1e-9)
         line = slope[:, None] * (_ALONG32 - middle[:, None])
         line += mean[:, None]
     return line, weight
 
 
 def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return each row's median over its usable values, to a rank, (rows,); 0 without any.
-
-    The others are set high and low by turns, which keeps the middle where it is.
-    """
+    """Return each row's median over its usable values, (rows,); 0 without any."""
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)
     found = values[:, PROFILES // 2]
-    return np.asarray(np.where(np.abs(found) < _FAR, found, _ZERO))
+    return np.asarray(np.where(np.abs(found) < _FAR, found, 0.0))

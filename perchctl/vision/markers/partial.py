@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.values import replace
 from perchctl.vision.lens import distort, pinhole_px, undistort, undistort_px
 from perchctl.vision.markers.corners import (
     BEFORE,
@@ -33,129 +32,102 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
     within,
 )
-from perchctl.vision.markers.detector import hides
+from perchctl.vision.markers.detector import Picture, hides
 from perchctl.vision.markers.edge_fit import (
+    MIN_LINE_SIGMA_PX,
     PROFILES,
     STEPS,
     Floats,
+    Surroundings,
     locate,
     places,
     reaches_px,
     sample,
+    shift_prior_px,
     side_profiles,
     surroundings,
 )
 from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELLS, Pattern
-from perchctl.vision.types import CameraModel, EdgeShift
+from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 LEAST_CELL_PX = 4.0  # smaller cells leave no part of a side that would show anything
 _ROUNDS, _STILL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR = 0.9  # of the window
 _MAX_SIGMA = 0.02  # of the side: vaguer corners are no measurement
-_MIN_SIGMA_PX, _LEAST_SHIFT_SIGMA_PX = 0.015, 0.01
-_SHIFT_PRIOR_PX, _CLIPPED_PRIOR_PX, _CLIPPED_GREY = 0.15, 0.4, 248.0
+_LEAST_SHIFT_SIGMA_PX = 0.01
 _TAILS = 1.3  # what robust weights take away from a residual's square
 _MAX_STEP = 0.5
 _MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
 
 
-def fit_partly(
-    image: NDArray[np.uint8],
+def seen_partly(
+    picture: Picture,
+    name: MarkerName,
     start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None = None,
+    known_by: KnownBy,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
     """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
 
-    `hidden` (h, w) is where pixels show something else. None where what is seen does not determine
-    the corners. The marker's cells are not looked at.
+    `known` is the shift of all edges, where it was measured before. None where what is seen does
+    not determine the corners, or the cells that are seen are not the marker's.
     """
-    if not _large_enough(start_px, pattern):
+    pattern, camera = picture.setup.patterns[name], picture.camera
+    if not mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX:
+        return None
+    # So many cells have to be in the picture, wherever the fit may lead.
+    spots = _within(_spots_px(start_px, pattern, camera), picture.image.shape, _MOST_OFF_PX)
+    if not _enough(_known(spots, pattern), pattern, known_by):
         return None
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H = from_unit(start)
     for k in range(_ROUNDS):
-        seen = seen_edges(image, H, pattern, camera, hidden)
+        seen = seen_edges(picture, H, pattern)
         if seen is None:
             return None
-        A, N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
-        try:
-            step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            return None
+        A, N, g = _equations(seen, known or EdgeShift(0.0, shift_prior_px(seen.white)))
+        step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
         H = incremented(H, p)
-        if k > 0 and float(np.abs(p[:6]).max() * seen.rows.scale_px.mean()) < _STILL_PX:
+        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _STILL_PX:
             break
     assert seen is not None
     left_px = seen.far_px - (step @ A).reshape(seen.far_px.shape)
-    return _corners(H, seen, left_px, N, pattern, camera)
-
-
-def seen_partly(
-    image: NDArray[np.uint8],
-    start_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    known_by: KnownBy,
-    hidden: NDArray[np.bool_] | None = None,
-    known: EdgeShift | None = None,
-) -> RefinedCorners | None:
-    """Return the result of `fit_partly`, if the cells that are seen are the marker's."""
-    if not _large_enough(start_px, pattern):
+    found = _corners(H, seen, left_px, N, pattern, camera)
+    if found is None or not _cells_agree(picture, found.corners_px, pattern, known_by):
         return None
-    if not may_show_enough(start_px, image.shape, pattern, camera, known_by, _MOST_OFF_PX):
-        return None
-    found = fit_partly(image, start_px, pattern, camera, hidden, known)
-    if found is None:
-        return None
-    agree = visible_cells_agree(image, found.corners_px, pattern, camera, hidden, known_by)
-    return found if agree else None
+    return found
 
 
-def _large_enough(start_px: Array, pattern: Pattern) -> bool:
-    """Return True if a part of a side may show anything."""
-    return mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX
-
-
-def wholly_seen(
-    found: RefinedCorners, shape: tuple[int, ...], hidden: NDArray[np.bool_] | None
-) -> bool:
-    """Return True if nothing of the marker is hidden, and the picture's edge too far away to take
-    anything from the sides' blur."""
-    return within(found.corners_px, shape, ROOM_PX + found.blur_px) and not hides(
-        hidden, found.corners_px
+def wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
+    """Return True if nothing of the marker is hidden or beyond the edge."""
+    room_px = ROOM_PX + found.blur_px
+    return within(found.corners_px, picture.image.shape, room_px) and not hides(
+        picture.hidden, found.corners_px
     )
 
 
-def _prior_px(seen: SeenEdges) -> float:
-    """Return the spread, px, of the shift that all edges share, before it is measured."""
-    return _CLIPPED_PRIOR_PX if seen.white > _CLIPPED_GREY else _SHIFT_PRIOR_PX
-
-
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the changes (9, rows * n) of the edges with the square's increment, in the terms of
-    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9), (9,),
-    per px^2 of an edge's spread."""
-    u, v, rows = seen.own[..., 0], seen.own[..., 1], seen.rows
-    nx, ny = OUT[rows.side].T[..., None] * rows.scale_px[:, None]
+    """Return the changes (9, rows * n) of the edges with the terms of `corner_jacobian` and the
+    shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
+    spread."""
+    u, v = seen.own[..., 0], seen.own[..., 1]
+    nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the seen one by the shift.
-    A[8] = np.where(rows.at < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(seen.at < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles nearer to each other than a pixel measure the same.
-    worth = np.minimum(1.0, 2.0 * rows.scale_px * rows.at / PROFILES)
+    worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.at / PROFILES)
     weighted = A * (seen.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
     # An edge's spread is about a tenth of a pixel while it is not known.
@@ -167,24 +139,32 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 
 
 def _corners(
-    H: Array, seen: SeenEdges, left_px: Array, N: Array, pattern: Pattern, camera: CameraModel
+    H: Array, seen: SeenEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners and covariance of the square H (3, 3), unit to pinhole px, after the last
-    round, by what that leaves over of its edges, px (rows, n), and by its normal matrix (9, 9);
-    None where they are not determined."""
-    spread = _spread(seen, left_px)
-    if spread is None:
+    """Return the corners of the square H (3, 3), unit to pinhole px, with a covariance by what is
+    left over of its edges, px (rows, n), and its normal matrix (9, 9); None where these are
+    vague."""
+    w = seen.weight
+    mass = w.sum(axis=1)
+    used = mass > 0.0
+    if not used.any() or (seen.blur[used] > _MAX_BLUR).any():
         return None
-    residual2, growth = spread
+    if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
+        return None
+    # What is left within rows; and by how much rows contradict each other beyond it.
+    mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
+    scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
+    chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
+    freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
+    noise2 = max(_TAILS * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
     pinhole = mapped(H, UNIT)
     corners_px = distort(mapped(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.rim.cells
-    noise2 = max(_TAILS * residual2 * growth, _MIN_SIGMA_PX**2)
     # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
     J = corner_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
-    floor2 = _MIN_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
+    floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
     if not (vaguest_px < _MAX_SIGMA * side_px and np.isfinite(corners_px).all()):
@@ -194,26 +174,9 @@ def _corners(
         corners_px=corners_px,
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
         refined=True,
-        shift_sigma_px=min(max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), _prior_px(seen)),
+        shift_sigma_px=min(max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), shift_prior_px(seen.white)),
         cov_px2=cov_px2,
     )
-
-
-def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
-    """Return the mean square of what the fit leaves over within rows, px^2, and by how much rows
-    contradict each other beyond it; None where these are no edges of a square."""
-    w = seen.weight
-    mass = w.sum(axis=1)
-    used = mass > 0.0
-    if not used.any() or (seen.blur[used] > _MAX_BLUR).any():
-        return None
-    if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
-        return None
-    mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
-    scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
-    chi2 = float((mean**2 * mass).sum()) / max(scatter, _MIN_SIGMA_PX**2)
-    freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
-    return scatter, max(chi2 / freedom, 1.0)
 
 
 # --- Which marker it is, by the cells that are seen of it -------------
@@ -228,19 +191,12 @@ _UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords d
 _INVERTED_PX = 0.5  # the lens model holds where its inverse is one
 
 
-def visible_cells_agree(
-    image: NDArray[np.uint8],
-    corners_px: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None,
-    known_by: KnownBy,
-) -> bool:
-    """Return True if the cells that are seen have their colour: not those beyond the picture's
-    edge, behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
-    what else says which marker it is."""
+def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
+    """Return True if the cells have their colour that are in the picture, not hidden, and not in
+    light that glares; how many, depends on what else says which marker it is."""
+    image, hidden = picture.image, picture.hidden
     h, w = image.shape
-    at = _spots_px(corners_px, pattern, camera)
+    at = _spots_px(corners_px, pattern, picture.camera)
     near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
     seen = _within(at, image.shape, 0.0)
     if hidden is not None:
@@ -259,7 +215,7 @@ def visible_cells_agree(
         seen &= grey < _BRIGHTEST_GREY
     count = np.bincount(pattern.owner, weights=seen)
     means = np.bincount(pattern.owner, weights=grey * seen) / np.maximum(count, 1.0)
-    known = count >= 0.5 * pattern.spots_per_cell
+    known = _known(seen, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.white, 1.0, -1.0)
     wrong = np.count_nonzero(known & (share < CELL_MARGIN))
     most_wrong = 0
@@ -268,25 +224,9 @@ def visible_cells_agree(
     return bool(wrong <= most_wrong) and _enough(known, pattern, known_by)
 
 
-def may_show_enough(
-    start_px: Array,
-    shape: tuple[int, ...],
-    pattern: Pattern,
-    camera: CameraModel,
-    known_by: KnownBy,
-    off_px: float,
-) -> bool:
-    """Return True if so many cells may be in the picture as `visible_cells_agree` asks for, of a
-    marker that is within `off_px` of corners (4, 2)."""
-    seen = _within(_spots_px(start_px, pattern, camera), shape, off_px)
-    count = np.bincount(pattern.owner, weights=seen)
-    return _enough(count >= 0.5 * pattern.spots_per_cell, pattern, known_by)
-
-
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
     """Return the spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
-    does not reach. A marker that fills the picture is no square in it: its middle is a third of a
-    cell from where its corners alone put it."""
+    does not reach. A marker that fills the picture is no square in it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)
@@ -303,6 +243,14 @@ def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.
     return np.asarray(inside.all(axis=1))
 
 
+def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
+    """Return which cells (cells,) show half of their spots (n,) or more."""
+    known: NDArray[np.bool_] = (
+        np.bincount(pattern.owner, weights=seen) >= 0.5 * pattern.spots_per_cell
+    )
+    return known
+
+
 def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
     """Return True if the known cells (cells,) tell which marker it is."""
     most_unknown = len(known) if known_by == "other" else _UNKNOWN_BITS[known_by]
@@ -312,8 +260,7 @@ def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bo
     )
 
 
-# --- The edges of a marker where they are seen: on profiles across its sides, and across the inner
-# edges of its border, that are in the picture, not hidden, and neither glaring nor shaded.
+# --- The edges of a marker where they are seen: of its sides, and inside of its border ---
 
 
 ROOM_PX = 2.0
@@ -328,126 +275,83 @@ _SEARCH_STEPS: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """The marker's sides and perhaps the inner edges of its border: starts, ends (rows, 2)
-    normalised; of each row (rows,) the side that it belongs to, its distance from the centre in
-    half sides, its length, pixels for a half side across it, and +1 where white is to the left of
-    the way from start to end; the mean width of a cell."""
-
-    starts: Array
-    ends: Array
-    side: NDArray[np.intp]
-    at: Array
-    lengths_px: Array
-    scale_px: Array
-    cell_px: float
-    sign: Array
-
-    def only(self, kept: NDArray[np.intp]) -> _Rows:
-        """Return some of the rows."""
-        of_each = ("starts", "ends", "side", "at", "lengths_px", "scale_px", "sign")
-        return replace(self, **{name: getattr(self, name)[kept] for name in of_each})
-
-
-@dataclass(frozen=True, eq=False)
 class SeenEdges:
-    """Edges of one round: of each profile (rows, n) its place in the marker's own coordinates
-    (rows, n, 2), how far outwards it is from where the square has it, and its weight; the rows,
-    and the blur of each in terms of the window (rows,); and how white the paper is."""
+    """Edges of one round: of each profile (rows, n) its place in own coordinates (rows, n, 2), how
+    far outwards it is of the square's, and its weight; of each row (rows,) the side that it belongs
+    to, its distance from the centre in half sides, pixels for a half side across it, and its blur
+    in terms of the window; and how white the paper is."""
 
     own: Array
     far_px: Array
     weight: Array
-    rows: _Rows
+    side: NDArray[np.intp]
+    at: Array
+    scale_px: Array
     blur: Array
     white: float
 
 
-def seen_edges(
-    image: NDArray[np.uint8],
-    H: Array,
-    pattern: Pattern,
-    camera: CameraModel,
-    hidden: NDArray[np.bool_] | None,
-) -> SeenEdges | None:
-    """Return the edges near to where the square H has them; None where too few are seen. Sides of
-    which nothing is seen are left out."""
-    rows = _rows(H, pattern, camera)
-    if rows is None:
-        return None
-    s = places(rows.lengths_px)
-    origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
-    if not (np.abs(origin) < _FAR_PX).all():
-        return None  # a lens model throws what is far outside anywhere, to no number too
-    normal *= rows.sign[:, None, None]
-    near_px, half_px = reaches_px(np.full(len(rows.at), rows.cell_px))
-    depth_px = 2.0 * rows.scale_px / pattern.rim.cells
-    around = surroundings(s, [pattern.rim], pattern.rim, depth_px)
-    free = around.possible & _in_view(image.shape, hidden, origin, normal, near_px)
-    kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
-    if len(kept) < _LEAST_EDGES:
-        return None
-    rows, around = rows.only(kept), around.only(kept)
-    origin, normal, free = origin[kept], normal[kept], free[kept]
-    near_px, half_px = near_px[kept], half_px[kept]
-    grey = sample(image, origin, normal, half_px)
-    lit = _unspoilt(grey, free, near_px, half_px)
-    if lit is None:
-        return None
-    good, white = lit
-    edges = locate(grey, half_px, near_px, replace(around, possible=good))
-    weight = np.where(good, edges.weight, 0.0)
-    weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
-    found = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
-    own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
-    if not np.isfinite(own).all():
-        return None
-    far = np.einsum("rni,ri->rn", own, OUT[rows.side]) - rows.at[:, None]
-    return SeenEdges(
-        own=own,
-        far_px=far * rows.scale_px[:, None],
-        weight=weight,
-        rows=rows,
-        blur=edges.blur_px / near_px,
-        white=white,
-    )
-
-
-def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
-    """Return the rows of the square H, unit to pinhole px; None where that is none."""
-    corners, cells = mapped(H, UNIT), pattern.rim.cells
+def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
+    """Return the edges near to where the square H has them, if enough are seen."""
+    camera, cells, corners = picture.camera, pattern.rim.cells, mapped(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
     cell_px = float(sides_px.mean()) / cells
+    # The marker's sides, and perhaps the inner edges of its border.
     rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _INNER_CELL_PX else (1.0,)
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
     to_rays: Array = np.linalg.inv(camera.K) @ H
     starts = np.stack([mapped(to_rays, r * UNIT) for r in rings])
-    across_px = 0.5 * (sides_px[BEFORE] + sides_px[NEXT])
+    scale_px = (0.25 * (sides_px[BEFORE] + sides_px[NEXT]))[side]
+    s = places(sides_px[side] * at)
+    ends = starts[:, NEXT].reshape(-1, 2)
+    origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    if not (np.abs(origin) < _FAR_PX).all():
+        return None  # a lens model throws what is far outside anywhere, to no number too
+    # White is outside of the marker, and inside of its border.
     turn = float(np.sign(doubled_area(corners[None])[0]))
-    return _Rows(
-        starts=starts.reshape(-1, 2),
-        ends=starts[:, NEXT].reshape(-1, 2),
+    normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
+    near_px, half_px = reaches_px(np.full(len(at), cell_px))
+    depth_px = 2.0 * scale_px / cells
+    around = surroundings(s, [pattern.rim], pattern.rim, depth_px)
+    free = around.possible & _in_view(picture, origin, normal, near_px)
+    kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
+    if len(kept) < _LEAST_EDGES:
+        return None
+    side, at, scale_px = side[kept], at[kept], scale_px[kept]
+    origin, normal, free = origin[kept], normal[kept], free[kept]
+    near_px, half_px = near_px[kept], half_px[kept]
+    grey = sample(picture.image, origin, normal, half_px)
+    lit = _unspoilt(grey, free, near_px, half_px)
+    if lit is None:
+        return None
+    good, white = lit
+    around = Surroundings(depth_px[kept], around.inside[kept], around.outside[kept], good)
+    offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
+    weight = np.where(good, weight, 0.0)
+    weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
+    found = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
+    own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
+    if not np.isfinite(own).all():
+        return None
+    far = np.einsum("rni,ri->rn", own, OUT[side]) - at[:, None]
+    return SeenEdges(
+        own=own,
+        far_px=far * scale_px[:, None],
+        weight=weight,
         side=side,
         at=at,
-        lengths_px=sides_px[side] * at,
-        scale_px=0.5 * across_px[side],
-        cell_px=cell_px,
-        sign=turn * np.where(at < 1.0, -1.0, 1.0),
+        scale_px=scale_px,
+        blur=blur_px / near_px,
+        white=white,
     )
 
 
-def _in_view(
-    shape: tuple[int, ...],
-    hidden: NDArray[np.bool_] | None,
-    origin: Array,
-    normal: Array,
-    near_px: Array,
-) -> NDArray[np.bool_]:
-    """Return which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
-    h, w = shape[:2]
+def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> NDArray[np.bool_]:
+    """Return which profiles (rows, n) are in the picture, and not hidden."""
+    hidden, (h, w) = picture.hidden, picture.image.shape
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
     x_and_y = (origin - reach >= ROOM_PX) & (origin + reach <= last)
@@ -462,9 +366,8 @@ def _in_view(
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return which of the free profiles (rows, n) begin black and end white, as most do, and how
-    white the paper is; None without contrast. Light that glares makes black bright; what lies on
-    the paper makes white dark."""
+    """Return which of the free profiles (rows, n) begin black and end white, and how white the
+    paper is; None without contrast."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

@@ -65,10 +65,8 @@ class Pattern:
 
 
 def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """Return the rim of a marker with the inner bits (n, n), 1 = white.
-
-    At small sizes the rim's blur reaches the border's outer edge and would push it out.
-    """
+    """Return the rim of a marker with the inner bits (n, n), 1 = white, whose blur may reach the
+    edge."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -85,8 +83,7 @@ def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return how a marker looks, with spots in every cell but those that another marker in the
-    centre covers."""
+    """Return how a marker looks, with spots in all cells that are uncovered."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -115,7 +112,7 @@ def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
 
 
 def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if every cell of the marker at these corners has its colour, clearly."""
+    """Return True if every cell at these corners has its colour, clearly."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -131,7 +128,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if nearly all cells have their colour, the others being covered."""
+    """Return True if nearly all cells have their colour."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -141,39 +138,26 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
 
 
 def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if the grey values in the cells go with the pattern, blurred as they may be."""
+    """Return True if the grey values in the cells go with the pattern."""
     return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
 def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the correlation of the cells' grey values with the pattern for corners (4, 2) rolled
-    on by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
+    """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
+    rolled on by 0 to 3; 0 without contrast."""
     grey = _read(image, corners_px, pattern)
-    return np.zeros(4) if grey is None else _likeness(grey[None], pattern)[0]
-
-
-def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> Array:
-    """Return the `resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m,
-    4)."""
-    like = np.zeros((len(squares), 4))
-    inside, grey = _read_squares(image, squares, pattern)
-    like[inside] = _likeness(grey, pattern)
-    return like
-
-
-def _likeness(grey: Array, pattern: Pattern) -> Array:
-    """Return the correlation (m, 4) of grey values (m, k) at the spots, 0 without contrast."""
-    grey = grey - grey.sum(axis=1, keepdims=True) / grey.shape[1]
-    spread = np.sqrt((grey * grey).sum(axis=1))[:, None]
-    like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)
+    if grey is None:
+        return np.zeros(4)
+    grey -= grey.mean()
+    spread = float(np.linalg.norm(grey))
     # Black and white each on about half of the spots are 2 spreads apart.
-    contrast = spread >= 0.5 * MIN_CONTRAST * math.sqrt(grey.shape[1])
-    return np.asarray(like * contrast)
+    if spread < 0.5 * MIN_CONTRAST * math.sqrt(len(grey)):
+        return np.zeros(4)
+    return np.asarray(pattern.soft @ grey / spread)
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the mean grey value of each cell that is read, None where one is outside of the
-    picture."""
+    """Return the mean grey value of each cell; None outside of the picture."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
@@ -181,29 +165,13 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the grey values (k,) at the pattern's k spots, None where one is outside of the
-    picture."""
+    """Return the grey values (k,) at the spots; None outside of the picture."""
     at = mapped(from_unit(corners_px), pattern.spots)
     # Spots are inside of the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
         return None
     nearest = (at + 0.5).astype(np.intp)
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
-
-
-def _read_squares(
-    image: NDArray[np.uint8], H: Array, pattern: Pattern
-) -> tuple[NDArray[np.bool_], Array]:
-    """Return which of m squares (m, 3, 3) have all spots in the picture, and the grey values (n, k)
-    at the k spots of those."""
-    h, w = image.shape
-    at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at /= pattern.spots @ H[:, 2, :2, None] + H[:, 2, 2, None, None]
-        low, high = at.min(axis=1), at.max(axis=1)
-        inside = (low >= 0.0).all(axis=1) & (high <= (w - 1, h - 1)).all(axis=1)
-    nearest = (at[inside] + 0.5).astype(np.intp)
-    return inside, image[nearest[..., 1], nearest[..., 0]].astype(np.float64)
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
@@ -243,8 +211,7 @@ class Drawing:
 def drawing_of(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
-    """Return the drawing of inner bits, 1 = white; with a centre, that of the target's large
-    marker: its sheet has a cell of white around it."""
+    """Return the drawing of inner bits, 1 = white; with a centre, the large marker's."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -267,12 +234,14 @@ def _wide(axis: Array, half_node: float) -> Array:
 
 @lru_cache(maxsize=64)
 def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """Return the drawing at n by n nodes over its reach, and perhaps what is beyond its sheet."""
+    """Return the drawing at n by n nodes, and perhaps what is beyond its sheet."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = drawn(drawing, axis, half_node)
-    outside = beyond_sheet(drawing, axis, half_node)
-    return (paper,) if outside is None else (paper, outside)
+    if drawing.sheet is None:
+        return (paper,)
+    on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
+    return paper, (1.0 - on @ on.T).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
@@ -282,8 +251,7 @@ def square(cells: int, n: int) -> NDArray[np.float32]:
 
 
 def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of each node and of `EDGE` nodes more all around, exact in area, as if
-    the paper had no end."""
+    """Return the whiteness of each node and of `EDGE` nodes all around."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
@@ -294,21 +262,12 @@ def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """Return the share of each row (or column) of cells in each node (n, cells), blurred by sigma
-    nodes: a cell's share in the drawing is the product of its row's and its column's."""
+    """Return the blurred share of each row of cells in each node (n, cells)."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
     )
     return np.asarray(soft[EDGE : EDGE + len(axis)], dtype=np.float64)
-
-
-def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32] | None:
-    """Return the share of each node that is not on the paper, likewise; None without an end."""
-    if drawing.sheet is None:
-        return None
-    on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
-    return (1.0 - on @ on.T).astype(np.float32)
 
 
 def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:

@@ -39,15 +39,13 @@ _HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
 _STILL_PX = 0.05  # the round after such a step moves a tenth of that, mostly
 _LENS_PX = 0.3  # what the lens does is computed anew after this way
 _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
-# How far shape may leave its start, as standard deviations, per unit of the marker's
-# half side: turns and scales; then the perspective, which a few pixels hardly show.
+# How far shape may leave its start, a unit of half a side: turns and scales; the perspective.
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
 _BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
 _MOST_BLUR_STEP = 0.5  # of a round: of the blur's square; a node's square at least
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
-"""A change of blur draws nothing anew that is smaller than both: as a share of it, and in cells.
-A blur of half a cell that is 5 % off leaves more than codewords differ by."""
+"""A change of blur draws nothing anew that is smaller than both: as a share, and in cells."""
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 _SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # unknowns: the increment, blur, those of light
@@ -71,7 +69,7 @@ class Alignment:
         cell_departure: largest mean departure of a cell, in units of the gain.
         flip, flip_sigma: by how much the cell that is most against it has the other colour, 0
             (drawn as it is seen) to 1 (the bit is wrong), and the least certain cell's spread.
-        blur_px, gain: the blur's sigma, and grey levels from black to white.
+        blur_px: the blur's sigma.
         moved_px: how far the corner that moved most is from its start.
     """
 
@@ -84,7 +82,6 @@ class Alignment:
     flip: float
     flip_sigma: float
     blur_px: float
-    gain: float
     moved_px: float
 
 
@@ -109,11 +106,8 @@ def align(
     camera: CameraModel,
     blur_px: float = 1.0,
 ) -> Alignment | None:
-    """Lay the drawing over the picture, starting with corners `start_px` (4, 2) and a blur.
-
-    None where the marker leaves the picture, has no contrast, is not alike at all, or the fit
-    breaks down.
-    """
+    """Lay the drawing over the picture, starting with corners `start_px` (4, 2) and a blur. None
+    where the marker leaves the picture, is not alike at all, or the fit breaks down."""
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all():
         return None
@@ -131,7 +125,7 @@ def align(
     around, first = patch
 
     def drawn(blur_px: float) -> Rendered:
-        return rendered(drawing, n, blur_px / node_px)
+        return rendered(drawing, n, round(math.log(blur_px / node_px) / _STEP))
 
     def possible_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
@@ -147,10 +141,7 @@ def align(
             return None
         if k == _HOPE_ROUNDS and likeness(grey, equations.error) < _LEAST_HOPE:
             return None
-        try:
-            step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            return None
+        step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
         p = step[_SHAPE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
             return None
@@ -186,22 +177,21 @@ def align(
         flip=flip,
         flip_sigma=flip_sigma,
         blur_px=seen.sigma * node_px,
-        gain=gain,
         moved_px=float(np.abs(corners_px - start_px).max()),
     )
 
 
 def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
-    """Return the normal equations of the next increment; None without contrast. There are 16 or 17
-    unknowns: shape, blur and light; `total` (8,) is the sum of the increments so far."""
+    """Return the normal equations of the next increment, of shape, blur and light; None without
+    contrast. `total` (8,) is the sum of the increments so far."""
     rows, products = seen.light
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
-    light = np.asarray(np.linalg.solve(A, _onto(rows, grey)), np.float64)
+    light = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
     gain = float(light[GAIN])
     if gain < _MIN_GAIN:
         return None
-    error = grey - _mixed(rows, light)
+    error = grey - np.einsum("kn,k->n", rows, light)
     J = np.concatenate([_lit_jacobian(seen, light), rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
     products = gram(J) / noise
@@ -220,7 +210,7 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """Return the correlation of the picture with the fit that leaves `error` over."""
+    """Return the correlation with the fit that leaves `error` over."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -229,14 +219,8 @@ def likeness(grey: Array, error: Array) -> float:
 def _cells_seen(
     seen: Rendered, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
-    """Return `flip` and `flip_sigma` of an `Alignment`; `inverse` is that of N, and so `many` nodes
-    measure the same.
-
-    The mean over a cell shows a wrong bit as long as blur is smaller than the cell. Beyond that a
-    wrong bit is spread over its neighbours, and shape, blur and light of the fit take a part of
-    what it leaves over. So each cell is looked for as it would look: blurred, and without what the
-    fit's unknowns explain (a matched filter).
-    """
+    """Return `flip` and `flip_sigma` of an `Alignment`, by the inverse of N. A wrong bit is looked
+    for as it would look: blurred, and without what the unknowns of the fit explain of it."""
     soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
@@ -250,14 +234,13 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, float]:
-    """Return the correlation and height of the inner pattern in the picture's grey values
-    (n * n,): what no plain square explains of them."""
+    """Return the correlation and height of the inner pattern in grey (n * n,)."""
     rows, products = drawing.plain
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.light[0][GAIN], grey
-    b = np.stack([_onto(rows, each) for each in both], axis=1)
-    shares = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-    bits, seen = (each - _mixed(rows, shares[:, k]) for k, each in enumerate(both))
+    b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
+    shares = np.linalg.solve(A, b)
+    bits, seen = (each - np.einsum("kn,k->n", rows, shares[:, k]) for k, each in enumerate(both))
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
     scale = math.sqrt(energy * float((seen * seen).sum()))
     if scale < 1e-9:
@@ -266,8 +249,7 @@ def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, f
 
 
 def _repeated(error: Array) -> float:
-    """Return how many neighbouring nodes measure the same: from the correlation along rows and
-    columns (n, n) of what is left (nodes closer than a pixel; blur that is not round)."""
+    """Return how many neighbouring nodes measure the same."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
     for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
@@ -285,9 +267,8 @@ def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
 
 @lru_cache(maxsize=32)
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Return each node's number of its cell, behind the last one's around the marker, and how many
-    nodes each cell has."""
-    x, y = ((g + 1.0) * 0.5 * n_cells for g in (grid.u, grid.v))
+    """Return each node's number of its cell, and how many nodes each cell has."""
+    x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
     own = y.astype(np.intp) * n_cells + x.astype(np.intp)
     index = np.where(inside, own, n_cells**2)
@@ -296,17 +277,17 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 
 
 # --- The light on a marker: what turns its drawing into grey values ---
-# Offset and gain, their slopes over the marker, the bend of the tone curve (clipped white,
-# gamma) and the grey beyond the sheet. All of them shift edges if left out.
+# Offset, gain, their slopes, the bend of the tone curve and the grey beyond the sheet: all of them
+# shift edges if left out.
 
 
 def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
-    """Return the changes (9, n * n) of the grey values with the homography's increment and the
-    blur's square, in this light (7 or 8,)."""
-    gain, grid = float(light[GAIN]), drawing.grid
+    """Return the changes (9, n * n) of grey with the homography's increment and the blur's
+    square."""
+    gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
     bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
-    slope = gain + light[GAIN_U] * grid.u + light[GAIN_V] * grid.v
+    slope = gain + light[GAIN_U] * u + light[GAIN_V] * v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
     for (_, more), height in zip(others, light[BEYOND:], strict=True):
@@ -322,28 +303,16 @@ _FEW = 9  # a side
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """n by n nodes, `axis` (n,) in both directions; u, v and 1 of each node, (3, n * n)."""
+    """n by n nodes, `axis` (n,) in both directions; u (across), v (down), 1 of each, (3, n * n)."""
 
     n: int
     axis: Array
     uv1: Array
 
-    @property
-    def u(self) -> Array:
-        """Across, (n * n,)."""
-        u: Array = self.uv1[0]
-        return u
-
-    @property
-    def v(self) -> Array:
-        """Down, (n * n,)."""
-        v: Array = self.uv1[1]
-        return v
-
 
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """Return the nodes in the middle of n by n equal parts of the square from -reach to reach."""
+    """Return the nodes in the middle of n by n parts of a square."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
@@ -355,7 +324,7 @@ def _crossings(axis: Array) -> Array:
 
 
 def projected(H: Array, uv1: Array) -> Array:
-    """Map own coordinates (3, n) through a homography to pinhole pixels, x and y (2, n)."""
+    """Map own coordinates (3, n) to pinhole pixels, x and y (2, n)."""
     q = H.dot(uv1)
     return np.asarray(q[:2] / q[2])
 
@@ -370,9 +339,8 @@ def through_lens(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """Return how far the lens moves each node that is seen through H, (2, n * n). A lens moves
-    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through these.
-    """
+    """Return how far the lens moves each node that is seen through H, (2, n * n): computed for a
+    few nodes, and for the rest by the polynomial through these."""
     uv1, between = _few(grid)
     pin = projected(H, uv1)
     shift = (through_lens(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -381,8 +349,8 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 @lru_cache(maxsize=64)
 def _few(grid: Grid) -> tuple[Array, Array]:
-    """Return Chebyshev's nodes over the grid (3, _FEW^2), and the weights (n, _FEW) that a row's
-    nodes give to its values there."""
+    """Return Chebyshev's nodes over the grid (3, _FEW^2), and their weights (n, _FEW) at its
+    own."""
     reach = float(grid.axis[-1])
     x = chebyshev.chebpts2(_FEW)
     degree = _FEW - 1
@@ -393,8 +361,7 @@ def _few(grid: Grid) -> tuple[Array, Array]:
 def _patch_around(
     image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the picture that the nodes may reach, and its first pixel x and y (2, 1);
-    None where they leave the picture."""
+    """Return the part of the picture that is needed, and its first pixel (2, 1)."""
     h, w = image.shape
     x, y = projected(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -408,8 +375,8 @@ def _patch_around(
 
 
 def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
-    """Return the grey values at the nodes, (n * n,); `offset_px` (2, n * n) is the lens's shift
-    less the patch's first pixel."""
+    """Return the grey values at the nodes, (n * n,), of a patch moved by the lens's shift (2, n *
+    n)."""
     at = (projected(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -417,8 +384,7 @@ def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) ->
 
 
 # --- Products of long rows, a value for each node of a square grid ----
-# They are taken block by block: large products wake threads, which cost more than they
-# save, and far more on a busy machine.
+# They are taken block by block: large products wake threads, which cost more than they save.
 
 
 _BLOCK = 256  # values of a row
@@ -434,19 +400,7 @@ def gram(rows: Array) -> Array:
     return np.asarray(total + rest.dot(rest.T))
 
 
-def _onto(rows: Array, values: Array) -> Array:
-    """Return the products (k,) of the rows (k, n) with values (n,)."""
-    return np.asarray(np.einsum("kn,n->k", rows, values))
-
-
-def _mixed(rows: Array, coefficients: Array) -> Array:
-    """Return the sum of the rows (k, n), each times its coefficient, (n,)."""
-    return np.asarray(np.einsum("kn,k->n", rows, coefficients))
-
-
-# --- A marker's drawing at the nodes of a grid, blurred, with all that follows from that alone ---
-# From picture to picture a marker's size and blur hardly change, so blur comes in steps, finer than
-# anything that a fit can tell, and what belongs to one is kept.
+# --- A marker's drawing at the nodes of a grid, blurred ---------------
 
 
 _STEP = 0.02  # of the blur
@@ -456,7 +410,7 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """The drawing's sheets, blurred by `sigma` nodes: the paper, and perhaps what is beyond it."""
+    """The drawing's sheets, blurred by `sigma` nodes."""
 
     drawing: Drawing
     grid: Grid
@@ -473,9 +427,9 @@ class Rendered:
     def light(self) -> tuple[Array, Array]:
         """What light makes of the drawing: rows (7 or 8, n * n), the last one only with a
         sheet's end, and their products."""
-        u, v = self.grid.u, self.grid.v
+        u, v, one = self.grid.uv1
         (white, _), *others = self.sheets
-        rows = [np.ones_like(u), u, v, white, white * u, white * v, white * (1.0 - white)]
+        rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])
         return stacked, gram(stacked)
 
@@ -496,18 +450,14 @@ class Rendered:
         return soft_cells(self.drawing, self.grid.axis, half_node, self.sigma)
 
 
-def rendered(drawing: Drawing, n: int, sigma: float) -> Rendered:
-    """Return the drawing at n by n nodes over its reach, blurred by about `sigma` nodes."""
-    return _rendered_at_step(drawing, n, round(math.log(sigma) / _STEP))
-
-
 @lru_cache(maxsize=16)
-def _rendered_at_step(drawing: Drawing, n: int, step: int) -> Rendered:
+def rendered(drawing: Drawing, n: int, step: int) -> Rendered:
+    """Return the drawing at n by n nodes over its reach, blurred by that step."""
     return Rendered(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 
 def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> tuple[Array, Array]:
-    """Return a sheet blurred by sigma nodes, and its changes, per unit of the drawing."""
+    """Return a sheet blurred by sigma nodes, and its changes."""
     soft = softened(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)

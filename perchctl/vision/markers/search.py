@@ -11,7 +11,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import mean_side_px, nested, within
@@ -19,17 +18,16 @@ from perchctl.vision.markers.detector import (
     MIRROR_INDEX,
     OPENCV_THRESHOLDS,
     QUICK_THRESHOLDS,
-    DetectorSetup,
+    Picture,
     Thresholds,
     make_marker_decoder,
 )
-from perchctl.vision.target_selection import TargetSelector
+from perchctl.vision.target_selection import AsideOf
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
-"""How a picture is searched for a target that is not simply where it is expected: near to
-that place, by a search (window), by fits to a blurred one, or both (near); all over for a sharp
-one, or for one that blur hides; or all that."""
+"""Where a target is looked for: near to where it is expected by a search (window), by fits to a
+blurred one, or both (near); all over if sharp, or blurred; or all that."""
 _WINDOW_MARGIN = 0.25  # of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
@@ -45,74 +43,62 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Raw corners (4, 2) px of at most one of each marker, whether the small marker's
-    mirror image is there, whether it was looked for in the whole picture, and how many whole
-    targets, both markers, there were to choose from."""
+    """Raw corners (4, 2) px of at most one of each marker, whether the mirror image of one is
+    there, and how many whole targets there were to choose from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     mirrored: bool = False
-    full_frame: bool = False
     targets: int = 0
 
 
 def search(
-    image: NDArray[np.uint8],
+    picture: Picture,
     expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
     look: Look = "all",
-    own: TargetSelector | None = None,
+    own: AsideOf | None = None,
 ) -> Found:
     """Search the window, if there is one, and the whole picture where that gave too little; only
-    one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
-    half the size first: all that may be whole in the picture is enough. `own` chooses among several
-    where none is expected."""
-    whole = _whole(image)
-    if setup.config.window and expected and look != "sharp":
-        quickly = search_halved(image, expected, setup, own)
+    one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several where
+    none is expected."""
+    setup, shape = picture.setup, picture.image.shape
+    whole = slice(0, shape[0]), slice(0, shape[1])
+    if setup.by_lines and expected and look != "sharp":
+        quickly = search_halved(picture, expected, own)
         if quickly is not None:
             return quickly
-        window = search_window(expected, setup.ratio, image.shape) or whole
+        window = search_window(expected, setup.ratio, shape) or whole
         found = Found()
         if len(expected) == 2:
-            found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own)
+            found = _pass(picture, window, expected, QUICK_THRESHOLDS, own)
         if len(found.corners_px) < 2 and window != whole:
-            found = _pass(image, window, expected, setup, OPENCV_THRESHOLDS, own)
+            found = _pass(picture, window, expected, OPENCV_THRESHOLDS, own)
         if len(found.corners_px) >= (2 if window == whole else 1) or (
             look in ("near", "window") and window != whole
         ):
             return found
-    return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS, own)
+    return _pass(picture, whole, expected, OPENCV_THRESHOLDS, own)
 
 
 def search_halved(
-    image: NDArray[np.uint8],
-    expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
-    own: TargetSelector | None = None,
+    picture: Picture, expected: Mapping[MarkerName, Array], own: AsideOf | None = None
 ) -> Found | None:
     """Search the window at half the size: a millisecond. None where that did not show all that
-    should be whole in the picture, or where that is too small for it."""
-    in_view = [quad for quad in expected.values() if within(quad, image.shape)]
+    should be whole in the picture."""
+    shape = picture.image.shape
+    in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
         return None
-    window = search_window(expected, setup.ratio, image.shape) or _whole(image)
-    found = _pass(image, window, expected, setup, QUICK_THRESHOLDS, own, halved=True)
+    window = search_window(expected, picture.setup.ratio, shape)
+    window = window or (slice(0, shape[0]), slice(0, shape[1]))
+    found = _pass(picture, window, expected, QUICK_THRESHOLDS, own, halved=True)
     return found if len(found.corners_px) >= len(in_view) else None
-
-
-def _whole(image: NDArray[np.uint8]) -> Window:
-    """Return the whole picture as a window."""
-    return slice(0, image.shape[0]), slice(0, image.shape[1])
 
 
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """Return where to look, None where a window would not pay.
-
-    It holds the whole large marker as long as that can be in the picture, so that
-    the stage can change from one frame to the next.
-    """
+    """Return where to look, None where a window would not pay. It holds the whole large marker as
+    long as that can be in the picture."""
     h, w = shape[:2]
     if "large" in expected:
         corners = expected["large"]
@@ -133,24 +119,21 @@ def search_window(
 
 
 def _pass(
-    image: NDArray[np.uint8],
+    picture: Picture,
     window: Window,
     expected: Mapping[MarkerName, Array],
-    setup: DetectorSetup,
     thresholds: Thresholds,
-    own: TargetSelector | None,
+    own: AsideOf | None,
     halved: bool = False,
 ) -> Found:
-    """Return what one pass of OpenCV's detector over the window gives, or over that at half its
-    size."""
-    part = image[window]
-    full_frame = part.shape == image.shape
+    """Return what one pass of OpenCV's detector over the window gives."""
+    setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
-        return Found(full_frame=full_frame)
+        return Found()
     rows, columns = window
     first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
@@ -165,31 +148,33 @@ def _pass(
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_wholes(candidates, setup.ratio))
     chosen = choose(candidates, expected, setup.ratio, own)
-    return Found(chosen, mirrored, full_frame, targets)
+    return Found(chosen, mirrored, targets)
 
 
 def choose(
     candidates: Mapping[MarkerName, list[Array]],
     expected: Mapping[MarkerName, Array],
     ratio: float,
-    own: TargetSelector | None = None,
+    own: AsideOf | None = None,
 ) -> dict[MarkerName, Array]:
-    """Return at most one of each marker: look-alikes and what does not fit together are dropped.
-
-    A small marker in the centre of a large one, of the right size and turn, verifies
-    both; of several such pairs the one counts that is nearest to the last detections, and what
-    goes on from these counts more than a pair elsewhere. Without a pair the last detections
-    decide; without these, a lone marker is taken. Of several the one counts that `own` has
-    nearest; without it the evidence is too thin to take any of several lone ones.
-    """
+    """Return at most one of each marker. A small marker in the centre of a large one, of the right
+    size and turn, verifies both; of several such pairs the one counts that is nearest to the last
+    detections. What goes on from these counts more than a pair elsewhere. Of several lone ones that
+    counts which `own` has nearest."""
     if own is not None and not expected:
-        candidates = _possible(candidates, own)
+        candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
     wholes = _wholes(candidates, ratio)
     near_large = _nearest("large", large, expected, ratio)
     near_small = _nearest("small", small, expected, ratio)
     if wholes:
-        _, i, j = _chosen(wholes, large, expected, own)
+        _, i, j = wholes[0]
+        if expected:
+            centre = next(iter(expected.values())).mean(axis=0)
+            away_px = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
+            _, i, j = wholes[int(np.argmin(away_px))]
+        elif own is not None:
+            _, i, j = min(wholes, key=lambda whole: whole[1])
         elsewhere = _nearest("large", [large[i]], expected, ratio) is None
         if not (elsewhere and (near_large is not None or near_small is not None)):
             return {"large": large[i], "small": small[j]}
@@ -198,7 +183,7 @@ def choose(
     if near_small is not None:
         return {"small": near_small}
     if own is not None and not expected:
-        large, small = (_least_aside(name, candidates[name], own) for name in MARKERS)
+        large, small = large[:1], small[:1]
     # A small marker beside a whole large one is not the target's.
     if len(large) == 1:
         return {"large": large[0]}
@@ -207,51 +192,25 @@ def choose(
     return {}
 
 
-def _chosen(
-    wholes: list[tuple[float, int, int]],
-    large: list[Array],
-    expected: Mapping[MarkerName, Array],
-    own: TargetSelector | None,
-) -> tuple[float, int, int]:
-    """Return the one that counts of several whole targets."""
-    if len(wholes) == 1 or not (expected or own):
-        return wholes[0]
-    if expected:
-        centre = next(iter(expected.values())).mean(axis=0)
-        away = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
-    else:
-        assert own is not None
-        away = [own.aside_m("large", large[i]) for _, i, _ in wholes]
-    return wholes[int(np.argmin(away))]
-
-
-def _possible(
-    candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
+def _nearest_first(
+    candidates: Mapping[MarkerName, list[Array]], own: AsideOf
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates without the markers that are too far aside. A lone one is left to the
-    pipeline, which says why it is not taken."""
-    if not own.refuses or sum(map(len, candidates.values())) < 2:
+    """Return the candidates that are least far aside first, without those that are too far. A lone
+    one is left to the pipeline, which says why it is not taken."""
+    if sum(map(len, candidates.values())) < 2:
         return candidates
-    kept: dict[MarkerName, list[Array]] = {
-        name: [quad for quad in quads if math.isfinite(own.aside_m(name, quad))]
-        for name, quads in candidates.items()
-    }
+    kept: dict[MarkerName, list[Array]] = {}
+    for name, quads in candidates.items():
+        away_m = [own(name, quad) for quad in quads]
+        order = np.argsort(away_m, kind="stable").tolist()
+        kept[name] = [quads[k] for k in order if math.isfinite(away_m[k])]
     return kept if any(kept.values()) else candidates
-
-
-def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> list[Array]:
-    """Return the quadrilateral that `own` has nearest, of several."""
-    if len(quads) < 2:
-        return quads
-    away = [own.aside_m(name, quad) for quad in quads]
-    return [quads[int(np.argmin(away))]]
 
 
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs that belong together, each large marker in one: misfit and both indices, the
-    best first."""
+    """Return the pairs that belong together, misfit and indices, best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
     best: dict[int, tuple[float, int, int]] = {}
@@ -262,8 +221,7 @@ def _wholes(
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return how far the small marker's corners are from where the large one puts them, in units of
-    what is allowed (1 or less: they belong together)."""
+    """Return how far the small marker is from its place; up to 1 is allowed."""
     mapped = nested(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
@@ -273,8 +231,7 @@ def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """Return the candidate that continues the last detections, in place and in size, if any
-    does."""
+    """Return the candidate that continues the last detections, if any."""
     if not expected or not quads:
         return None
     if name in expected:

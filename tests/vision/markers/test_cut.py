@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig
 from perchctl.vision import (
     Attitude,
     Frame,
@@ -32,7 +31,8 @@ from perchctl.vision.markers.cut import (
     is_cut,
     outline_of,
 )
-from perchctl.vision.markers.detect import between, detect_markers
+from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners, frame
@@ -99,15 +99,11 @@ def test_the_large_marker_stands_for_what_shows_nothing_of_the_small_one() -> No
     assert float(error @ np.linalg.solve(found.large.cov_px2, error)) < 20.0
 
 
-def test_it_is_never_a_first_sight() -> None:
+def test_it_is_never_a_first_sight_nor_one_after_a_while() -> None:
     image, expected = picture("height"), both(BESIDE_HEIGHT)
     assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
     assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
-    assert not nothing(look("height"))
-
-
-def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert not nothing(look("height", age_s=MOST_AGE_S - 0.01))
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
 
@@ -167,12 +163,12 @@ def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> Non
 def test_what_leaves_a_direction_open_is_refused() -> None:
     """With a lens through which its corners could be told."""
     plain = replace(CAMERA, dist=np.zeros(5))
-    outline = outline_of(SETUP.patterns["large"].drawing)
+    outline = outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
     image = render(*LINE, plain, noise=4.0, blur_px=1.0)
-    found = fitted(image, _pose("line"), outline, 0.0 * outline.cell, plain)
+    found = fitted(image, _pose("line"), outline, plain)
     assert found.shown == found.in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
-    assert cut_markers(image, expected, SETUP.patterns, plain) == {}
+    assert cut_markers(Picture(image, None, SETUP, plain), expected) == {}
 
 
 @pytest.mark.parametrize("name", ["height", "width"])
@@ -197,12 +193,12 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     image, mask = gear(picture("height"))
     true = corners("small", BESIDE_HEIGHT)
     expected = both(BESIDE_HEIGHT, 10.0)
-    assert cut_markers(image, expected, SETUP.patterns, CAMERA) == {}
-    outline = outline_of(SETUP.patterns["large"].drawing)
+    assert cut_markers(Picture(image, None, SETUP, CAMERA), expected) == {}
+    outline = outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
-    fit = fitted(image, _pose("height"), outline, 0.0 * outline.cell, CAMERA, own)
+    fit = fitted(image, _pose("height"), outline, CAMERA, own)
     assert fit.shown == fit.in_view
-    found = cut_markers(image, expected, SETUP.patterns, CAMERA, mask)["small"]
+    found = cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
 
@@ -230,34 +226,27 @@ def _pose(name: str) -> RigidPose:
 def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     """Of the large marker alone in view, and its far corners where the lens model has no
     inverse."""
-    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing)
+    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
     x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
-    found = fitted(image, _pose("corner"), outline, 0.0 * outline.cell, CAMERA)
+    found = fitted(image, _pose("corner"), outline, CAMERA)
     assert found.small == 0
-    assert cut_markers(image, both(POSES["corner"]), SETUP.patterns, CAMERA) == {}
+    assert cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
 
 
 def test_a_prediction_may_be_off_in_range() -> None:
     rvec, tvec = BESIDE_HEIGHT
     for growth in (0.93, 1.07):
         expected = both((rvec, tvec * (1.0, 1.0, growth)))
-        assert "small" in cut_markers(picture("height"), expected, SETUP.patterns, CAMERA)
-
-
-def test_two_fields_of_it_are_surer_than_one() -> None:
-    a = look("height")
-    middle = between(a, replace(a, small=replace(a.small, corners_px=a.small.corners_px + 1.0)))
-    assert middle.small.cov_px2 is not None
-    assert np.allclose(middle.small.corners_px, a.small.corners_px + 0.5)
-    assert np.allclose(middle.small.cov_px2, a.small.cov_px2 / 2.0)
+        assert "small" in cut_markers(Picture(picture("height"), None, SETUP, CAMERA), expected)
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])
 def test_a_square_beyond_all_lenses_shows_no_edges(side_px: float) -> None:
     """Where a lens model throws a near target's far corners overflows a picture's coordinates."""
     square_px = np.array([[side_px, 0.0, 320.0], [0.0, side_px, 240.0], [0.0, 0.0, 1.0]])
-    assert seen_edges(picture("height"), square_px, SETUP.patterns["large"], CAMERA, None) is None
+    seen = Picture(picture("height"), None, SETUP, CAMERA)
+    assert seen_edges(seen, square_px, SETUP.patterns["large"]) is None
 
 
 # --- The pipeline on the way to contact --------------------------------------------------------
@@ -269,11 +258,9 @@ NEAREST_M = {"width": 0.025, "height": 0.033, "under": 0.012}
 STEP_M = 0.003
 
 
-def ascent(
-    build: Any, along: str, with_attitude: bool, cut: bool = True
-) -> list[tuple[float, PipelineOutput]]:
+def ascent(build: Any, along: str, with_attitude: bool) -> list[tuple[float, PipelineOutput]]:
     """The camera's distance, and what its picture gave."""
-    setup = build(detector=DetectorConfig(cut=cut))
+    setup = build()
     x, y = SIDEWAYS[along]
     state, out = PipelineState(), []
     for k, z in enumerate(np.arange(0.075, NEAREST_M[along], -STEP_M)):

@@ -13,9 +13,10 @@ from perchctl.vision import project, square_corners
 from perchctl.vision.markers.corners import (
     RAW_SIGMA_PX,
     SUBPIX_SIGMA_PX,
+    refine_each,
 )
 from perchctl.vision.markers.edge_fit import (
-    refine,
+    refine_lines,
 )
 from perchctl.vision.markers.pattern import (
     cells_agree,
@@ -49,7 +50,7 @@ def inwards(corners: Array, amount: float) -> Array:
     return corners - amount * out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
-def errors(noise: float, blur_px: float, method: str, cells: int, side_m: float) -> Array:
+def errors(noise: float, blur_px: float, cells: int, side_m: float) -> Array:
     """(radial bias, error) of each corner over all poses, raw corners 0.5 px inwards."""
     rows = []
     for index, values in enumerate(POSES):
@@ -57,8 +58,8 @@ def errors(noise: float, blur_px: float, method: str, cells: int, side_m: float)
         image = render(rvec, tvec, noise=noise, blur_px=blur_px, seed=index)
         true = true_corners(rvec, tvec, side_m)
         raw = inwards(true, 0.5) + np.random.default_rng(index).normal(0.0, 0.3, (4, 2))
-        result = refine(image, raw[None], [RIMS[cells]], CAMERA, method)[0]
-        assert result.refined == (method == "line")
+        result = refine_lines(image, raw[None], [RIMS[cells]], CAMERA)[0]
+        assert result.refined
         out = true - true.mean(axis=0)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         error = result.corners_px - true
@@ -67,18 +68,14 @@ def errors(noise: float, blur_px: float, method: str, cells: int, side_m: float)
 
 
 @pytest.mark.parametrize(("cells", "side_m"), [(6, 0.150), (7, 0.025)])
-@pytest.mark.parametrize("blur_px", [0.6, 1.2])
-def test_lines_find_corners_without_bias(cells: int, side_m: float, blur_px: float) -> None:
-    poses = errors(0.0, blur_px, "line", cells, side_m)
+@pytest.mark.parametrize(("noise", "blur_px"), [(0.0, 0.6), (0.0, 1.2), (10.0, 0.7)])
+def test_lines_find_corners_without_bias(
+    cells: int, side_m: float, noise: float, blur_px: float
+) -> None:
+    poses = errors(noise, blur_px, cells, side_m)
     poses = poses if side_m > 0.1 else poses[:12]  # beyond 30 cm its cells are 4 px and less
-    assert abs(poses[:, 0].mean()) < 0.02
-    assert np.sqrt((poses[:, 1:] ** 2).mean()) < 0.03
-
-
-def test_lines_are_calm_in_noise() -> None:
-    poses = errors(10.0, 0.7, "line", 6, 0.150)
-    assert abs(poses[:, 0].mean()) < 0.03
-    assert np.sqrt((poses[:, 1:] ** 2).mean()) < 0.08
+    assert abs(poses[:, 0].mean()) < (0.03 if noise else 0.02)
+    assert np.sqrt((poses[:, 1:] ** 2).mean()) < (0.08 if noise else 0.03)
 
 
 @pytest.mark.parametrize("off_px", [4.0, 6.0, 6.5])
@@ -92,8 +89,8 @@ def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float)
         true = true_corners(rvec, tvec, 0.150)
         turn = rng.uniform(-np.pi, np.pi)
         raw = true + off_px * np.array([np.cos(turn), np.sin(turn)])
-        result = refine(image, raw[None], [RIMS[6]], CAMERA, "line")[0]
-        if result.refined:
+        result = refine_lines(image, raw[None], [RIMS[6]], CAMERA)[0]
+        if result is not None:
             fitted += 1
             assert np.abs(result.corners_px - true).max() < 0.1
     assert fitted >= 6
@@ -112,7 +109,7 @@ def test_a_sheet_that_curls_shifts_no_edges(curl: float) -> None:
     squared = (way**2).sum(axis=2, keepdims=True) / reach_px**2
     at = (centre + way * (1.0 - curl * squared)).astype(np.float32)
     curled = np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC), np.uint8)
-    found = refine(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA, "line")[1]
+    found = refine_lines(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA)[1]
     out = (small - centre) / np.linalg.norm(small - centre, axis=1, keepdims=True)
     assert found.refined
     assert abs(float(((found.corners_px - small) * out).sum(axis=1).mean())) < 0.08
@@ -136,7 +133,7 @@ def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
         out = true - true.mean(axis=0)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         for rims, rows in ((RIMS, biases), (closed, raw_biases)):
-            result = refine(image, true[None], [rims[6]], CAMERA, "line")[0]
+            result = refine_lines(image, true[None], [rims[6]], CAMERA)[0]
             assert result.refined
             rows.append(((result.corners_px - true) * out).sum(axis=1).mean())
             assert abs(rows[-1]) < 4.0 * np.hypot(result.shift_sigma_px, result.sigma_px)
@@ -150,28 +147,20 @@ def test_an_occluded_part_of_a_side_is_left_out() -> None:
     true = true_corners(rvec, tvec, 0.150)
     spot = (0.7 * true[0] + 0.3 * true[1]).astype(int)
     image[spot[1] - 5 : spot[1] + 6, spot[0] - 9 : spot[0] + 10] = 220
-    result = refine(image, true[None] + 0.4, [RIMS[6]], CAMERA, "line")[0]
+    result = refine_lines(image, true[None] + 0.4, [RIMS[6]], CAMERA)[0]
     assert result.refined
     assert np.abs(result.corners_px - true).max() < 0.1
 
 
-def test_what_is_no_square_or_flat_falls_back_to_the_raw_corners() -> None:
+def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corners() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
     raw = np.array([[200.0, 200.0], [260.0, 205.0], [255.0, 262.0], [198.0, 258.0]])
     for image, most_px in ((noise, 6.5), (np.full_like(noise, 128), 1e-5)):
-        result = refine(image, raw[None], [RIMS[6]], CAMERA, "line")[0]
+        assert refine_lines(image, raw[None], [RIMS[6]], CAMERA) == [None]
+        result = refine_each(image, raw, 6)
         assert not result.refined
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
         assert result.sigma_px in (RAW_SIGMA_PX, SUBPIX_SIGMA_PX)
-
-
-def test_none_leaves_the_corners_alone() -> None:
-    rvec, tvec = pose_of(*POSES[0])
-    raw = true_corners(rvec, tvec, 0.150)[None] + 0.3
-    (result,) = refine(render(rvec, tvec), raw, [RIMS[6]], CAMERA, "none")
-    assert np.array_equal(result.corners_px, raw[0])
-    assert not result.refined
-    assert refine(render(rvec, tvec), np.empty((0, 4, 2)), [], CAMERA, "line") == []
 
 
 # --- Cells -------------------------------------------------------------------------------------

@@ -16,13 +16,13 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, make_pipeline
 from perchctl.vision.fields import field_picture
-from perchctl.vision.markers.corners import from_unit, mapped
+from perchctl.vision.markers.corners import RefinedCorners, from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import (
+    Picture,
     hidden_in,
     hides,
     make_aruco_detector,
-    make_mask,
 )
 from perchctl.vision.markers.partial import (
     KnownBy,
@@ -36,6 +36,13 @@ from tests.helpers.target_picture import CAMERA, pose_of, render
 Grey = NDArray[np.uint8]
 W, H = CAMERA.size_px
 LARGE = SETUP.patterns["large"]
+
+
+def partly(
+    image: Grey, start_px: Array, known_by: KnownBy, hidden: NDArray[np.bool_] | None = None
+) -> RefinedCorners | None:
+    """The large marker by what is seen of it."""
+    return seen_partly(Picture(image, hidden, SETUP, CAMERA), "large", start_px, known_by)
 
 
 def beyond(pose: tuple[Array, Array], name: MarkerName = "large") -> float:
@@ -88,15 +95,6 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
     assert np.mean(np.square(squares)) < 2.0
 
 
-def test_corners_out_of_sight_are_claimed_to_be_known_less() -> None:
-    pose = cut(0.1, 1)
-    found = detect_markers(frame(render(*pose, noise=2.0)), None, SETUP, CAMERA).large
-    assert found.cov_px2 is not None
-    spread = np.sqrt(np.diagonal(found.cov_px2).reshape(4, 2).sum(axis=1))
-    gone = int(corners("large", pose)[:, 0].argmin())
-    assert spread[gone] > 1.1 * np.delete(spread, gone).max()
-
-
 @pytest.mark.parametrize("share", [0.02, 0.04, 0.25, 0.4])
 def test_the_edge_of_the_picture_is_taken_for_no_side(share: float) -> None:
     """Alone, the large marker is measured or refused, and never made smaller than it is."""
@@ -119,7 +117,7 @@ def test_a_side_along_the_edge_of_the_picture_is_not_drawn_inwards(share: float)
     first = detect_markers(frame(image), None, SETUP, CAMERA)
     for found in (first, detect_markers(frame(image, 1), first, SETUP, CAMERA)):
         assert np.abs(found.large.corners_px - true).max() < 0.03
-    seen = seen_partly(image, true + 1.0, LARGE, CAMERA, "bits")
+    seen = partly(image, true + 1.0, "bits")
     assert np.abs(seen.corners_px - true).max() < 0.03
 
 
@@ -127,7 +125,7 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     """Both markers decoded, but the large one does not look as it should."""
     pose = cut(0.03, 0)
     image = render(*pose, noise=2.0)
-    assert set(search(image, {}, SETUP).corners_px) == {"large", "small"}
+    assert set(search(Picture(image, None, SETUP, CAMERA), {}).corners_px) == {"large", "small"}
     large = MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150)
     other = make_aruco_detector(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
     setup = replace(SETUP, patterns={**SETUP.patterns, "large": other})
@@ -178,10 +176,10 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     spots = mapped(from_unit(true), LARGE.spots[LARGE.owner == black])
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
-    found = seen_partly(bright, true, LARGE, CAMERA, "track")
+    found = partly(bright, true, "track")
     assert np.abs(found.corners_px - true).max() < 0.1
     grey = np.where(bright > image + 20, 200, image).astype(np.uint8)  # white paper instead
-    assert seen_partly(grey, true, LARGE, CAMERA, "track") is None
+    assert partly(grey, true, "track") is None
 
 
 def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
@@ -189,11 +187,11 @@ def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
     image = render(*pose, markers=(("DICT_4X4_1000", 16, 0.150),))
     ways: tuple[KnownBy, ...] = ("bits", "track", "other")
     for known_by in ways:
-        assert seen_partly(image, corners("large", pose), LARGE, CAMERA, known_by) is None
+        assert partly(image, corners("large", pose), known_by) is None
     turned = np.roll(corners("large", pose), 1, axis=0)
     right = render(*pose)
-    assert seen_partly(right, turned, LARGE, CAMERA, "other") is None
-    assert seen_partly(right, corners("large", pose), LARGE, CAMERA, "bits") is not None
+    assert partly(right, turned, "other") is None
+    assert partly(right, corners("large", pose), "bits") is not None
 
 
 def test_a_code_that_may_be_another_one_is_not_told_by_its_bits_alone() -> None:
@@ -204,8 +202,8 @@ def test_a_code_that_may_be_another_one_is_not_told_by_its_bits_alone() -> None:
     cell = float(np.linalg.norm(true[1] - true[0])) / 6.0
     x, y = true[0] + 1.05 * cell
     covered[round(y) : round(y + 0.9 * cell), round(x) : round(x + 1.9 * cell)] = True
-    assert seen_partly(image, true, LARGE, CAMERA, "bits", covered) is None
-    assert seen_partly(image, true, LARGE, CAMERA, "track", covered) is not None
+    assert partly(image, true, "bits", covered) is None
+    assert partly(image, true, "track", covered) is not None
 
 
 # --- The vehicle's own gear in the picture: `camera.mask`, from the file to the corners --------
@@ -222,12 +220,6 @@ def over(*ends: tuple[float, float], width: int = 22) -> NDArray[np.bool_]:
     return drawn > 0
 
 
-def behind(image: NDArray[np.uint8], covered: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The picture with the leg before it, dark, and a little smaller than its mask."""
-    inner = cv2.erode(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return np.where(inner, 25, image).astype(np.uint8)
-
-
 def middle(a: int, b: int) -> tuple[float, float]:
     x, y = 0.5 * (TRUE[a] + TRUE[b])
     return float(x), float(y)
@@ -242,41 +234,31 @@ LEGS = {
 
 @pytest.mark.parametrize("name", sorted(LEGS))
 def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
-    covered = LEGS[name]
-    assert hides(covered, TRUE)
-    setup = replace(SETUP, mask=make_mask(covered))
-    image = behind(render(*POSE, noise=2.0), covered)
-    before: Detections | None = None
-    for k in range(2):
-        before = detect_markers(frame(image, k), before, setup, CAMERA)
-        assert before.large.cov_px2 is not None
-        assert np.abs(before.large.corners_px - TRUE).max() < 0.2
-
-
-@pytest.mark.parametrize("name", sorted(LEGS))
-def test_what_a_leg_covers_counts_for_nothing(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
-    setup = replace(SETUP, mask=make_mask(covered))
-    found = []
+    assert hides(covered, TRUE)
+    setup, found = replace(SETUP, mask=covered), []
     for grey in (0, 120, 255):
         image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)
-        large = detect_markers(frame(image), None, setup, CAMERA).large
-        found.append(large.corners_px)
+        before: Detections | None = None
+        for k in range(2):
+            before = detect_markers(frame(image, k), before, setup, CAMERA)
+            assert before.large.cov_px2 is not None
+            assert np.abs(before.large.corners_px - TRUE).max() < 0.2
+        found.append(before.large.corners_px)
     assert np.array_equal(found[0], found[1])
     assert np.array_equal(found[0], found[2])
 
 
 def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
     covered = LEGS["corner"]
-    mask = make_mask(covered)
     image = np.where(covered, 0, 200).astype(np.uint8)
     for first_row, name in ((0, "top"), (1, "bottom")):
         field = field_picture(image, first_row)
-        hidden = hidden_in(Frame(0, 0.0, field, fields=name), mask)
+        hidden = hidden_in(Frame(0, 0.0, field, fields=name), covered)
         assert hidden is not None
         assert (field[~hidden] == 200).all()
-    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), mask)
+    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), covered)
     assert whole is not None
     assert np.array_equal(whole, covered)
 
@@ -284,9 +266,11 @@ def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
 # --- the file ----------------------------------------------------------------------------------
 
 
-def profile_with(folder: Path, image: NDArray[np.uint8] | None, **camera: object) -> Profile:
+def profile_with(folder: Path, image: Grey | str | None, **camera: object) -> Profile:
     """A profile in a folder, with the mask beside it."""
-    if image is not None:
+    if isinstance(image, str):
+        (folder / "gear.png").write_text(image)
+    elif image is not None:
         cv2.imwrite(str(folder / "gear.png"), image)
     keys = "".join(f", {key}: {value}" for key, value in camera.items())
     (folder / "mine.yaml").write_text(f"extends: sim\ncamera: {{mask: gear.png{keys}}}\n")
@@ -297,9 +281,9 @@ def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
     drawn = np.zeros((H, W), np.uint8)
     drawn[:40, :70] = 255
     mask = make_pipeline(profile_with(tmp_path, drawn), CAMERA).detector.mask
-    assert np.array_equal(mask.whole, drawn > 0)
+    assert np.array_equal(mask, drawn > 0)
     turned = make_pipeline(profile_with(tmp_path, drawn, mirrored="true"), CAMERA).detector.mask
-    assert np.array_equal(turned.whole, drawn[:, ::-1] > 0)
+    assert np.array_equal(turned, drawn[:, ::-1] > 0)
     assert make_pipeline(Profile(), CAMERA).detector.mask is None
 
 
@@ -310,21 +294,16 @@ WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
     ("image", "error", "told"),
     [
         (None, NotFound, "does not exist"),
+        ("legs", InvalidValue, "cannot be read as a picture"),
         (WHITE[:240, :320], InvalidValue, "320x240 px, but the calibration was made at 640x480"),
         (WHITE, InvalidValue, "covers 100 % of the picture, at most 75 %"),
         (BLACK, InvalidValue, "covers nothing"),
     ],
 )
 def test_a_mask_that_cannot_be_is_one_sentence(
-    image: NDArray[np.uint8] | None, error: type[PerchError], told: str, tmp_path: Path
+    image: Grey | str | None, error: type[PerchError], told: str, tmp_path: Path
 ) -> None:
     with pytest.raises(error, match=told) as caught:
         make_pipeline(profile_with(tmp_path, image), CAMERA)
     assert "gear.png" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_mask_that_is_no_picture_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "gear.png").write_text("legs")
-    with pytest.raises(InvalidValue, match="cannot be read as a picture"):
-        make_pipeline(profile_with(tmp_path, None), CAMERA)

@@ -12,29 +12,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision import CameraModel, project, square_corners
-from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.blurred import (
     expected_in_blur,
     hidden_in_blur,
     told_apart,
     verified,
 )
-from perchctl.vision.markers.corners import from_unit
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import make_aruco_detector
+from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.pattern import Drawing, drawing_of
 from perchctl.vision.markers.photometric_fit import (
     Alignment,
     align,
-    lens_shift_px,
-    make_grid,
-    projected,
-    through_lens,
 )
 from perchctl.vision.types import Detection, Detections
-from tests.helpers.markers import SETUP, blurry, box, frame
+from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)
@@ -87,7 +80,6 @@ def test_corners_of_small_and_blurred_markers(
         error = found.corners_px - true
         squares.append((error**2).mean())
         assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
-        assert found.gain == pytest.approx(175.0, rel=0.2)
     assert math.sqrt(np.mean(squares)) < allowed_px
 
 
@@ -130,23 +122,6 @@ def test_other_markers_are_not_verified(
     for k in range(4):
         found = align(image, np.roll(true, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
         assert found is None or not verified(found)
-
-
-def test_nothing_is_verified_where_there_is_no_marker() -> None:
-    rng = np.random.default_rng(7)
-    smooth = np.zeros((480, 640))
-    for step in (6, 12, 30):  # a texture of all sizes
-        coarse = rng.uniform(-60, 60, (480 // step + 2, 640 // step + 2))
-        smooth += np.kron(coarse, np.ones((step, step)))[:480, :640]
-    image = np.clip(120 + smooth, 0, 255).astype(np.uint8)
-    for _ in range(60):
-        side = float(np.exp(rng.uniform(math.log(10), math.log(90))))
-        angle, centre = rng.uniform(0, math.tau), rng.uniform((100, 100), (540, 380))
-        turns = angle + np.arange(4) * math.pi / 2
-        corners = centre + side / math.sqrt(2) * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-        for drawing in DRAWINGS.values():
-            found = align(image, corners, drawing, CAMERA, 1.5)
-            assert found is None or not verified(found)
 
 
 @pytest.mark.parametrize(
@@ -232,20 +207,6 @@ def test_a_blurred_marker_of_another_codeword_is_not_taken(wrong: list[tuple[int
     assert detect_markers(frame(own), None, SETUP, PINHOLE).small is not None
 
 
-# --- What the lens does to a marker's nodes, from a few of them --------------------------------
-
-
-def _exact(uv1: Array, H: Array) -> Array:
-    pin = projected(H, uv1)
-    return np.asarray(through_lens(pin, CAMERA) - pin)
-
-
-@given(st.floats(20.0, 620.0), st.floats(20.0, 460.0), st.floats(8.0, 60.0))
-def test_a_small_marker_anywhere(cx: float, cy: float, side_px: float) -> None:
-    grid, H = make_grid(30, 1.2), from_unit(undistort_px(box(cx, cy, side_px), CAMERA))
-    assert np.abs(_exact(grid.uv1, H) - lens_shift_px(grid, H, CAMERA)).max() < 1e-4
-
-
 # --- Blur that hides the target ----------------------------------------------------------------
 
 
@@ -257,19 +218,17 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
     image, true = blurry(26.0, 3.0, seed)
     ids = ARUCO.detectMarkers(image)[1]
     assert ids is None or 997 not in ids
-    still = hidden_in_blur(image, SETUP, CAMERA)
+    still = hidden_in_blur(Picture(image, None, SETUP, CAMERA))
     assert np.abs(still["large"].corners_px - true).max() < 0.5
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
-    blind = make_aruco_detector(DetectorConfig(blurred=False), TargetConfig())
-    assert detect_markers(frame(image), None, blind, CAMERA).large is None
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_in_blur_the_target_is_found_beside_where_it_is_expected(seed: int) -> None:
     image, true = blurry(24.0, 3.0, seed)
     way = np.random.default_rng(seed).uniform(-8.0, 8.0, 2)
-    seen = expected_in_blur(image, {"large": true + way}, SETUP.patterns, CAMERA)
+    seen = expected_in_blur(Picture(image, None, SETUP, CAMERA), {"large": true + way})
     assert np.abs(seen["large"].corners_px - true).max() < 0.5
     before = Detections(0, 0.0, Detection("large", true + way, 0.1, True))
     found = detect_markers(frame(image, 1), before, SETUP, CAMERA)
@@ -287,5 +246,5 @@ def test_in_blur_nothing_is_taken_for_the_target() -> None:
             image[y : y + side, x : x + side] = 30
             image[y + side // 5 : y + 4 * side // 5, x + side // 5 : x + 4 * side // 5] = 210
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
-        assert hidden_in_blur(image, SETUP, CAMERA) == {}
-        assert expected_in_blur(image, expected, SETUP.patterns, CAMERA) == {}
+        assert hidden_in_blur(Picture(image, None, SETUP, CAMERA)) == {}
+        assert expected_in_blur(Picture(image, None, SETUP, CAMERA), expected) == {}

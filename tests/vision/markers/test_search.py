@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from perchctl.vision import Frame, PipelineState, step
-from perchctl.vision.markers import detect as detect_room
-from perchctl.vision.markers import search as search_room
+from perchctl.vision import Frame, Pipeline, PipelineState, step
 from perchctl.vision.markers.search import choose
 from tests.helpers.markers import SETUP, box
 from tests.helpers.target_picture import pose_of, render
 
 RATIO = SETUP.ratio
+Build = Callable[..., Pipeline]
 
 
 @pytest.mark.parametrize(
@@ -70,112 +69,32 @@ def test_a_whole_target_elsewhere_does_not_stand_in_for_the_own_one() -> None:
     near = choose({"large": large, "small": small}, {"large": box(104, 98, 60)}, RATIO)
     assert list(near) == ["large"]
     assert near["large"] is large[0]
+    # Not a look-alike of another size: that goes on from nothing.
+    other = {"large": [box(100, 100, 20), large[1]], "small": small}
+    assert choose(other, {"large": box(104, 98, 60)}, RATIO)["large"] is large[1]
     small = [box(100, 100, 10), box(400, 200, 10)]
     near = choose({"large": large[1:], "small": small}, {"small": box(104, 98, 10)}, RATIO)
     assert list(near) == ["small"]
     assert near["small"] is small[0]
 
 
-def test_a_lone_look_alike_goes_before_a_whole_target_until_it_is_out_of_sight() -> None:
-    """As the gate says of it: with the whole picture searched both are seen, and one is told."""
-    whole = {"large": [box(400, 200, 60)], "small": [box(400, 200, 10)]}
-    lone = {"large": box(104, 98, 60)}
-    both = {"large": [box(100, 100, 60), *whole["large"]], "small": whole["small"]}
-    assert list(choose(both, lone, RATIO)) == ["large"]
-    assert choose(both, lone, RATIO)["large"] is both["large"][0]
-    assert choose(whole, lone, RATIO) == {"large": whole["large"][0], "small": whole["small"][0]}
-    # Not a look-alike of another size: that goes on from nothing.
-    other = {"large": [box(100, 100, 20), *whole["large"]], "small": whole["small"]}
-    assert choose(other, lone, RATIO)["large"] is whole["large"][0]
+# --- After a loss the searches take turns ------------------------------------------------------
 
 
-# --- After a loss the searches take turns: none is left out, and no frame has two dear ones ----
-
-
-RATE_HZ = 30.0
 EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
 NEAR, ASIDE = pose_of(0.05, -0.05, 1.2, 0.4), pose_of(-0.45, 0.3, 1.2, 0.4)
-
-
-@dataclass
-class Done:
-    """What one frame was searched by."""
-
-    window: int = 0
-    whole: int = 0
-    near_in_blur: int = 0
-    all_in_blur: int = 0
-
-    @property
-    def dear(self) -> int:
-        return self.whole + self.near_in_blur + self.all_in_blur
-
-
-@dataclass
-class Stream:
-    """Frames through the pipeline, and what each was searched by."""
-
-    setup: object
-    state: PipelineState = field(default_factory=PipelineState)
-    done: list[Done] = field(default_factory=list)
-
-    def see(self, picture: NDArray[np.uint8]) -> bool:
-        self.done.append(Done())
-        k = len(self.done)
-        self.state, output = step(self.state, Frame(k, k / RATE_HZ, picture), None, self.setup)
-        return output.detections.large is not None
-
-
-@pytest.fixture
-def stream(build: object, monkeypatch: pytest.MonkeyPatch) -> Stream:
-    made = Stream(build())
-    one_pass, near, anywhere = (
-        search_room._pass,
-        detect_room.expected_in_blur,
-        detect_room.hidden_in_blur,
-    )
-
-    def passed(image, window, *rest):
-        whole = image[window].shape == image.shape
-        made.done[-1].whole += whole
-        made.done[-1].window += not whole
-        return one_pass(image, window, *rest)
-
-    def near_in_blur(*rest):
-        made.done[-1].near_in_blur += 1
-        return near(*rest)
-
-    def all_in_blur(*rest):
-        made.done[-1].all_in_blur += 1
-        return anywhere(*rest)
-
-    monkeypatch.setattr(search_room, "_pass", passed)
-    monkeypatch.setattr(detect_room, "expected_in_blur", near_in_blur)
-    monkeypatch.setattr(detect_room, "hidden_in_blur", all_in_blur)
-    return made
-
-
-def test_no_frame_of_a_stream_has_two_dear_searches(stream: Stream) -> None:
-    for k in range(60):
-        stream.see(render(*NEAR) if k < 3 else EMPTY)
-    lost = stream.done[3:]
-    assert max(done.dear for done in lost) == 1
-    # ... and each of them has its turn.
-    assert sum(done.near_in_blur for done in lost) > 1
-    assert sum(done.all_in_blur for done in lost) > 5
-    assert sum(done.whole for done in lost) > 20
-    assert lost[0].window > 0
 
 
 @pytest.mark.parametrize("lost", [0, 1, 2, 3, 7, 40])
 @pytest.mark.parametrize("place", [NEAR, ASIDE])
 def test_what_comes_back_is_found_by_the_second_frame(
-    stream: Stream, lost: int, place: tuple[np.ndarray, np.ndarray]
+    build: Build, lost: int, place: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Wherever it is by then, sharp as it is; a jump out of the window costs one frame at most."""
-    for _ in range(3):
-        assert stream.see(render(*NEAR))
-    for _ in range(lost):
-        assert not stream.see(EMPTY)
-    back = render(*place)
-    assert any(stream.see(back) for _ in range(2))
+    images = [render(*NEAR)] * 3 + [EMPTY] * lost + [render(*place)] * 2
+    state, seen = PipelineState(), []
+    for k, image in enumerate(images):
+        state, output = step(state, Frame(k, k / 30.0, image), None, build())
+        seen.append(output.detections.large is not None)
+    assert seen[: 3 + lost] == [True] * 3 + [False] * lost
+    assert any(seen[3 + lost :])
