@@ -36,7 +36,6 @@ from perchctl.vision import (
     Frame,
     MarkerPose,
     PipelineState,
-    estimate_pose,
     make_pipeline,
     step,
 )
@@ -70,7 +69,6 @@ class MarkerReading:
     t_s: float
     large: Array | None
     small: Array | None
-    joint: Array | None
     center_px: Array | None
 
 
@@ -88,14 +86,11 @@ def read_markers(
     for frame in frames:
         state, output = step(state, frame, attitude, setup)
         seen = [d for name in MARKERS if (d := output.detections.get(name)) is not None]
-        both = len(seen) == 2
-        joint = estimate_pose(seen, frame.t_s, attitude, setup.pose) if both else None
         yield MarkerReading(
             frame.t_s,
             _vector(output.poses.get("large")),
             _vector(output.poses.get("small")),
-            _vector(joint),
-            np.concatenate([d.corners_px for d in seen]).mean(axis=0) if both else None,
+            np.concatenate([d.corners_px for d in seen]).mean(axis=0) if len(seen) == 2 else None,
         )
 
 
@@ -131,7 +126,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
     """Return the lines of a position in the session's file."""
-    return "".join(row_text(position, r.t_s, [r.large, r.small, actual, r.joint]) for r in readings)
+    return "".join(row_text(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
 class SessionFile:
