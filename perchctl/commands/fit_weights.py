@@ -150,7 +150,7 @@ def _open_session(path: Path, frames: int) -> SessionFile:
     if session.note:
         say(session.note)
     if session.done:
-        say(f"{session.path} holds {len(session.done)} positions already")
+        say(f"{session.path} holds {session.done} positions already")
     return session
 
 
@@ -163,7 +163,7 @@ def _collect_simulated(
         raise no_simulator(error.name) from None
 
     session = _open_session(path, frames)
-    with count_bar("frames", max(0, positions - len(session.done)) * frames) as advance:
+    with count_bar("frames", max(0, positions - session.done) * frames) as advance:
         SimulatedStand(profile, camera, positions, seed).fill(session, frames, advance)
 
 
