@@ -100,7 +100,7 @@ MOST_NAMES = {
     "positioning": 10,
     "profile": 35,
     "sim": 14,
-    "target": 15,
+    "target": 14,
     "vision": 26,
     "weights": 9,
 }

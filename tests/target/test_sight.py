@@ -17,10 +17,8 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig, load_profile
 from perchctl.profile.vision import VehicleConfig
-from perchctl.target import make_design, overhead_text, suggest_target, view_from
+from perchctl.target import make_design, overhead_text, view_from
 from perchctl.target.design import TargetDesign
-from perchctl.target.reading import check_target
-from perchctl.target.sheets import fits
 from perchctl.target.sight import (
     SURE_PX,
     BlindRange,
@@ -32,7 +30,7 @@ from perchctl.target.sight import (
 )
 from perchctl.vision import project, square_corners
 from tests.helpers.flights import short_profile
-from tests.target.rig import camera_of, sized
+from tests.target.rig import camera_of
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
@@ -259,26 +257,3 @@ def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position() -> None
     for ceiling_m, gap in ((0.9 * sure_m, False), (1.1 * sure_m, True)):
         design = make_design(TARGET, PAPER_CAMERA, 0.6, ground, ceiling_m)
         assert any("gap at the start" in text for text in design.warnings) is gap
-
-
-def test_a_camera_far_from_the_gear_gets_a_target_and_a_warning() -> None:
-    aside = short_profile({"camera.mount.position_m": (0.3, 0.0, 0.0)}, base="sim")
-    found, _ = suggest_target(PAPER_CAMERA, 0.6, aside, 0.05)
-    assert any("gap before contact" in text for text in found.warnings)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("focal_px", "blur_px", "ceiling_m"), [(380.0, 2.0, 2.4), (250.0, 0.6, None)]
-)
-def test_what_is_suggested_covers_the_way(
-    profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
-) -> None:
-    found, page = suggest_target(camera_of(focal_px), blur_px, profile, 0.05, ceiling_m)
-    assert page == "a4"
-    assert found.warnings == ()
-    assert found.z1_m is not None
-    assert found.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
-    check_target(found.target, 0.05)
-    assert fits(found.target, "a4")
-    assert not fits(sized(1e3 * found.target.large.side_m + 5, 25.0), "a4")
