@@ -85,7 +85,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 10,
-    "calibration": 17,
+    "calibration": 16,
     "camera": 17,
     "campaign": 22,
     "check": 8,

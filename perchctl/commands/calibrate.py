@@ -1,4 +1,4 @@
-"""`perchctl calibrate`: pictures in, calibration file and report out; a mask, a check, a converted
+"""`perchctl calibrate`: pictures in, calibration file out; a mask, a check, a converted
 file. `calibrate mount` is in a file of its own."""
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
+from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, check_place, same_file, write_files
+from perchctl.files import check_output, same_file, write_files
 from perchctl.target import Board
 from perchctl.vision import CameraModel
 
@@ -120,33 +120,24 @@ def camera(
     """
     pictures = _source(source, view)
     if output is not None:
-        _check_output(output, force)
+        check_output(output, SUFFIXES, force, CONTENT)
     layout = Board.parse(board)
 
     def check_place_of(size_px: tuple[int, int]) -> None:
         """Raise before a person has worked for a file that cannot be written."""
-        _check_output(_file(output, size_px), force)
+        check_output(_file(output, size_px), SUFFIXES, force, CONTENT)
 
     found = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
     file = _file(output, found.views[0].size_px)
-    _check_output(file, force)
+    check_output(file, SUFFIXES, force, CONTENT)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
     result = calibrate_camera(found, layout.notation(), model)
     write_files({file: result.text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
-
-    def draw() -> Path:
-        from perchctl.calibration import draw_calibration
-
-        picture = file.with_suffix(".png")
-        write_files({picture: draw_calibration(result)})
-        return picture
-
-    report = draw_unless_interrupted(draw)
-    say(f"wrote {file}" + ("" if report is None else f" and {report}"))
-    record = result.record() | {"file": str(file), "report": report and str(report)}
+    say(f"wrote {file}")
+    record = result.record() | {"file": str(file)}
     print_result(record if as_json else file)
 
 
@@ -250,11 +241,6 @@ def convert(
 
 def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
     return output or FOLDER / f"camera_{size_px[0]}x{size_px[1]}.yaml"
-
-
-def _check_output(file: Path, force: bool) -> None:
-    check_output(file, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
-    check_place(file.with_suffix(".png"), force)
 
 
 def _now() -> str:
