@@ -291,20 +291,19 @@ def _find_views(
         check: called with a live camera's picture size before the person begins.
     """
     source = parse_source(spec)
-    place = Path(source.place).expanduser()
-    if source.live:
+    if source.scheme != "images":
         frames = open_camera(spec, time.monotonic, size_px=size_px)
         with contextlib.closing(frames):
-            assert frames.size_px is not None  # the first frame is there
-            check(frames.size_px)
+            if frames.size_px is not None:
+                check(frames.size_px)
             return capture_live_views(frames, board, view)
     with search_bar("searching the board") as progress:
-        pictures = image_files(str(place)) if source.scheme == "images" else place
+        pictures = image_files(str(Path(source.place).expanduser()))
         found = find_views(pictures, board, progress)
     if not found.views:
-        first, count = found.missing[0], f"{len(found.missing)} pictures"
+        first = found.missing[0]
         raise InvalidValue(
-            f"none of {count if source.scheme == 'images' else first.view} of {source} shows the "
+            f"none of {len(found.missing)} pictures of {source} shows the "
             f"board {board.notation()} ({first.view}: {first.reason}); is it wholly in view, "
             f"sharp, and --board its true layout?"
         )
@@ -312,7 +311,7 @@ def _find_views(
 
 
 def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundViews:
-    """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
+    """Return views of a video or live camera, taken until all is covered or Ctrl-C ends it.
 
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
@@ -323,7 +322,8 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guide(page))
-        say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
+        if source.live:
+            say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
         found = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(

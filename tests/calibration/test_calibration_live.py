@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import itertools
 import json
 from pathlib import Path
 
@@ -84,8 +85,10 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends(shown: list[Grey]) 
     assert moments[0].advice == "hold still"
     assert moments[-1].rows[-1] == ("views", str(len(views)), None)
     assert len({m.line for m in moments}) == len(views) + 1  # a pipe gets one line a view
-    with pytest.raises(TimedOut, match="only 1 views"):
-        capture_views(_frames(shown[:3]), CHESSBOARD, moments.append)
+    gone = _frames(shown[:3])
+    gone.trouble = "camera:0 is unplugged"
+    with pytest.raises(TimedOut, match="unplugged; only 1 views"):
+        capture_views(gone, CHESSBOARD, moments.append, itertools.count().__next__, lambda s: None)
 
 
 FOLLOWED = {
