@@ -35,7 +35,6 @@ from perchctl.camera import (
 )
 from perchctl.commands.calibrate_mount import mount
 from perchctl.commands.command_line import (
-    CamOption,
     ForceOption,
     Group,
     JsonOption,
@@ -185,20 +184,19 @@ def mask(
     app,
     "perchctl calibrate check camera.yaml images:board",
     "perchctl calibrate check camera.yaml camera:0 --view",
-    "perchctl calibrate check camchain.yaml images:board --cam cam0",
+    "perchctl calibrate check camchain.yaml images:board",
 )
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
-    cam: CamOption = None,
     view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source, view)
     layout = Board.parse(board)
-    model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration)
     found = _find_views(pictures, model.size_px, layout, view)
     check_size(found.views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, found)
@@ -214,18 +212,17 @@ def check(
 @command(
     app,
     "perchctl calibrate convert opencv.yaml",
-    "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
+    "perchctl calibrate convert camchain.yaml -o mine.yaml",
     "perchctl calibrate convert ost.yaml -o calib/fpv.yaml",
 )
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
-    cam: CamOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
-    model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration)
     file = _file(output, model.size_px)
     if same_file(file, calibration):
         raise UsageError(f"{file} is the file to convert; name another with --output")

@@ -11,7 +11,6 @@ import typer
 
 from perchctl.calibration import load_calibration
 from perchctl.commands.command_line import (
-    CamOption,
     ForceOption,
     Group,
     JsonOption,
@@ -176,12 +175,11 @@ def design(
     profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     blur: BlurOption = 1.0,
-    cam: CamOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
-    name, model = _camera(config, camera, cam)
+    name, model = _camera(config, camera)
     found = make_design(config.target, model, blur, config, ceiling)
     record = found.record() | {"target": config.target.model_dump(mode="json")}
     print_result(record if as_json else found.text(name))
@@ -290,10 +288,10 @@ def _chosen(profile: Profile, large: Marker, small: Marker) -> TargetConfig:
     return profile.target.model_copy(update=markers)
 
 
-def _camera(profile: Profile, name: str | None, cam: str | None) -> tuple[str, CameraModel]:
+def _camera(profile: Profile, name: str | None) -> tuple[str, CameraModel]:
     """Return the calibration's file, and the camera."""
     path = find_calibration(name or profile.camera.calibration)
-    return str(path), load_calibration(path, cam=cam)
+    return str(path), load_calibration(path)
 
 
 def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date | None]:

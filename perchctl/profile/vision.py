@@ -131,7 +131,7 @@ class CameraConfig(Section):
     calibration: str = key(
         "example_640x480.yaml", "file beside the profile, in `calib/`, or a whole path"
     )
-    cam: str | None = key(None, "which camera of a Kalibr file of several: `cam0`, `cam1`, ...")
+    cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
     latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = key(
         START_LATENCY_S, "from exposure to arrival; `measured`: by each flight"
     )
