@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import ValuesView
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Vector3 = tuple[float, float, float]
 
@@ -45,29 +37,6 @@ Range = Ordered[float]
 
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse YAML's yes, no, on and off, which would be read as 1 and 0."""
-        kind = cls.model_fields[info.field_name or ""].annotation
-        if _is_of_numbers(kind) and _holds_truth(value):
-            raise ValueError(
-                "found true or false, which is how YAML reads yes, no, on and off; a number is "
-                "needed"
-            )
-        return value
-
-
-def _is_of_numbers(kind: Any) -> bool:
-    return kind in (int, float) or any(map(_is_of_numbers, get_args(kind)))
-
-
-def _holds_truth(value: Any) -> bool:
-    parts = value.values() if isinstance(value, dict) else value
-    if isinstance(parts, (list, tuple, ValuesView)):
-        return any(map(_holds_truth, parts))
-    return isinstance(value, bool)
 
 
 # --- Units ------------------------------------------------------------
