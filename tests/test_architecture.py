@@ -98,7 +98,7 @@ MOST_NAMES = {
     "mission": 27,
     "perception": 6,
     "positioning": 10,
-    "profile": 35,
+    "profile": 33,
     "sim": 14,
     "target": 14,
     "vision": 26,

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
 from perchctl.files import file_kind
@@ -22,7 +22,7 @@ from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
 from perchctl.profile.schema import Profile
-from perchctl.profile.vision import WeightsConfig
+from perchctl.profile.vision import MergeConfig, WeightsConfig
 
 _NAMED_FILES = (
     ("merge", "weights_file", "weights"),
@@ -68,8 +68,8 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
     profile = _checked(path, _read_yaml(path))
     if profile.merge.weights_file is None or not with_weights:
         return profile
-    fitted = read_weights(find_weights(profile.merge.weights_file))
-    merge = profile.merge.model_copy(update={"weights": fitted.weights})
+    weights = _read_weights(profile.merge.weights_file)
+    merge = profile.merge.model_copy(update={"weights": weights})
     return profile.model_copy(update={"merge": merge})
 
 
@@ -98,54 +98,22 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
 # --- The weights file -------------------------------------------------
 
 
-class FittedData(BaseModel):
-    """The data that weights were fitted to."""
-
-    file: str = ""
-    sha256: str = ""
-    rows: int = 0
-    positions: int = 0
-
-
-class FittedWeights(BaseModel):
-    """A weights file, as far as a flight needs it (`perchctl.weights` writes more)."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    date: str = ""
-    method: str = ""
-    weights: WeightsConfig
-    data: FittedData = FittedData()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _all_axes(cls, values: dict[str, Any]) -> dict[str, Any]:
-        given = values.get("weights")
-        if isinstance(given, dict):
-            missing = [axis for axis in WeightsConfig.model_fields if axis not in given]
-            if missing:
-                raise ValueError(f"weights.{missing[0]} is missing; needed are x, y, z and yaw")
-        return values
-
-
-def find_weights(name: str) -> Path:
-    """Return the weights file that a loaded profile names: a whole path, or a name in the user's
-    folder. Raises NotFound."""
+def _read_weights(name: str) -> WeightsConfig:
+    """Return the weights of the file that a loaded profile names: a whole path, or a name in the
+    user's folder. Raises NotFound, InvalidValue."""
     given = Path(name)
-    found = given if given.is_file() else data_file("weights", name)
-    if found is None:
+    path = given if given.is_file() else data_file("weights", name)
+    if path is None:
         raise NotFound(
             f"merge.weights_file: {name} does not exist; perchctl fit-weights makes it, or remove "
             f"the key"
         )
-    return found
-
-
-def read_weights(path: Path) -> FittedWeights:
-    """Read and check a weights file. Errors: NotFound, InvalidValue."""
-    values = _read_yaml(path)
+    weights = _read_yaml(path).get("weights")
+    missing = [axis for axis in WeightsConfig.model_fields if axis not in (weights or ())]
+    if missing:
+        raise InvalidValue(f"{path}: weights.{missing[0]} is missing; needed are x, y, z and yaw")
     try:
-        return FittedWeights.model_validate(values)
+        return MergeConfig.model_validate({"weights": weights}).weights
     except ValidationError as error:
         raise InvalidValue(_one_sentence(path, error)) from None
 

@@ -12,11 +12,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.plain_yaml import clip_text
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
-
-_FORMAT = "^[A-Z0-9]{3,4}$"
-
 
 # --- ArUco dictionaries by name, and the ids they hold ----------------
 
@@ -149,7 +145,7 @@ class CameraConfig(Section):
     format: str | None = key(
         None,
         "asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
-        pattern=_FORMAT,
+        pattern="^[A-Z0-9]{3,4}$",
     )
     rate_hz: float | None = key(
         None, "asked of `camera:` sources; none: the driver's own", gt=0, le=500
@@ -165,16 +161,6 @@ class CameraConfig(Section):
         raise ValueError(
             f"found {latency_s!r}; allowed are 0 to {MOST_LATENCY_S:g} (seconds), or the word "
             f"measured, to have each flight measure it"
-        )
-
-    @field_validator("format", mode="before")
-    @classmethod
-    def _a_format(cls, name: Any) -> Any:
-        if name is None or (isinstance(name, str) and re.fullmatch(_FORMAT, name)):
-            return name
-        raise ValueError(
-            f"found {clip_text(repr(name))}; allowed is a format's name of three or four capitals "
-            f"or digits, as in MJPG or YUYV"
         )
 
     @property

@@ -90,7 +90,7 @@ def _refusal(tmp_path: Path, text: str) -> str:
           for value, found in [("80", "80"), ("-0.1", "-0.1"), ("auto", "'auto'"),
                                ("null", "None"), (".nan", "nan")]),
         *((f"camera: {{format: {value}}}",
-           ["camera.format", f"found {found};", "three or four capitals"])
+           ["camera.format", f"found {found}"])
           for value, found in [("4", "4"), ("mjpeg", "'mjpeg'"), ("[MJPG]", "['MJPG']")]),
         ("camera: {latency_s: yes}", ["camera.latency_s"]),
         ("target: {small: {dictionary: DICT_4X4_1000, id: 997, side_m: 0.025}}",
