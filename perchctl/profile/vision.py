@@ -280,7 +280,7 @@ class PoseConfig(Section):
     )
     refine: bool = key(True, "least squares on the corners after it")
     max_reprojection_px: float = key(3.0, "no pose above this RMS", gt=0)
-    each_marker: bool = key(False, "beside the joint pose also each marker's own, for the log")
+    each_marker: ClassVar[bool] = False  # beside the joint pose also each marker's own
 
 
 class KalmanConfig(Section):
@@ -319,9 +319,8 @@ class KalmanConfig(Section):
         0.1, "of the state estimate's drift, for tracks in the world, likewise", gt=0, le=100
     )
     attitude_sigma_deg: float = key(0.3, "constant error of roll and pitch, likewise", ge=0, le=10)
-    drift_mps: float = key(
-        0.05, "an unmeasured target moves in the estimate's world at most so fast", ge=0, le=1
-    )
+    drift_mps: ClassVar[float] = 0.05
+    """An unmeasured target moves in the estimate's world at most so fast."""
     gate: bool = key(True, "a pose that contradicts the target's track is not taken")
 
 

@@ -44,7 +44,6 @@ def test_paper_constants() -> None:
     assert (weights.x, weights.y, weights.z, weights.yaw) == (0.275, 0.306, 0.728, 0.469)
     assert (paper.merge.z2_m, paper.merge.z3_m) == (0.25, 0.12)
     assert paper.merge.method == "weights"
-    assert paper.planner.recover.descend_m == 0.10
     assert load_calibration(find_calibration(paper.camera.calibration)).size_px == (640, 480)
 
 
