@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
-from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
@@ -46,11 +45,6 @@ def find_profile(name: str) -> Path:
         what = "is a folder" if path.is_dir() else "does not exist"
         raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
     found = data_file("profiles", name)
-    if found is None and Path(name).is_file():
-        kind = file_kind(Path(name))
-        if kind == "a profile":
-            raise InvalidValue(f"{name}: the file of a profile ends in .yaml; rename it")
-        raise InvalidValue(f"{name} is {kind}, no profile; shipped profiles are {_choices()}")
     if found is None:
         raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
     return found
@@ -87,11 +81,6 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
-        kind = file_kind(path)
-        if kind == "a camera calibration":
-            raise InvalidValue(
-                f"{path} is {kind}, no profile: name it in a profile's camera.calibration"
-            ) from None
         raise InvalidValue(_one_sentence(path, error)) from None
 
 

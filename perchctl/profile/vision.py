@@ -50,18 +50,10 @@ def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool
 
 
 def check_marker_id(name: str, marker_id: int) -> None:
-    """Raises ValueError when the id is outside its dictionary, with what would hold it."""
+    """Raises ValueError when the id is outside its dictionary."""
     count = dictionary_size(name)
-    if marker_id < count:
-        return
-    hint = ""
-    match = re.fullmatch(r"(DICT_\d+X\d+)_\d+", name)
-    if match:
-        family = [n for n in dictionary_names() if n.startswith(match.group(1) + "_")]
-        larger = sorted((dictionary_size(n), n) for n in family if dictionary_size(n) > marker_id)
-        if larger:
-            hint = f"; {larger[0][1]} holds it"
-    raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}{hint}")
+    if marker_id >= count:
+        raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}")
 
 
 # --- The keys ---------------------------------------------------------
