@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
 import itertools
 import json
 from pathlib import Path
@@ -21,7 +20,6 @@ from perchctl.calibration.board.capture import (
     signature,
 )
 from perchctl.camera import Grey
-from perchctl.commands.progress import guide, page_state
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
 from tests.helpers.boards import (
@@ -167,15 +165,3 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
     assert not fresh.update(blurred)
     assert not fresh.update(blurred)
     assert "blurred" in fresh.advice
-
-
-def test_a_pipe_gets_a_line_whenever_it_changes_and_the_page_its_shares() -> None:
-    out = io.StringIO()
-    rows = (("x", "50 %", 0.5), ("views", "3", None))
-    moment = GuidedFrame(0, np.zeros((4, 4), np.uint8), (), rows, "hold still", "")
-    with guide(None, out) as show:
-        for line in ("a", "a", "b"):
-            show(dataclasses.replace(moment, line=line))
-    assert out.getvalue().splitlines() == ["perchctl: a", "perchctl: b"]
-    state = {"rows": [["x", "50 %", 0.5], ["views", "3"]], "phase": "hold still"}
-    assert page_state(moment) == state

@@ -144,8 +144,7 @@ def test_the_captions_say_what_is_printed_and_which_side_it_is() -> None:
 
 
 LAYOUTS = [
-    (150.0, 25.0, "a4"), (150.0, 25.0, "letter"), (150.0, 25.0, "a3"), (150.0, 25.0, "220x240mm"),
-    (120.0, 20.0, "a4"), (100.0, 15.0, "letter"), (60.0, 10.0, "160x220mm"), (200.0, 30.0, "a3"),
+    (150.0, 25.0, "a4"), (150.0, 25.0, "220x240mm"), (60.0, 10.0, "160x220mm"), (200.0, 30.0, "a3"),
     (355.0, 35.0, "442x478mm"),
 ]  # fmt: skip
 
@@ -236,12 +235,6 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
     call("-o", "target.pdf", "--force")
     assert files() == {"target.pdf"}
     assert Path("target.pdf").read_bytes() == first
-
-
-def test_a_board() -> None:
-    out, _ = call("board", "chessboard:9x6:25mm", "-o", "board.pdf")
-    assert "wrote board.pdf" in out
-    assert files() == {"board.pdf"}
 
 
 @pytest.mark.long

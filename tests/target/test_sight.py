@@ -123,13 +123,6 @@ def test_where_the_target_is_found_overhead(
     assert words in overhead_text(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
 
 
-def test_a_way_is_named_by_the_vehicle_s_sides() -> None:
-    mount, target_m = Mounting(position_m=(0.0, 0.0, 0.0)), np.array([0.31, -0.12, 1.0])
-    seen = view_from(np.zeros(3), 0.0, target_m, 0.0, TARGET, CAMERA, mount)
-    assert seen.aside_text == "0.31 m forward and 0.12 m to the right"
-    assert seen.reach_m == overhead_reach_m(SIDE_M, CAMERA, mount, 1.0)
-
-
 # --- near the target: from where on a mounting is blind ---------------------------------------
 
 
@@ -237,7 +230,6 @@ def test_z3_is_the_geometry_s() -> None:
     [
         ({}, ""),
         ({"z1_m": 0.9}, "gap at the start"),
-        ({"start_range_m": 0.2}, "the ceiling is hardly above the search height"),
         ({"z2_m": 0.15}, "gap between the markers"),
         ({"z1_m": None}, "never read"),
         ({"small_nearest_m": 0.2}, "gap before contact"),
