@@ -85,7 +85,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 10,
-    "calibration": 17,
+    "calibration": 16,
     "camera": 17,
     "campaign": 22,
     "check": 8,
@@ -98,9 +98,9 @@ MOST_NAMES = {
     "mission": 26,
     "perception": 6,
     "positioning": 10,
-    "profile": 35,
+    "profile": 33,
     "sim": 13,
-    "target": 15,
+    "target": 14,
     "vision": 26,
     "weights": 9,
 }

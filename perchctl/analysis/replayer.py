@@ -229,7 +229,7 @@ def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -
     """Return the pipeline with the flown calibration and mask, unless the changed keys name others.
     Errors: InvalidValue, NotFound."""
     camera = log.flown_camera
-    if camera is None or {"camera.calibration", "camera.cam"} & {*changed}:
+    if camera is None or "camera.calibration" in changed:
         camera = profile_camera(profile.camera)
     if profile.camera.mask is None or "camera.mask" in changed:
         return make_pipeline(profile, camera)

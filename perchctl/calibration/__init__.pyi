@@ -2,7 +2,6 @@ from .board.capture import capture_views as capture_views
 from .board.capture import find_views as find_views
 from .board.check import check_calibration as check_calibration
 from .board.detect import FoundViews as FoundViews
-from .board.plot import draw_calibration as draw_calibration
 from .board.solve import calibrate_camera as calibrate_camera
 from .files import calibration_text as calibration_text
 from .files import load_calibration as load_calibration

@@ -26,12 +26,11 @@ MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "eq
 
 def profile_camera(config: CameraConfig) -> CameraModel:
     """Return the calibrated camera of a profile. Raises as `load_calibration`."""
-    return load_calibration(config.calibration, cam=config.cam)
+    return load_calibration(config.calibration)
 
 
-def load_calibration(file: Path | str, cam: str | None = None) -> CameraModel:
-    """Read a camera model from a file, or by the name of one in `calib/`; `cam` names one of the
-    cameras of a Kalibr file.
+def load_calibration(file: Path | str) -> CameraModel:
+    """Read a camera model from a file, or by the name of one in `calib/`.
 
     Raises:
         NotFound: no file. InvalidValue: wrong content.
@@ -54,7 +53,7 @@ def load_calibration(file: Path | str, cam: str | None = None) -> CameraModel:
     except ValueError as error:
         raise InvalidValue(f"{path}: {error}") from None
     try:
-        return _checked(*_values(path, raw, is_opencv, cam))
+        return _checked(*_values(path, raw, is_opencv))
     except InvalidValue as error:
         raise InvalidValue(f"{path}: {error}") from None
     except KeyError as error:
@@ -69,20 +68,17 @@ _Values = tuple[Any, NDArray[Any], NDArray[Any], str]
 """Size (width, height) in px, camera matrix (9 numbers), distortion, its model."""
 
 
-def _values(path: Path, raw: Any, is_opencv: bool, cam: str | None) -> _Values:
+def _values(path: Path, raw: Any, is_opencv: bool) -> _Values:
     if not isinstance(raw, dict):
         raise InvalidValue(
             "must hold camera_info keys (image_width, camera_matrix, ...) or a Kalibr "
             "camchain (cam0: ...)"
         )
     cameras = [key for key in raw if re.fullmatch(r"cam\d+", str(key))]
+    if len(cameras) > 1:
+        raise InvalidValue(f"holds the cameras {', '.join(cameras)}: keep the one that flies")
     if cameras:
-        return _kalibr_values(raw, _named(cameras, cam))
-    if cam is not None:
-        raise InvalidValue(
-            f"is no Kalibr file and holds one camera only: leave out {cam} "
-            f"(--cam, or camera.cam in the profile)"
-        )
+        return _kalibr_values(cameras[0], raw[cameras[0]])
     if is_opencv:
         return _opencv_values(path)
     return (
@@ -93,22 +89,8 @@ def _values(path: Path, raw: Any, is_opencv: bool, cam: str | None) -> _Values:
     )
 
 
-def _named(cameras: list[str], cam: str | None) -> str:
-    """Return the name of the camera to read."""
-    held = ", ".join(cameras)
-    if cam is None and len(cameras) > 1:
-        raise InvalidValue(
-            f"holds {len(cameras)} cameras ({held}): name one with --cam {cameras[0]}, or "
-            f"with camera.cam in the profile"
-        )
-    if cam is not None and cam not in cameras:
-        raise InvalidValue(f"holds no camera {cam!r}; its cameras are {held}")
-    return cam or cameras[0]
-
-
-def _kalibr_values(raw: dict[Any, Any], cam: str) -> _Values:
-    """Return the values of one camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
-    camera = raw[cam]
+def _kalibr_values(cam: str, camera: Any) -> _Values:
+    """Return the values of a camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
     if not isinstance(camera, dict):
         raise InvalidValue(f"{cam} must hold keys (intrinsics, resolution, ...)")
     projection = camera.get("camera_model", "pinhole")

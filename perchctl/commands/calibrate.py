@@ -1,4 +1,4 @@
-"""`perchctl calibrate`: pictures in, calibration file and report out; a mask, a check, a converted
+"""`perchctl calibrate`: pictures in, calibration file out; a mask, a check, a converted
 file. `calibrate mount` is in a file of its own."""
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from perchctl.camera import (
 )
 from perchctl.commands.calibrate_mount import mount
 from perchctl.commands.command_line import (
-    CamOption,
     ForceOption,
     Group,
     JsonOption,
@@ -43,12 +42,12 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
+from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, check_place, same_file, write_files
+from perchctl.files import check_output, same_file, write_files
 from perchctl.target import Board
 from perchctl.vision import CameraModel
 
@@ -120,33 +119,24 @@ def camera(
     """
     pictures = _source(source, view)
     if output is not None:
-        _check_output(output, force)
+        check_output(output, SUFFIXES, force, CONTENT)
     layout = Board.parse(board)
 
     def check_place_of(size_px: tuple[int, int]) -> None:
         """Raise before a person has worked for a file that cannot be written."""
-        _check_output(_file(output, size_px), force)
+        check_output(_file(output, size_px), SUFFIXES, force, CONTENT)
 
     found = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
     file = _file(output, found.views[0].size_px)
-    _check_output(file, force)
+    check_output(file, SUFFIXES, force, CONTENT)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
     result = calibrate_camera(found, layout.notation(), model)
     write_files({file: result.text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
-
-    def draw() -> Path:
-        from perchctl.calibration import draw_calibration
-
-        picture = file.with_suffix(".png")
-        write_files({picture: draw_calibration(result)})
-        return picture
-
-    report = draw_unless_interrupted(draw)
-    say(f"wrote {file}" + ("" if report is None else f" and {report}"))
-    record = result.record() | {"file": str(file), "report": report and str(report)}
+    say(f"wrote {file}")
+    record = result.record() | {"file": str(file)}
     print_result(record if as_json else file)
 
 
@@ -194,20 +184,19 @@ def mask(
     app,
     "perchctl calibrate check camera.yaml images:board",
     "perchctl calibrate check camera.yaml camera:0 --view",
-    "perchctl calibrate check camchain.yaml images:board --cam cam0",
+    "perchctl calibrate check camchain.yaml images:board",
 )
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
-    cam: CamOption = None,
     view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source, view)
     layout = Board.parse(board)
-    model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration)
     found = _find_views(pictures, model.size_px, layout, view)
     check_size(found.views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, found)
@@ -223,18 +212,17 @@ def check(
 @command(
     app,
     "perchctl calibrate convert opencv.yaml",
-    "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
+    "perchctl calibrate convert camchain.yaml -o mine.yaml",
     "perchctl calibrate convert ost.yaml -o calib/fpv.yaml",
 )
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
-    cam: CamOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
-    model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration)
     file = _file(output, model.size_px)
     if same_file(file, calibration):
         raise UsageError(f"{file} is the file to convert; name another with --output")
@@ -250,11 +238,6 @@ def convert(
 
 def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
     return output or FOLDER / f"camera_{size_px[0]}x{size_px[1]}.yaml"
-
-
-def _check_output(file: Path, force: bool) -> None:
-    check_output(file, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
-    check_place(file.with_suffix(".png"), force)
 
 
 def _now() -> str:
@@ -305,20 +288,19 @@ def _find_views(
         check: called with a live camera's picture size before the person begins.
     """
     source = parse_source(spec)
-    place = Path(source.place).expanduser()
-    if source.live:
+    if source.scheme != "images":
         frames = open_camera(spec, time.monotonic, size_px=size_px)
         with contextlib.closing(frames):
-            assert frames.size_px is not None  # the first frame is there
-            check(frames.size_px)
+            if frames.size_px is not None:
+                check(frames.size_px)
             return capture_live_views(frames, board, view)
     with search_bar("searching the board") as progress:
-        pictures = image_files(str(place)) if source.scheme == "images" else place
+        pictures = image_files(str(Path(source.place).expanduser()))
         found = find_views(pictures, board, progress)
     if not found.views:
-        first, count = found.missing[0], f"{len(found.missing)} pictures"
+        first = found.missing[0]
         raise InvalidValue(
-            f"none of {count if source.scheme == 'images' else first.view} of {source} shows the "
+            f"none of {len(found.missing)} pictures of {source} shows the "
             f"board {board.notation()} ({first.view}: {first.reason}); is it wholly in view, "
             f"sharp, and --board its true layout?"
         )
@@ -326,7 +308,7 @@ def _find_views(
 
 
 def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundViews:
-    """Return views of a live camera, taken until all is covered or Ctrl-C ends it.
+    """Return views of a video or live camera, taken until all is covered or Ctrl-C ends it.
 
     Raises:
         InvalidValue: no view was taken. Those of `capture_views`.
@@ -337,7 +319,8 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guide(page))
-        say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
+        if source.live:
+            say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
         found = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(

@@ -123,7 +123,6 @@ def mount(
     recordings: Sequence[MountingRecording]
     if logs:
         recordings = _read_parts(logs, part)
-        _check_seen_by(recordings, PoseReader.basis(vehicle, camera))
     else:
         parts: tuple[Part, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
@@ -210,18 +209,6 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
     return list(found.values())
 
 
-def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
-    """Raise InvalidValue if the poses rest on other sizes or another lens than the profile's."""
-    for recording in recordings:
-        if not recording.seen_by:
-            say(f"the {recording.part} does not say by which sizes and lens it was seen: unchecked")
-        elif recording.seen_by != now:
-            raise InvalidValue(
-                f"the {recording.part} was seen by {recording.seen_by}; the profile has {now}: "
-                f"record it anew, or name the profile that it was recorded with"
-            )
-
-
 def _check_unchanged(name: str, then: Profile) -> None:
     """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
     turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
@@ -276,7 +263,7 @@ def _record_live(
             if sys.stdin.isatty():  # Ctrl-C ends at once here
                 print("press Enter when it is held so: ", end="", file=sys.stderr, flush=True)
                 sys.stdin.readline()
-            recording = MountingRecording(part, seen_by=PoseReader.basis(profile, camera))
+            recording = MountingRecording(part)
             recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)
             if frames.live:

@@ -201,10 +201,6 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing fil
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
 ]
-CamOption = Annotated[
-    str | None,
-    typer.Option("--cam", help="Which camera of a Kalibr file of several: cam0, cam1, ..."),
-]
 
 
 def main() -> Any:

@@ -50,9 +50,7 @@ app = new_app(Group)
     "perchctl fit-weights session.csv -o weights.yaml --method lms",
 )
 def fit(
-    data: Annotated[
-        list[Path] | None, typer.Argument(help="CSV files, as fit-weights collect writes them.")
-    ] = None,
+    data: Annotated[Path, typer.Argument(help="The CSV file, as fit-weights collect writes it.")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Weights file to write.")
     ] = None,
@@ -72,16 +70,14 @@ def fit(
     """Fit the merge weights to poses whose truth is known, and verify that they help.
 
     A CSV row is a frame: position (a number for the place), t_s, then x_m, y_m, z_m and yaw_rad
-    of large_, small_ and actual_; the cells of a marker that was not seen are empty. joint_
-    columns may follow. All three poses are in one frame; collect writes the target relative to
-    the gear in the level frame.
+    of large_, small_ and actual_; the cells of a marker that was not seen are empty. All three
+    poses are in one frame; collect writes the target relative to the gear in the level frame.
     """
-    files = tuple(data or ())
     if output is not None:
-        if any(same_file(output, file) for file in files):
+        if same_file(output, data):
             raise UsageError(f"{output} is the data itself; write the result to another file")
         check_output(output, (".yaml", ".yml"), force)
-    result = fit_weights(files, method, test)
+    result = fit_weights(data, method, test)
     if not as_json:
         print(report_text(result), flush=True)
     problem: PerchError | None = None
@@ -154,7 +150,7 @@ def _open_session(path: Path, frames: int) -> SessionFile:
     if session.note:
         say(session.note)
     if session.done:
-        say(f"{session.path} holds {len(session.done)} positions already")
+        say(f"{session.path} holds {session.done} positions already")
     return session
 
 
@@ -167,7 +163,7 @@ def _collect_simulated(
         raise no_simulator(error.name) from None
 
     session = _open_session(path, frames)
-    with count_bar("frames", max(0, positions - len(session.done)) * frames) as advance:
+    with count_bar("frames", max(0, positions - session.done) * frames) as advance:
         SimulatedStand(profile, camera, positions, seed).fill(session, frames, advance)
 
 

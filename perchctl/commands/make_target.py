@@ -11,7 +11,6 @@ import typer
 
 from perchctl.calibration import load_calibration
 from perchctl.commands.command_line import (
-    CamOption,
     ForceOption,
     Group,
     JsonOption,
@@ -38,7 +37,6 @@ from perchctl.target import (
     measured_target,
     mm_text,
     parse_length,
-    suggest_target,
     target_pdf,
 )
 from perchctl.vision import CameraModel
@@ -177,47 +175,14 @@ def design(
     profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     blur: BlurOption = 1.0,
-    cam: CamOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
-    name, model = _camera(config, camera, cam)
+    name, model = _camera(config, camera)
     found = make_design(config.target, model, blur, config, ceiling)
     record = found.record() | {"target": config.target.model_dump(mode="json")}
     print_result(record if as_json else found.text(name))
-
-
-@command(
-    app,
-    "perchctl make-target suggest --ceiling 2.4",
-    "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
-    "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
-)
-def suggest(
-    camera: CameraArgument = None,
-    profile: ProfileOption = "sim",
-    ceiling: CeilingOption = None,
-    page: PageOption = "a4",
-    magnet: MagnetOption = "50mm",
-    blur: BlurOption = 1.0,
-    cam: CamOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Propose sizes and ids for a camera, the largest that the page holds and that are seen."""
-    config = load_profile(profile)
-    name, model = _camera(config, camera, cam)
-    magnet_m = parse_length(magnet, "--magnet")
-    found, held_by = suggest_target(model, blur, config, magnet_m, ceiling, page)
-    large, small = found.target.large, found.target.small
-    command = (
-        f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
-        f"--large-dict {large.dictionary} --small {small.side_m * 1e3:g}mm --small-id {small.id} "
-        f"--small-dict {small.dictionary} --page {held_by}"
-    )
-    record = {"command": command, "target": found.target.model_dump(mode="json")}
-    text = f"{command}\n\n{found.text(name)}"
-    print_result(record | found.record() if as_json else text)
 
 
 @command(
@@ -323,10 +288,10 @@ def _chosen(profile: Profile, large: Marker, small: Marker) -> TargetConfig:
     return profile.target.model_copy(update=markers)
 
 
-def _camera(profile: Profile, name: str | None, cam: str | None) -> tuple[str, CameraModel]:
+def _camera(profile: Profile, name: str | None) -> tuple[str, CameraModel]:
     """Return the calibration's file, and the camera."""
     path = find_calibration(name or profile.camera.calibration)
-    return str(path), load_calibration(path, cam=cam)
+    return str(path), load_calibration(path)
 
 
 def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date | None]:

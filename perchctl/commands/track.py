@@ -37,7 +37,6 @@ from perchctl.camera import (
     without_password,
 )
 from perchctl.commands.command_line import (
-    CamOption,
     ProfileOption,
     ViewOption,
     command,
@@ -95,7 +94,6 @@ def track(
             "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
         ),
     ] = None,
-    cam: CamOption = None,
     stills: Annotated[
         bool | None,
         typer.Option(
@@ -121,8 +119,6 @@ def track(
     source = parse_source(source).spec
     if stills is None:  # files of pictures need not belong together
         stills = source.startswith("images:")
-    if calibration is None:
-        cam = cam or flown.camera.cam
     file = find_calibration(str(calibration or flown.camera.calibration))
     lines = as_json or not view
     start_s = time.monotonic()
@@ -132,7 +128,7 @@ def track(
 
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
-        camera = load_calibration(file, cam=cam)
+        camera = load_calibration(file)
         pictures_hz = STILLS_HZ if stills else None
         opened = open_camera(
             source, now, flown.camera, size_px=camera.size_px, pictures_hz=pictures_hz

@@ -9,11 +9,9 @@ from .limits import DOUBTFUL as DOUBTFUL
 from .load import find_calibration as find_calibration
 from .load import find_mask as find_mask
 from .load import find_profile as find_profile
-from .load import find_weights as find_weights
 from .load import first_invalid_key as first_invalid_key
 from .load import load_profile as load_profile
 from .load import read_mask as read_mask
-from .load import read_weights as read_weights
 from .mission import PlannerConfig as PlannerConfig
 from .mission import SafetyConfig as SafetyConfig
 from .positioning import PositioningConfig as PositioningConfig

@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import ValuesView
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Vector3 = tuple[float, float, float]
 
@@ -45,29 +37,6 @@ Range = Ordered[float]
 
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse YAML's yes, no, on and off, which would be read as 1 and 0."""
-        kind = cls.model_fields[info.field_name or ""].annotation
-        if _is_of_numbers(kind) and _holds_truth(value):
-            raise ValueError(
-                "found true or false, which is how YAML reads yes, no, on and off; a number is "
-                "needed"
-            )
-        return value
-
-
-def _is_of_numbers(kind: Any) -> bool:
-    return kind in (int, float) or any(map(_is_of_numbers, get_args(kind)))
-
-
-def _holds_truth(value: Any) -> bool:
-    parts = value.values() if isinstance(value, dict) else value
-    if isinstance(parts, (list, tuple, ValuesView)):
-        return any(map(_holds_truth, parts))
-    return isinstance(value, bool)
 
 
 # --- Units ------------------------------------------------------------
@@ -111,67 +80,28 @@ def key_unit(path: str) -> str:
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
 
 
-# --- Keys that have become constants of their section, or are gone ----
-
-GONE = frozenset(
-    (
-        "camera.controls",
-        "detector.window",
-        "simulation.bare_floor_aside_m",
-        "simulation.bare_floor_m",
-        "simulation.camera_blank_rate",
-        "simulation.camera_blended",
-        "simulation.camera_receiver_noise",
-        "simulation.draught_towards_deg",
-        "simulation.drift_xyz_mps",
-        "simulation.estimate_tilt_bias_xy_deg",
-        "simulation.flow_bias_dps",
-        "simulation.flow_noise_radps",
-        "simulation.flow_reach_m",
-        "simulation.gloss",
-        "simulation.gust_every_s",
-        "simulation.gust_mps",
-        "simulation.lamp_aside_m",
-        "simulation.lamp_z_m",
-        "simulation.mount_error_rpy_deg",
-        "simulation.mount_error_xyz_m",
-        "simulation.target_tilt_towards_deg",
-        "simulation.target_xy_m",
-    )
-)
-"""Nothing depends on them any more: left out, so that a flight's log is still read."""
-WORLD = "simulation.set"
-"""It named the profile `rough` or `extreme` for the keys that were not written."""
+# --- Keys that have become constants of their section ------------------
 
 
 def without_constants(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return the values of a profile without keys that are gone or constants by now.
-
-    Constants are class variables of `model`, or of a model within it. Return also a note for each
-    of these keys, and a sentence for each whose value would be lost, as it is another one than the
-    constant.
+    """Return the values of a profile without keys that are constants by now: class variables of
+    `model`, or of a model within it. Return also a note for each of these keys, and a sentence for
+    each whose value would be lost, as it is another one than the constant.
     """
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None
-        dotted = f"{path}{key}"
-        if dotted in GONE or (dotted == WORLD and value == "nominal"):
-            del result[key]
-            notes.append(f"{dotted} is no longer used; remove it")
-        elif dotted == WORLD:
-            del result[key]
-            lost.append(f"{WORLD} is no longer a key: remove it, and extend the profile {value}")
-        elif key in model.__class_vars__:
+        if key in model.__class_vars__:
             del result[key]
             constant = getattr(model, key)
-            now = f"{dotted} is no longer a key: it is {constant} for every profile"
+            now = f"{path}{key} is no longer a key: it is {constant} for every profile"
             if value == (list(constant) if isinstance(constant, tuple) else constant):
                 notes.append(f"{now}; remove it")
             else:
                 lost.append(f"{now}, and {value} here; remove it")
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
-            result[key], more, gone = without_constants(value, kind, f"{dotted}.")
+            result[key], more, gone = without_constants(value, kind, f"{path}{key}.")
             notes, lost = notes + more, lost + gone
     return result, notes, lost

@@ -91,7 +91,6 @@ def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
 Value = float | int | str | tuple[float, ...]
 
 _DECIMALS = 6
-_BOM = "\ufeff"
 
 
 def writable_profile(name: str) -> Path:
@@ -158,7 +157,7 @@ def with_values(text: str, values: Mapping[str, Value]) -> str:
     yaml = YAML()
     yaml.preserve_quotes, yaml.width = True, 10**6
     yaml.representer.add_representer(type(None), _as_null)
-    document = yaml.load(text.removeprefix(_BOM))
+    document = yaml.load(text)
     wanted = copy.deepcopy(_values_of(text))
     for dotted, value in values.items():
         new = yaml.load(_flow(value))
@@ -178,10 +177,10 @@ def with_values(text: str, values: Mapping[str, Value]) -> str:
         plain[key] = parse_yaml(_flow(value))
     stream = io.StringIO()
     yaml.dump(document, stream)
-    written = (_BOM if text.startswith(_BOM) else "") + stream.getvalue()
+    written = stream.getvalue()
     if _values_of(written) != wanted:  # as where an anchor's value is another key's, too
         raise ValueError("the numbers do not fit into this file's layout")
-    return written.replace("\n", "\r\n") if "\r\n" in text else written
+    return written
 
 
 def _as_null(representer: Any, nothing: None) -> Any:
@@ -193,7 +192,7 @@ def _values_of(text: str) -> dict[str, Any]:
     values = parse_yaml(text)
     if not isinstance(values, dict):
         raise ValueError("holds no keys and values")
-    return without_constants(values, Profile)[0]
+    return values
 
 
 def _flow(value: Value) -> str:

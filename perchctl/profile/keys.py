@@ -9,7 +9,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import yaml
@@ -22,41 +21,30 @@ from perchctl.profile.schema import Profile
 
 @dataclass(frozen=True)
 class Key:
-    """One leaf of the profile's schema; `schema` is its part of the JSON schema."""
+    """One leaf of the profile's schema.
+
+    `meaning` is the schema's own description, with backticks around what is typed as it stands;
+    `allowed` the bounds or choices, in words.
+    """
 
     path: str
-    schema: dict[str, Any]
+    unit: str
+    meaning: str
+    allowed: str
     default: Any
-
-    @property
-    def unit(self) -> str:
-        return key_unit(self.path)
-
-    @property
-    def meaning(self) -> str:
-        """The schema's own description; backticks around what is typed as it stands."""
-        return str(self.schema.get("description", ""))
-
-    @property
-    def allowed(self) -> str:
-        """The bounds or choices, in words."""
-        return _allowed(self.schema)
 
 
 def keys(section: BaseModel, prefix: str = "") -> Iterator[Key]:
     """Yield every leaf below a section of a profile with its value, in the schema's order."""
-    properties = _schema(type(section))["properties"]
+    properties = type(section).model_json_schema()["properties"]
     for name in type(section).model_fields:
         value = getattr(section, name)
         if isinstance(value, BaseModel):
             yield from keys(value, f"{prefix}{name}.")
         else:
-            yield Key(prefix + name, properties[name], value)
-
-
-@cache
-def _schema(model: type[BaseModel]) -> dict[str, Any]:
-    return model.model_json_schema()
+            schema, path = properties[name], f"{prefix}{name}"
+            meaning = str(schema.get("description", ""))
+            yield Key(path, key_unit(path), meaning, _allowed(schema), value)
 
 
 def _allowed(schema: dict[str, Any]) -> str:

@@ -11,7 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.profile.base import key_unit
-from perchctl.profile.mission import OVERDUE_SHARE, AscendConfig
+from perchctl.profile.mission import (
+    OVERDUE_SHARE,
+    AlignConfig,
+    AscendConfig,
+    EstimateConfig,
+    SafetyConfig,
+)
 
 REACHED_SHARE = 0.8
 """Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
@@ -66,7 +72,7 @@ _IMPOSSIBLE = {
     f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
     " < planner.approach_timeout_s": ("the take-off takes longer than it is waited for"),
     "camera.latency_s < safety.max_frame_age_s": "every picture would be too old to measure by",
-    "link.telemetry_period_s < safety.proof_age_s": (
+    f"link.telemetry_period_s < {SafetyConfig.proof_age_s:g}": (
         "telemetry would be too old to prove a contact or a landing"
     ),
     "link.telemetry_period_s < safety.telemetry_hold_s": (
@@ -101,7 +107,7 @@ _DOUBTFUL = {
     },
     "time limits": {
         f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
-        " + planner.estimate.dwell_s + planner.align.dwell_s + planner.ascend.settle_dwell_s"
+        f" + {EstimateConfig.dwell_s + AlignConfig.dwell_s:g} + planner.ascend.settle_dwell_s"
         " + planner.perch.contact_dwell_s < planner.perching_time_s": (
             "the perching time is over before a contact"
         ),
@@ -129,7 +135,7 @@ _DOUBTFUL = {
         # The hover thrust of 30 g (docs/firmware.md, "Thrust to PWM").
         "40200 <= planner.perch.thrust": "so little raw thrust does not press",
         "20 <= safety.max_tilt_deg": "a gust tilts it so far, and cuts the motors",
-        "link.telemetry_period_s + link.telemetry_period_s <= safety.proof_age_s": (
+        f"link.telemetry_period_s <= {SafetyConfig.proof_age_s / 2:g}": (
             "one lost packet, and nothing is proven"
         ),
     },

@@ -14,15 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
-from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
 from perchctl.profile.schema import Profile
-from perchctl.profile.vision import WeightsConfig
+from perchctl.profile.vision import MergeConfig, WeightsConfig
 
 _NAMED_FILES = (
     ("merge", "weights_file", "weights"),
@@ -46,11 +45,6 @@ def find_profile(name: str) -> Path:
         what = "is a folder" if path.is_dir() else "does not exist"
         raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
     found = data_file("profiles", name)
-    if found is None and Path(name).is_file():
-        kind = file_kind(Path(name))
-        if kind == "a profile":
-            raise InvalidValue(f"{name}: the file of a profile ends in .yaml; rename it")
-        raise InvalidValue(f"{name} is {kind}, no profile; shipped profiles are {_choices()}")
     if found is None:
         raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
     return found
@@ -68,8 +62,8 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
     profile = _checked(path, _read_yaml(path))
     if profile.merge.weights_file is None or not with_weights:
         return profile
-    fitted = read_weights(find_weights(profile.merge.weights_file))
-    merge = profile.merge.model_copy(update={"weights": fitted.weights})
+    weights = _read_weights(profile.merge.weights_file)
+    merge = profile.merge.model_copy(update={"weights": weights})
     return profile.model_copy(update={"merge": merge})
 
 
@@ -87,65 +81,28 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
-        kind = file_kind(path)
-        if kind == "a camera calibration":
-            raise InvalidValue(
-                f"{path} is {kind}, no profile: name it in a profile's camera.calibration"
-            ) from None
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
 # --- The weights file -------------------------------------------------
 
 
-class FittedData(BaseModel):
-    """The data that weights were fitted to."""
-
-    file: str = ""
-    sha256: str = ""
-    rows: int = 0
-    positions: int = 0
-
-
-class FittedWeights(BaseModel):
-    """A weights file, as far as a flight needs it (`perchctl.weights` writes more)."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    date: str = ""
-    method: str = ""
-    weights: WeightsConfig
-    data: FittedData = FittedData()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _all_axes(cls, values: dict[str, Any]) -> dict[str, Any]:
-        given = values.get("weights")
-        if isinstance(given, dict):
-            missing = [axis for axis in WeightsConfig.model_fields if axis not in given]
-            if missing:
-                raise ValueError(f"weights.{missing[0]} is missing; needed are x, y, z and yaw")
-        return values
-
-
-def find_weights(name: str) -> Path:
-    """Return the weights file that a loaded profile names: a whole path, or a name in the user's
-    folder. Raises NotFound."""
+def _read_weights(name: str) -> WeightsConfig:
+    """Return the weights of the file that a loaded profile names: a whole path, or a name in the
+    user's folder. Raises NotFound, InvalidValue."""
     given = Path(name)
-    found = given if given.is_file() else data_file("weights", name)
-    if found is None:
+    path = given if given.is_file() else data_file("weights", name)
+    if path is None:
         raise NotFound(
             f"merge.weights_file: {name} does not exist; perchctl fit-weights makes it, or remove "
             f"the key"
         )
-    return found
-
-
-def read_weights(path: Path) -> FittedWeights:
-    """Read and check a weights file. Errors: NotFound, InvalidValue."""
-    values = _read_yaml(path)
+    weights = _read_yaml(path).get("weights")
+    missing = [axis for axis in WeightsConfig.model_fields if axis not in (weights or ())]
+    if missing:
+        raise InvalidValue(f"{path}: weights.{missing[0]} is missing; needed are x, y, z and yaw")
     try:
-        return FittedWeights.model_validate(values)
+        return MergeConfig.model_validate({"weights": weights}).weights
     except ValidationError as error:
         raise InvalidValue(_one_sentence(path, error)) from None
 

@@ -25,7 +25,7 @@ class SearchConfig(Section):
 class EstimateConfig(Section):
     """Phase 3. The pose must stay within `spread_m` for `dwell_s`."""
 
-    dwell_s: float = key(0.4, "for which the pose must be steady", ge=0, lt=4)
+    dwell_s: ClassVar[float] = 0.4  # for which the pose must be steady
     spread_m: ClassVar[float] = 0.05
     """Within which it must stay."""
     timeout_s: ClassVar[float] = 4.0
@@ -36,11 +36,11 @@ class AlignConfig(Section):
     """Phase 4. Errors must stay within tolerance for `dwell_s`."""
 
     xy_m: float = key(0.04, "aligned: the gear's distance from the target's axis", gt=0, le=1)
-    yaw_deg: float = key(5.0, "aligned: heading", gt=0, le=180)
-    dwell_s: float = key(0.4, "for which both must hold", ge=0, le=10)
+    yaw_deg: ClassVar[float] = 5.0  # aligned: heading
+    dwell_s: ClassVar[float] = 0.4  # for which both must hold
     timeout_s: ClassVar[float] = 20.0
     """An attempt that is not aligned by then counts as failed."""
-    speed_mps: float = key(0.4, "of the setpoint, sideways", gt=0, le=2)
+    speed_mps: ClassVar[float] = 0.4  # of the setpoint, sideways
     yaw_rate_dps: ClassVar[float] = 60.0
     """Of the setpoint."""
 
@@ -126,7 +126,7 @@ class CompleteConfig(Section):
     """Raw thrust goes down over this time, from the least of position mode to still motors."""
     hang_s: ClassVar[float] = 1.0
     """The whole weight must hang for so long before the motors stop."""
-    release_timeout_s: float = key(8.0, "then the attempt counts as failed", gt=1.8, le=30)
+    release_timeout_s: ClassVar[float] = 8.0  # then the attempt counts as failed
     slip_m: ClassVar[float] = 0.03  # hanging: at most so far below the contact
     slip_mps: ClassVar[float] = 0.12  # a slip: sinking faster
     slip_dwell_s: ClassVar[float] = 0.03  # a slip: for so long; a free fall is answered at once
@@ -137,7 +137,7 @@ class CompleteConfig(Section):
 class RecoverConfig(Section):
     """After a miss or a slip: descend, steady, back to phase 3."""
 
-    descend_m: float = key(0.10, "below where the attempt ended", gt=0, le=1)
+    descend_m: ClassVar[float] = 0.10  # below where the attempt ended
     dwell_s: ClassVar[float] = 0.5
     """It must be steady for so long."""
     steady_mps: ClassVar[float] = 0.1
@@ -160,7 +160,7 @@ class LandingConfig(Section):
         0.3, "above the ground: from here the vehicle lands by itself", ge=0.1, le=2
     )
     undershoot_m: float = key(0.05, "the landing aims so far below the ground", ge=0, le=1)
-    drift_mps: float = key(0.012, "of the estimate's height: the aim sinks so fast", ge=0, le=0.1)
+    drift_mps: ClassVar[float] = 0.012  # of the estimate's height: the aim sinks so fast
     timeout_s: float = key(30.0, "for which a landing is waited for", gt=0, le=120)
 
     @property
@@ -198,7 +198,7 @@ class SafetyConfig(Section):
 
     min_rest_v: float = key(3.8, "no flight begins below it", ge=0, le=5)
     min_load_v: float = key(3.0, "in flight, under load: lands below it", ge=0, le=5)
-    battery_debounce_s: float = key(1.5, "below `min_load_v` before it lands", ge=0, le=30)
+    battery_debounce_s: ClassVar[float] = 1.5  # below `min_load_v` before it lands
     energy_gate: bool = key(True, "no attempt begins that the battery has not enough for: it lands")
     energy_reserve_s: float = key(
         4.0, "of hovering, left after an attempt and a landing", ge=0, le=120
@@ -207,9 +207,8 @@ class SafetyConfig(Section):
     """A battery reading that stands still for longer is stale."""
     telemetry_hold_s: float = key(0.3, "age of telemetry: held", gt=0, le=5)
     telemetry_land_s: float = key(1.0, "age of telemetry: landed", gt=0, le=10)
-    proof_age_s: float = key(
-        0.1, "older telemetry proves nothing: no contact, no landing, no stop", gt=0, le=0.5
-    )
+    proof_age_s: ClassVar[float] = 0.1
+    """Older telemetry proves nothing: no contact, no landing, no stop."""
     camera_hold_s: float = key(0.5, "since the last good picture: held", gt=0, le=10)
     camera_land_s: float = key(3.0, "since the last good picture: landed", gt=0, le=60)
     max_frame_age_s: float = key(0.4, "an older picture is no measurement", gt=0, le=5)
@@ -235,7 +234,7 @@ class SafetyConfig(Section):
     """With a turn of the loop so late it holds its place."""
     loop_late_land_s: ClassVar[float] = 1.0
     """With a turn of the loop so late it lands."""
-    estimator_wait_s: float = key(10.0, "on the ground", gt=0, le=60)
+    estimator_wait_s: ClassVar[float] = 10.0  # on the ground
     estimator_variance_m2: ClassVar[float] = 0.01
     """A larger variance of the position refuses take-off."""
     ground_z_m: float = key(

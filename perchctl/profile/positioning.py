@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, ClassVar, Literal
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
@@ -14,7 +13,7 @@ SPARE_S = 0.02
 MOST_LATENCY_S = 0.04
 """The vehicle takes each position for the one of now. 40 ms late it perches within 2 mm, 50 ms late
 it may swing for a minute and be landed (tests/flight/test_capture_flights.py)."""
-_HOST = re.compile(r"[^\s:/?#@]+(?::([0-9]{1,5}))?")
+_HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"
 
 
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
@@ -34,7 +33,7 @@ class PositioningConfig(Section):
     system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = key(
         "vicon", "kind of motion capture"
     )
-    host: str = key("", "its computer, or `NAME:PORT`")
+    host: str = key("", "its computer, or `NAME:PORT`", pattern=_HOST)
     body: str = key("crazyflie", "the vehicle's rigid body there", min_length=1)
     body_rpy_deg: Vector3 = key(
         (0.0, 0.0, 0.0), "the rigid body's axes in the vehicle's: roll, pitch, yaw"
@@ -74,30 +73,6 @@ class PositioningConfig(Section):
         if isinstance(values, dict) and values.get("by") == "target":
             return {**BY_TARGET, **values}
         return values
-
-    @field_validator("host")
-    @classmethod
-    def _is_host(cls, host: str) -> str:
-        found = _HOST.fullmatch(host.strip())
-        if host.strip() and not (found and (found[1] is None or 1 <= int(found[1]) <= 65535)):
-            raise ValueError(f"host is NAME or NAME:PORT (1 to 65535), found {host!r}")
-        return host
-
-    @model_validator(mode="after")
-    def _meant(self) -> PositioningConfig:
-        """Refuse keys of a capture without `by`, which would fly by the decks, without a word. (A
-        log's profile has every key, and so `by`, too.)"""
-        keys = [key for key in type(self).model_fields if key != "decks"]
-        of_capture = [key for key in keys if key in self.model_fields_set]
-        if "by" in of_capture:
-            of_capture = ["host"] if self.by == "deck" and self.host.strip() else []
-        if of_capture:
-            verb = "is" if len(of_capture) == 1 else "are"
-            raise ValueError(
-                f"{', '.join(of_capture)} {verb} given, but by is deck: write by: mocap, or only "
-                f"positioning: deck"
-            )
-        return self
 
     @model_validator(mode="after")
     def _fits(self) -> PositioningConfig:

@@ -78,12 +78,6 @@ class Profile(Section):
         value."""
         return without_constants(values, cls)[2]
 
-    @model_validator(mode="before")
-    @classmethod
-    def _without_constants(cls, values: Any) -> Any:
-        """Leave out keys that are constants by now, which logs of earlier versions hold."""
-        return without_constants(values, cls)[0] if isinstance(values, dict) else values
-
     @model_validator(mode="after")
     def _neighbours_can_be_printed(self) -> Profile:
         ids = self.simulation.neighbour_ids

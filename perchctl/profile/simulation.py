@@ -76,7 +76,7 @@ class SimulationConfig(Section):
         0.0, "of the accelerometer, without a deck; each level axis, at most", ge=0, le=0.2
     )
     draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
-    magnet_force_n: float = key(1.2, "that the magnet holds", ge=0, le=20)
+    magnet_force_n: ClassVar[float] = 1.2  # that the magnet holds
     first_contact_fails: float = key(
         0.1, "share of flights in which the first contact does not hold", ge=0, le=1
     )

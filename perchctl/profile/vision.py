@@ -12,11 +12,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.plain_yaml import clip_text
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
-
-_FORMAT = "^[A-Z0-9]{3,4}$"
-
 
 # --- ArUco dictionaries by name, and the ids they hold ----------------
 
@@ -54,18 +50,10 @@ def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool
 
 
 def check_marker_id(name: str, marker_id: int) -> None:
-    """Raises ValueError when the id is outside its dictionary, with what would hold it."""
+    """Raises ValueError when the id is outside its dictionary."""
     count = dictionary_size(name)
-    if marker_id < count:
-        return
-    hint = ""
-    match = re.fullmatch(r"(DICT_\d+X\d+)_\d+", name)
-    if match:
-        family = [n for n in dictionary_names() if n.startswith(match.group(1) + "_")]
-        larger = sorted((dictionary_size(n), n) for n in family if dictionary_size(n) > marker_id)
-        if larger:
-            hint = f"; {larger[0][1]} holds it"
-    raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}{hint}")
+    if marker_id >= count:
+        raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}")
 
 
 # --- The keys ---------------------------------------------------------
@@ -131,7 +119,7 @@ class CameraConfig(Section):
     calibration: str = key(
         "example_640x480.yaml", "file beside the profile, in `calib/`, or a whole path"
     )
-    cam: str | None = key(None, "which camera of a Kalibr file of several: `cam0`, `cam1`, ...")
+    cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
     latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = key(
         START_LATENCY_S, "from exposure to arrival; `measured`: by each flight"
     )
@@ -147,7 +135,7 @@ class CameraConfig(Section):
     format: str | None = key(
         None,
         "asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
-        pattern=_FORMAT,
+        pattern="^[A-Z0-9]{3,4}$",
     )
     rate_hz: float | None = key(
         None, "asked of `camera:` sources; none: the driver's own", gt=0, le=500
@@ -163,16 +151,6 @@ class CameraConfig(Section):
         raise ValueError(
             f"found {latency_s!r}; allowed are 0 to {MOST_LATENCY_S:g} (seconds), or the word "
             f"measured, to have each flight measure it"
-        )
-
-    @field_validator("format", mode="before")
-    @classmethod
-    def _a_format(cls, name: Any) -> Any:
-        if name is None or (isinstance(name, str) and re.fullmatch(_FORMAT, name)):
-            return name
-        raise ValueError(
-            f"found {clip_text(repr(name))}; allowed is a format's name of three or four capitals "
-            f"or digits, as in MJPG or YUYV"
         )
 
     @property
@@ -285,7 +263,7 @@ class PoseConfig(Section):
     solver: ClassVar[str] = "sqpnp"  # OpenCV's, for the first guess
     refine: ClassVar[bool] = True  # by least squares on the corners after it
     max_reprojection_px: float = key(3.0, "no pose above this RMS", gt=0)
-    each_marker: bool = key(False, "beside the joint pose also each marker's own, for the log")
+    each_marker: ClassVar[bool] = False  # beside the joint pose also each marker's own
 
 
 class KalmanConfig(Section):
@@ -324,9 +302,8 @@ class KalmanConfig(Section):
         0.1, "of the state estimate's drift, for tracks in the world, likewise", gt=0, le=100
     )
     attitude_sigma_deg: float = key(0.3, "constant error of roll and pitch, likewise", ge=0, le=10)
-    drift_mps: float = key(
-        0.05, "an unmeasured target moves in the estimate's world at most so fast", ge=0, le=1
-    )
+    drift_mps: ClassVar[float] = 0.05
+    """An unmeasured target moves in the estimate's world at most so fast."""
     gate: bool = key(True, "a pose that contradicts the target's track is not taken")
 
 

@@ -208,7 +208,7 @@ class FlightLog:
             said = sentence.removesuffix("; remove it")
             warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
         try:
-            return Profile.model_validate(values)
+            return Profile.model_validate(values, extra="ignore")
         except ValidationError as error:
             key, text = first_invalid_key(error)
             raise InvalidValue(

@@ -1,6 +1,5 @@
 from .boards import Board as Board
 from .design import make_design as make_design
-from .design import suggest_target as suggest_target
 from .drawing import TargetDrawing as TargetDrawing
 from .drawing import draw_target as draw_target
 from .drawing import mm_text as mm_text

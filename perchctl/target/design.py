@@ -1,5 +1,4 @@
-"""What a target will do with a camera: from where to where each marker is seen, and sizes that
-cover the way from the search height to the contact.
+"""What a target will do with a camera: from where to where each marker is seen.
 
 z1 and z2 are the farthest ranges of the large and the small marker, z3 the nearest of the
 whole large one (paper, section III-B: 115, 25, 12 cm). They follow from the smallest side
@@ -13,18 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.errors import InvalidValue
-from perchctl.profile import MarkerConfig, Profile, TargetConfig
+from perchctl.profile import Profile, TargetConfig
 from perchctl.target.drawing import mm_text
-from perchctl.target.reading import check_target, smallest_side_px
-from perchctl.target.sheets import fits, fitting_page
+from perchctl.target.reading import smallest_side_px
 from perchctl.target.sight import (
     BlindRange,
     FieldOfView,
     blind_range,
     gear_from_camera,
     least_side_px,
-    raised,
     square_outline,
     turned_outline,
 )
@@ -75,11 +71,6 @@ class TargetDesign:
         if self.start_height_m == 0.0:
             sure_px = least_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
-        if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
-            found.append(
-                f"the ceiling is hardly above the search height ({self.start_height_m:g} m): lower "
-                f"planner.search.max_height_m"
-            )
         if start_m is not None and start_m > far_m:
             found.append(
                 f"gap at the start: from {self.start_height_m:g} m over the floor the target is "
@@ -146,18 +137,6 @@ def focal_px(camera: CameraModel) -> float:
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 
-def start_height_m(profile: Profile) -> float:
-    """Return from where over the floor the target has to be seen: the highest search position, or
-    the ground where the target is the positioning system."""
-    ground = profile.positioning.by == "target"
-    return 0.0 if ground else profile.planner.search.max_height_m
-
-
-def start_range_m(profile: Profile, ceiling_m: float) -> float:
-    """Return the metres from the camera there to the target."""
-    return ceiling_m - start_height_m(profile) - profile.camera.mount.position_m[2]
-
-
 def make_design(
     target: TargetConfig,
     camera: CameraModel,
@@ -176,6 +155,12 @@ def make_design(
     )
     large = target.large.side_m
     small = target.small.side_m
+    # Where the target is the positioning system, it has to be seen from the ground.
+    ground = profile.positioning.by == "target"
+    height_m = 0.0 if ground else profile.planner.search.max_height_m
+    start_m = None
+    if ceiling_m is not None:
+        start_m = ceiling_m - height_m - profile.camera.mount.position_m[2]
     return TargetDesign(
         target=target,
         camera=camera,
@@ -188,95 +173,7 @@ def make_design(
         z3_upright_m=view.nearest_m(square_outline(large), *ahead),
         small_nearest_m=view.nearest_m(turned_outline(small), *gear_from_camera(profile)),
         blind=blind_range(target, camera, profile),
-        start_range_m=None if ceiling_m is None else start_range_m(profile, ceiling_m),
-        start_height_m=start_height_m(profile),
+        start_range_m=start_m,
+        start_height_m=height_m,
         standoff_m=profile.planner.ascend.standoff_m,
-    )
-
-
-# --- Sizes and ids that cover the way from the search height to the contact ---
-
-
-DEFAULT_SEARCH_M = 1.15
-"""Range to cover where no ceiling is named: the paper's z1."""
-DEFAULT_CEILING_M = 2.5
-"""Of a room, where none is named and the target has to be seen from the ground."""
-FAR_MARGIN, OVERLAP_MARGIN, NEAR_MARGIN = 1.10, 1.20, 0.95
-SMALL_RANGE = (0.08, 0.19)
-"""Side of the small marker per side of the large one: up to 0.19 the large one is read as far
-as around a smaller one, by trial (from 13 px on at a blur of 0.6 px; at 0.21 from 36 px on)."""
-_LARGE = ("DICT_4X4_1000", 997)
-_SMALL = ("DICT_ARUCO_ORIGINAL", 5)
-_LARGE_STEP_M, _SMALL_STEP_M = 0.005, 0.0005
-_LARGE_LIMITS_M = (0.03, 1.0)
-
-
-def suggest_target(
-    camera: CameraModel,
-    blur_px: float,
-    profile: Profile,
-    magnet_m: float,
-    ceiling_m: float | None = None,
-    page: str = "a4",
-) -> tuple[TargetDesign, str]:
-    """Return the design of the largest markers that the page holds and of which the small one takes
-    over from the large one, as every error falls with the size; and the page, a larger one only
-    where the search needs it. What they do not cover is in the design's warnings.
-
-    Raises InvalidValue where the blur leaves nothing to read, for a ceiling too low, or for a
-    magnet that is smaller than what the small marker needs.
-    """
-    ground = profile.positioning.by == "target"
-    search_m = start_range_m(profile, ceiling_m or DEFAULT_CEILING_M)
-    if ceiling_m is None and not ground:
-        search_m = DEFAULT_SEARCH_M
-    if search_m <= 0.0:
-        raise InvalidValue(
-            f"--ceiling {ceiling_m:g} is below the highest search position "
-            f"({start_height_m(profile):g} m): lower planner.search.max_height_m"
-        )
-    large_px, small_px = (
-        smallest_side_px(_sized(0.150, 0.025), name, blur_px, max(camera.size_px))
-        for name in MARKERS
-    )
-    if large_px is None or small_px is None:
-        raise InvalidValue(
-            f"no marker is read through a blur of {blur_px:g} px: a sharper picture is needed"
-        )
-    f, view = focal_px(camera), FieldOfView(camera)
-    far_px = least_side_px(large_px) if ground else FAR_MARGIN * large_px
-    needed_m = math.ceil(search_m * far_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
-    needed_m = min(max(needed_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
-    R, gear = gear_from_camera(profile)
-    standoff_m = profile.planner.ascend.standoff_m
-    # The largest side whose circle is in the picture with the gear at the stand-off.
-    sides_m = np.arange(1.0, 0.0, -_SMALL_STEP_M).tolist()
-    held_m = (s for s in sides_m if view.holds(raised(turned_outline(s), standoff_m) @ R.T + gear))
-    near_m = next(held_m, 0.0)
-    most_m = min(magnet_m / math.sqrt(2.0), NEAR_MARGIN * near_m)
-
-    def target_of(large_m: float) -> TargetConfig:
-        """Return the target with the largest small marker."""
-        small_m = max(min(SMALL_RANGE[1] * large_m, most_m), SMALL_RANGE[0] * large_m, 0.005)
-        small_m = math.floor(small_m / _SMALL_STEP_M + 1e-6) * _SMALL_STEP_M
-        return _sized(round(large_m, 4), round(small_m, 4))
-
-    def takes_over(target: TargetConfig) -> bool:
-        """Return true if the small marker is read before the large one leaves the picture."""
-        near_m = view.nearest_m(turned_outline(target.large.side_m), np.eye(3), np.zeros(3))
-        return near_m is None or f * target.small.side_m >= OVERLAP_MARGIN * near_m * small_px
-
-    count = int((_LARGE_LIMITS_M[1] - needed_m) / _LARGE_STEP_M)
-    larger = (target_of(needed_m + k * _LARGE_STEP_M) for k in range(count, 0, -1))
-    held = (each for each in larger if fits(each, page) and takes_over(each))
-    target = next(held, target_of(needed_m))
-    check_target(target, magnet_m)
-    held_by = page if fits(target, page) else fitting_page(target)
-    return make_design(target, camera, blur_px, profile, ceiling_m), held_by
-
-
-def _sized(large_m: float, small_m: float) -> TargetConfig:
-    return TargetConfig(
-        large=MarkerConfig(dictionary=_LARGE[0], id=_LARGE[1], side_m=large_m),
-        small=MarkerConfig(dictionary=_SMALL[0], id=_SMALL[1], side_m=small_m),
     )

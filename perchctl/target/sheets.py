@@ -79,7 +79,7 @@ def target_pdf(
     if place is None:
         raise InvalidValue(
             f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
-            f"fit on {page}; --page {fitting_page(target, texts)} holds it"
+            f"fit on {page}; --page {_fitting_page(target, texts)} holds it"
         )
     pdf = _Paper(*size, f"perchctl target, {mm_text(target.large.side_m)} mm", 2, date)
     _draw_front(pdf, target, *place)
@@ -117,11 +117,6 @@ def board_pdf(board: Board, page: str) -> bytes:
         pdf.write_line(left, base + 3.2 * i, line, _LABEL)
     _draw_rulers(pdf, max(width / 2, _RULER_REACH), max(height / 2, _RULER_REACH))
     return bytes(pdf.output())
-
-
-def fits(target: TargetConfig, page: str) -> bool:
-    """Return true if the page holds the target with its white and its rulers."""
-    return _layout_on(target, parse_page(page), _caption(target)) is not None
 
 
 # --- Pages and their texts --------------------------------------------
@@ -162,11 +157,7 @@ def _holding(needed: tuple[float, float], page: tuple[float, float]) -> tuple[fl
     return None
 
 
-def _caption(
-    target: TargetConfig,
-    origin: str = "sizes from the command line",
-    date: datetime.date | None = None,
-) -> tuple[str, ...]:
+def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> tuple[str, ...]:
     def named(marker: MarkerConfig) -> str:
         return f"{mm_text(marker.side_m)} mm {marker.dictionary} id {marker.id}"
 
@@ -220,9 +211,8 @@ def _caption_room(texts: Sequence[str], width: float) -> tuple[list[str], float]
     return lines, _RULER_DEPTH + 2.0 + _LINE * len(lines)
 
 
-def fitting_page(target: TargetConfig, texts: Sequence[str] = ()) -> str:
+def _fitting_page(target: TargetConfig, texts: Sequence[str]) -> str:
     """Return the page, for --page, that holds the target: a named one, or a size."""
-    texts = texts or _caption(target)
     for name, size in PAGES_MM.items():
         if _layout_on(target, size, texts):
             return name

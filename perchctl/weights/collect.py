@@ -18,16 +18,15 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from perchctl.calibration import poll_frames
 from perchctl.camera import FrameSource, check_size
-from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound, PerchError
+from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound
 from perchctl.files import cannot_be_written
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
-from perchctl.positioning import BodyPose, CaptureFrame, Placed
+from perchctl.positioning import CaptureFrame, CaptureSource, Placed
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import (
     MARKERS,
@@ -36,7 +35,6 @@ from perchctl.vision import (
     Frame,
     MarkerPose,
     PipelineState,
-    estimate_pose,
     make_pipeline,
     step,
 )
@@ -48,12 +46,10 @@ STILL_PX = 1.0
 """The target's picture must not wander farther than this within a position (between its
 thirds), nor shake with a greater standard deviation."""
 FAR_M, FAR_RAD = 0.03, math.radians(10.0)
-"""A typed pose that differs from the camera's by more must be confirmed."""
+"""An actual pose that differs from the camera's by more is a mistake."""
 SAMPLES = 30
-"""Poses of motion capture whose median is the actual pose; they must come within `WITHIN_S`."""
+"""Frames of motion capture whose median is the actual pose; they must come within `WITHIN_S`."""
 WITHIN_S = 5.0
-MOVED_M, MOVED_RAD = 0.003, math.radians(1.0)
-"""A vehicle that moved farther than this while its frames were taken was not held still."""
 _LEAST_FRAMES = 3
 
 Ask = Callable[[str], str]
@@ -70,7 +66,6 @@ class MarkerReading:
     t_s: float
     large: Array | None
     small: Array | None
-    joint: Array | None
     center_px: Array | None
 
 
@@ -88,14 +83,11 @@ def read_markers(
     for frame in frames:
         state, output = step(state, frame, attitude, setup)
         seen = [d for name in MARKERS if (d := output.detections.get(name)) is not None]
-        both = len(seen) == 2
-        joint = estimate_pose(seen, frame.t_s, attitude, setup.pose) if both else None
         yield MarkerReading(
             frame.t_s,
             _vector(output.poses.get("large")),
             _vector(output.poses.get("small")),
-            _vector(joint),
-            np.concatenate([d.corners_px for d in seen]).mean(axis=0) if both else None,
+            np.concatenate([d.corners_px for d in seen]).mean(axis=0) if len(seen) == 2 else None,
         )
 
 
@@ -108,16 +100,12 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
     count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames came"
-    for name in MARKERS:
-        seen = sum(getattr(reading, name) is not None for reading in readings)
-        if seen < SEEN_SHARE * count:
-            return (
-                f"half seen: the {name} marker was found in {seen} of {count} frames; move so "
-                f"that both markers are whole in the picture"
-            )
     centers = np.array([r.center_px for r in readings if r.center_px is not None])
-    if len(centers) < _LEAST_FRAMES:
-        return f"half seen: both markers at once were found in {len(centers)} of {count} frames"
+    if len(centers) < SEEN_SHARE * count:
+        return (
+            f"half seen: both markers at once were found in {len(centers)} of {count} frames; "
+            f"move so that both are whole in the picture"
+        )
     thirds = np.array([part.mean(axis=0) for part in np.array_split(centers, 3)])
     drift_px = float(np.linalg.norm(np.ptp(thirds, axis=0)))
     wander_px = max(float(np.linalg.norm(centers.std(axis=0))), drift_px)
@@ -131,7 +119,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
     """Return the lines of a position in the session's file."""
-    return "".join(row_text(position, r.t_s, [r.large, r.small, actual, r.joint]) for r in readings)
+    return "".join(row_text(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
 class SessionFile:
@@ -139,27 +127,22 @@ class SessionFile:
 
     Attributes:
         note: a sentence, if an unfinished end was taken off.
-        done: numbers of the positions that are complete.
+        done: number of positions that are complete.
     """
 
     def __init__(self, path: Path, frames: int) -> None:
         self.path = path
         self.note = ""
-        self.done: list[int] = []
+        self.done = 0
         if path.exists() and path.stat().st_size:
             self._continue(frames)
         else:
             self._write(HEADER + "\n", "w")
 
-    @property
-    def next_position(self) -> int:
-        """Number of the position to take next, from 1."""
-        return max(self.done, default=0) + 1
-
-    def append(self, position: int, rows: str) -> None:
+    def append(self, rows: str) -> None:
         """Append one whole position, and bring it to the disk."""
         self._write(rows, "a")
-        self.done.append(position)
+        self.done += 1
 
     def _write(self, text: str, mode: str) -> None:
         try:
@@ -178,47 +161,26 @@ class SessionFile:
                 f"{self.path}: line 1: not a session of perchctl (its header differs), so "
                 f"nothing is appended; name a new file"
             )
-        try:
-            positions = [int(line.partition(b",")[0]) for line in lines[1:]]
-        except ValueError:
-            raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
-        counts = Counter(positions)
+        rows = Counter(line.partition(b",")[0] for line in lines[1:])
         if torn:
             # The position that was being written: its tail is lost, so all of it is taken again.
-            if positions and counts[positions[-1]] < frames:
-                del lines[-counts.pop(positions[-1]) :]
+            last = lines[-1].partition(b",")[0]
+            if 0 < rows[last] < frames:
+                del lines[-rows.pop(last) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
             self.note = f"{self.path}: an unfinished end was taken off"
-        self.done = list(counts)
+        self.done = len(rows)
 
 
 # --- The actual pose --------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class ActualPose:
-    """The actual pose (4,), and the attitude of the vehicle, None where it stands level."""
-
-    pose: Array
-    attitude: Attitude | None = None
-
-
-def motion_fault(before: ActualPose, after: ActualPose) -> str | None:
-    """Return one sentence if the vehicle moved in between, None if it was held still."""
-    way_m = float(np.linalg.norm(after.pose[:3] - before.pose[:3]))
-    turn_rad = abs(wrap_rad(float(after.pose[3] - before.pose[3])))
-    if way_m <= MOVED_M and turn_rad <= MOVED_RAD:
-        return None
-    return (
-        f"shaken: the vehicle moved by {way_m * 1e3:.1f} mm and {math.degrees(turn_rad):.1f} deg "
-        f"while the frames were taken; hold still"
-    )
+ActualPose = tuple[Array, Attitude | None]
+"""The actual pose (4,), and the attitude of the vehicle, None where it stands level."""
 
 
 class TypedTruth:
     """A person with a ruler: centimetres and degrees, as in the paper's tables."""
-
-    repeatable = False  # a second answer would show nothing
 
     def actual(self, ask: Ask) -> ActualPose:
         """Ask the person for the pose. Raises InvalidValue for an answer that is no pose."""
@@ -231,20 +193,10 @@ class TypedTruth:
             raise InvalidValue(
                 f"{text.strip()!r} is not a pose: four numbers are needed, x y z and yaw"
             )
-        return ActualPose(np.array([0.01 * x, 0.01 * y, 0.01 * z, wrap_rad(math.radians(yaw))]))
+        return np.array([0.01 * x, 0.01 * y, 0.01 * z, wrap_rad(math.radians(yaw))]), None
 
     def close(self) -> None:
         """Do nothing: a person needs no closing."""
-
-
-class CapturedFrames(Protocol):
-    """The part of a motion capture that is needed here."""
-
-    def frames(self) -> list[CaptureFrame]: ...
-
-    def problem(self, now_s: float) -> str | None: ...
-
-    def close(self) -> None: ...
 
 
 class MocapTruth:
@@ -255,11 +207,9 @@ class MocapTruth:
         target: rigid body of the target; its x axis is the heading.
     """
 
-    repeatable = True
-
     def __init__(
         self,
-        capture: CapturedFrames,
+        capture: CaptureSource,
         config: PositioningConfig,
         target: str,
         gear_body_m: Array,
@@ -271,52 +221,38 @@ class MocapTruth:
 
     def actual(self, ask: Ask) -> ActualPose:
         """Return the median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
-        self._capture.frames()  # older ones do not count
-        poses: dict[str, list[BodyPose]] = {self._config.body: [], self._target: []}
-        seen: set[str] = set()
+        self._capture.poll(self._now())  # an older one does not count
+        frames: list[CaptureFrame] = []
         until_s = self._now() + WITHIN_S
-        while missing := [name for name, found in poses.items() if len(found) < SAMPLES]:
-            frames = self._capture.frames()
-            for frame in frames:
-                seen |= set(frame.bodies)
-                for name in poses.keys() & frame.bodies.keys():
-                    poses[name].append(frame.bodies[name])
+        while len(frames) < SAMPLES:
+            frame = self._capture.poll(self._now())
+            if frame is not None and {self._config.body, self._target} <= frame.bodies.keys():
+                frames.append(frame)
             if self._now() > until_s:
-                raise self._unseen(missing[0], seen)
-            if not frames:
-                self._wait(0.01)
-        for name, found in poses.items():
-            if len(set(found)) == 1:
+                if (problem := self._capture.problem(self._now())) is not None:
+                    raise ConnectionFailed(problem)
                 raise NotFound(
-                    f"{self._config.label} has {name!r} frozen: {SAMPLES} times the same numbers, "
-                    f"and a measured pose has noise"
+                    f"{self._config.label} does not see both rigid bodies, {self._config.body!r} "
+                    f"and {self._target!r}"
                 )
-        target_m, (_, _, target_yaw) = _median(poses[self._target], PositioningConfig())
-        body_m, (roll, pitch, yaw) = _median(poses[self._config.body], self._config)
+            self._wait(0.002)
+        target_m, (_, _, target_yaw) = _median(frames, self._target, PositioningConfig())
+        body_m, (roll, pitch, yaw) = _median(frames, self._config.body, self._config)
         level = rot_z(-yaw) @ (target_m - body_m)
         e_m = level - rotation_from_rpy(roll, pitch, 0.0) @ self._gear
         attitude = Attitude(0.0, roll, pitch, yaw, (body_m[0], body_m[1], body_m[2]))
-        return ActualPose(np.array([*e_m, wrap_rad(target_yaw - yaw)]), attitude)
+        return np.array([*e_m, wrap_rad(target_yaw - yaw)]), attitude
 
     def close(self) -> None:
         """End the capture."""
         self._capture.close()
 
-    def _unseen(self, missing: str, seen: set[str]) -> PerchError:
-        problem = self._capture.problem(self._now())
-        if problem is not None:
-            return ConnectionFailed(problem)
-        return NotFound(
-            f"{self._config.label} does not see the rigid body {missing!r}; it sees "
-            f"{', '.join(sorted(seen)) or 'none'}"
-        )
-
 
 def _median(
-    poses: list[BodyPose], mounted: PositioningConfig
+    frames: list[CaptureFrame], body: str, mounted: PositioningConfig
 ) -> tuple[Array, tuple[float, float, float]]:
     """Return the position (3,) m, and roll, pitch, yaw in rad of the body's axes in the world."""
-    placed = [Placed.of(pose, mounted) for pose in poses]
+    placed = [Placed.of(frame.bodies[body], mounted) for frame in frames]
     rpy = np.unwrap([rpy_from_rotation(each.R) for each in placed], axis=0)
     roll, pitch, yaw = (float(angle) for angle in np.median(rpy, axis=0))
     return np.median([each.position_m for each in placed], axis=0), (roll, pitch, wrap_rad(yaw))
@@ -346,11 +282,11 @@ class Experiment:
     def run(self, positions: int, frames: int) -> None:
         """Take positions until the session holds so many. Raises Interrupted when the person stops
         (the session keeps what is complete), and the errors of the source and the truth."""
-        while len(self.session.done) < positions:
-            number = self.session.next_position
+        while self.session.done < positions:
+            number = self.session.done + 1
             self.say(
-                f"position {len(self.session.done) + 1} of {positions}: place the camera so "
-                f"that both markers are whole in the picture, at another height, place and heading"
+                f"position {number} of {positions}: place the camera so that both markers are "
+                f"whole in the picture, at another height, place and heading"
             )
             fault = self._take(number, frames)
             if fault is None:
@@ -361,23 +297,19 @@ class Experiment:
     def _take(self, number: int, frames: int) -> str | None:
         """Take one position into the file; return a sentence if it must be taken again."""
         try:
-            before = self.truth.actual(self._answer)
+            actual, attitude = self.truth.actual(self._answer)
         except InvalidValue as error:
             return str(error)
         self._answer("hold still and press Enter (q stops): ")
         shown = self._frames(frames)
         readings = []
         with self.bar("frames", frames) as advance:
-            for reading in read_markers(shown, self.profile, self.camera, before.attitude):
+            for reading in read_markers(shown, self.profile, self.camera, attitude):
                 readings.append(reading)
                 advance()
-        fault = position_fault(readings)
-        if fault is None and self.truth.repeatable:
-            fault = motion_fault(before, self.truth.actual(self._answer))
+        fault = position_fault(readings) or _mismatch(actual, readings)
         if fault is None:
-            fault = self._mismatch(before, readings)
-        if fault is None:
-            self.session.append(number, session_rows(number, readings, before.pose))
+            self.session.append(session_rows(number, readings, actual))
         return fault
 
     def _answer(self, question: str) -> str:
@@ -387,26 +319,10 @@ class Experiment:
             text = "q"
         if text.strip().lower() in ("q", "quit"):
             raise Interrupted(
-                f"stopped with {len(self.session.done)} positions in {self.session.path}; the "
-                f"same command goes on from there"
+                f"stopped with {self.session.done} positions in {self.session.path}; the same "
+                f"command goes on from there"
             )
         return text
-
-    def _mismatch(self, actual: ActualPose, readings: list[MarkerReading]) -> str | None:
-        """Return a sentence if the camera measures another pose, and the person does not keep
-        it."""
-        poses = np.array([r.large for r in readings if r.large is not None])
-        poses[:, 3] = np.unwrap(poses[:, 3])
-        seen = np.median(poses, axis=0)
-        off_m = float(np.linalg.norm(seen[:3] - actual.pose[:3]))
-        off_rad = abs(wrap_rad(float(seen[3] - actual.pose[3])))
-        if off_m <= FAR_M and off_rad <= FAR_RAD:
-            return None
-        expected = _pose_text(actual.pose)
-        self.say(f"the camera measures {_pose_text(seen)}, but the actual pose is {expected}")
-        if self._answer("keep it all the same? [y/N] ").strip().lower() in ("y", "yes"):
-            return None
-        return "the actual pose does not fit what the camera sees"
 
     def _frames(self, count: int) -> Iterator[Frame]:
         if self.source.live:
@@ -425,6 +341,18 @@ class Experiment:
         raise NotFound(
             f"{self.source.describe()} ended after {got} of {count} frames of the position"
         )
+
+
+def _mismatch(actual: Array, readings: list[MarkerReading]) -> str | None:
+    """Return a sentence if the camera measures another pose."""
+    poses = np.array([r.large for r in readings if r.large is not None])
+    poses[:, 3] = np.unwrap(poses[:, 3])
+    seen = np.median(poses, axis=0)
+    off_m = float(np.linalg.norm(seen[:3] - actual[:3]))
+    off_rad = abs(wrap_rad(float(seen[3] - actual[3])))
+    if off_m <= FAR_M and off_rad <= FAR_RAD:
+        return None
+    return f"the camera measures {_pose_text(seen)}, but the actual pose is {_pose_text(actual)}"
 
 
 def _pose_text(pose: Array) -> str:

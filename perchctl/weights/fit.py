@@ -47,7 +47,6 @@ LABELS = {
     "paper": "the paper's weights",
     "lms": "LMS",
     "closed_form": "closed form",
-    "joint": "joint solve",
 }
 
 
@@ -58,7 +57,7 @@ class Errors:
     Attributes:
         name: the file, for messages.
         positions: the positions' numbers, (g,); starts: the first row of each, (g,).
-        large, small: a and b, (n, 4). joint: (n, 4) with NaN.
+        large, small: a and b, (n, 4).
         use: False where the row is an outlier on the axis, (n, 4).
     """
 
@@ -67,7 +66,6 @@ class Errors:
     starts: NDArray[np.int64]
     large: Array
     small: Array
-    joint: Array
     use: NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -81,19 +79,6 @@ class Errors:
         parts = np.stack([use, a, b, a * a, b * b, a * b])
         return np.asarray(np.add.reduceat(parts, self.starts, axis=1))
 
-    @property
-    def biases(self) -> dict[str, tuple[Array, Array]]:
-        """Each marker's constant offset from the truth, (4,), and the half width of its 95 %
-        interval over positions."""
-        found = {}
-        of_positions = self.sums[1:3] / np.maximum(self.sums[0], 1.0)
-        for name, means in zip(SINGLE, of_positions, strict=True):
-            mean, g = means.mean(axis=0), len(means)
-            half = t_quantile(g - 1) * means.std(axis=0, ddof=1) / math.sqrt(g)
-            mean[YAW] = wrap(mean[YAW])
-            found[name] = (mean, half)
-        return found
-
 
 def errors_of(data: Measurements) -> Errors:
     """Return the errors of the rows with both markers."""
@@ -104,8 +89,7 @@ def errors_of(data: Measurements) -> Errors:
     large, small = data.large[rows] - actual, data.small[rows] - actual
     yaw = np.concatenate([large[:, YAW], small[:, YAW]])
     reference = float(np.arctan2(np.sin(yaw).sum(), np.cos(yaw).sum()))
-    joint = data.joint[rows] - actual
-    for each in (large, small, joint):
+    for each in (large, small):
         each[:, YAW] = reference + wrap(each[:, YAW] - reference)
     return Errors(
         name=data.name,
@@ -113,7 +97,6 @@ def errors_of(data: Measurements) -> Errors:
         starts=starts,
         large=large,
         small=small,
-        joint=joint,
         use=_inliers(large, starts) & _inliers(small, starts),
     )
 
@@ -158,8 +141,8 @@ def closed_form(sums: Array) -> Array:
 START_STEP = 0.02
 LEAST_RUN_ROWS, LEAST_PASSES = 40_000, 3
 """Rows to run through, in as many passes as that takes, so that few rows suffice."""
-MOST_ROWS, MOST_FOLDS = 100_000, 20
-"""Of more rows an even share is run through; of more positions so many groups are held out."""
+MOST_ROWS = 100_000
+"""Of more rows an even share is run through."""
 _STREAM = (0, 601)
 
 
@@ -172,21 +155,20 @@ def lms(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
     """
     power, pull = _recursion(errors)
     g = len(errors.positions)
-    group = np.arange(g) * min(g, MOST_FOLDS) // g
-    fold_of_row = np.repeat(group, np.diff(errors.starts, append=len(errors)))
+    place = np.repeat(np.arange(g), np.diff(errors.starts, append=len(errors)))
     share = slice(None, None, 1 + len(errors) // MOST_ROWS)
-    power, pull, fold_of_row = power[share], pull[share], fold_of_row[share]
-    n, folds = len(power), int(group[-1]) + 1
-    kept = fold_of_row[:, None, None] != np.arange(folds + 1)[:, None]  # the last one keeps all
+    power, pull, place = power[share], pull[share], place[share]
+    n = len(power)
+    kept = place[:, None, None] != np.arange(g + 1)[:, None]  # the last one keeps all
     rng = np.random.default_rng(_STREAM)
     passes = max(LEAST_PASSES, math.ceil(LEAST_RUN_ROWS / n))
     order = np.concatenate([rng.permutation(n) for _ in range(passes)])
     first = np.minimum(START_STEP, 0.5 / np.maximum(power.max(axis=0), 1.0))
-    w = np.full((folds + 1, 4), start)
+    w = np.full((g + 1, 4), start)
     for taken, row in enumerate(order.tolist()):
         step = first / (1.0 + 0.5 * first * taken)
         w -= kept[row] * (step * power[row] * w + step * pull[row])
-    return w[-1], w[:-1][group]
+    return w[-1], w[:-1]
 
 
 def _recursion(errors: Errors) -> tuple[Array, Array]:
@@ -242,7 +224,7 @@ def fit_all(errors: Errors) -> dict[str, FittedWeights]:
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """Mean square errors of each position by the name of each set of weights, (g, 4), on positions
-    that it was not fitted to; NaN where a position has no joint pose."""
+    that it was not fitted to."""
 
     squares: dict[str, Array]
 
@@ -266,8 +248,7 @@ class Evidence:
     def gain(self, name: str, other: Array) -> tuple[Array, Array]:
         """Return by how much the RMS error is below that of `other` (g, 4), and the half width of
         the difference's interval, (4,)."""
-        there = np.where(np.isnan(other), np.nan, self.squares[name])
-        (rms, influence), (reference, of_reference) = _root(there), _root(other)
+        (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
@@ -278,33 +259,27 @@ class Evidence:
 
 
 def evidence(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
-    """Return the errors of the fitted weights, of the paper's, of each marker alone and of the
-    joint solve. `weights` by the fitted methods' names: (4,), or a row a position, (g, 4)."""
+    """Return the errors of the fitted weights, of the paper's and of each marker alone. `weights`
+    by the fitted methods' names: (4,), or a row a position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums
     known = {"large": np.ones(4), "small": np.zeros(4), "paper": np.array(PAPER_WEIGHTS)}
-    squares = {
-        name: (w * w * aa + 2.0 * w * (1.0 - w) * ab + (1.0 - w) ** 2 * bb) / np.maximum(n, 1.0)
-        for name, w in (known | dict(weights)).items()
-    }
-    there = errors.use & ~np.isnan(errors.joint)
-    if there.any():
-        joint = np.add.reduceat(np.where(there, errors.joint, 0.0) ** 2, errors.starts, axis=0)
-        count = np.add.reduceat(there.astype(np.float64), errors.starts, axis=0)
-        squares["joint"] = np.where(count > 0, joint / np.maximum(count, 1.0), np.nan)
-    return Evidence(squares)
+    return Evidence(
+        {
+            name: (w * w * aa + 2.0 * w * (1.0 - w) * ab + (1.0 - w) ** 2 * bb) / np.maximum(n, 1.0)
+            for name, w in (known | dict(weights)).items()
+        }
+    )
 
 
 def _root(square: Array) -> tuple[Array, Array]:
     """Return the root of the mean over positions (4,), and each position's influence (g, 4)."""
-    mean = np.nanmean(square, axis=0)
+    mean = square.mean(axis=0)
     rms = np.sqrt(mean)
     return rms, (square - mean) / (2.0 * np.maximum(rms, 1e-300))
 
 
 def _half_width(influence: Array) -> Array:
-    """Return half the width of the 95 % interval, (4,); infinite with a single position."""
-    g = int(np.isfinite(influence[:, 0]).sum())
-    if g < 2:
-        return np.full(4, np.inf)
-    spread = np.sqrt(np.nansum(influence**2, axis=0) / (g - 1) / g)
+    """Return half the width of the 95 % interval, (4,)."""
+    g = len(influence)
+    spread = np.sqrt((influence**2).sum(axis=0) / (g - 1) / g)
     return np.asarray(t_quantile(g - 1) * spread)

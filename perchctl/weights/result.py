@@ -1,4 +1,4 @@
-"""The fit from data files: all that it found out, as one value, as a report for a terminal, as one
+"""The fit from a data file: all that it found out, as one value, as a report for a terminal, as one
 JSON record, and as the weights file that a profile names (`merge.weights_file`)."""
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from perchctl.files import write_files
+from perchctl.errors import InvalidValue
+from perchctl.files import same_file, write_files
 from perchctl.geometry import Array
 from perchctl.weights.data import AXES, read_data
 from perchctl.weights.fit import (
@@ -47,7 +48,6 @@ class Result:
     other: Evidence | None
     other_name: str
     chosen: str
-    sha256: str
 
     @property
     def proven(self) -> list[bool]:
@@ -66,39 +66,24 @@ class Result:
         alone = np.where(self.evidence.better == 0, 1.0, 0.0)
         return np.where(self.proven, self.fits[self.chosen].weights, alone)
 
-    @property
-    def notes(self) -> list[str]:
-        """Sentences on clipped weights, and on too few positions."""
-        notes = []
-        for name, found in self.fits.items():
-            outside = [
-                f"{axis} {w:.3f}"
-                for axis, w in zip(AXES, found.raw, strict=True)
-                if not 0.0 <= w <= 1.0
-            ]
-            if outside:
-                notes.append(f"{name}: clipped to 0 .. 1: {', '.join(outside)}")
-        count = len(self.errors.positions)
-        if count < 5:
-            notes.append(f"{count} positions are few: intervals are wide (10 are usual)")
-        return notes
 
-
-def fit_weights(paths: Sequence[Path], chosen: str, test: Path | None = None) -> Result:
+def fit_weights(path: Path, chosen: str, test: Path | None = None) -> Result:
     """Read the data, fit the weights by each method, and judge them by held-out positions.
 
     Args:
         chosen: the method that is offered, one of `FITTED`.
         test: other data to judge the weights by.
 
-    Errors: NotFound, InvalidValue, UsageError.
+    Errors: NotFound, InvalidValue.
     """
-    data, tested = read_data(paths, test)
-    errors = errors_of(data)
+    if test is not None and same_file(path, test):
+        raise InvalidValue(f"{test} is the data itself, and no test of what is fitted to it")
+    errors = errors_of(read_data(path))
     fits = fit_all(errors)
     other = None
-    if tested is not None:
-        other = evidence(errors_of(tested), {name: fit.weights for name, fit in fits.items()})
+    if test is not None:
+        weights = {name: fit.weights for name, fit in fits.items()}
+        other = evidence(errors_of(read_data(test)), weights)
     return Result(
         errors=errors,
         fits=fits,
@@ -106,7 +91,6 @@ def fit_weights(paths: Sequence[Path], chosen: str, test: Path | None = None) ->
         other=other,
         other_name="" if test is None else str(test),
         chosen=chosen,
-        sha256=data.sha256,
     )
 
 
@@ -132,15 +116,11 @@ def weights_record(result: Result) -> dict[str, Any]:
         "better_single": dict(zip(AXES, result.better, strict=True)),
         "half_width": {name: _by_axis(fit.half) for name, fit in result.fits.items()},
         "errors": _errors_record(result.evidence),
-        "bias": {name: _by_axis(mean) for name, (mean, _) in result.errors.biases.items()},
-        "outliers": dict(zip(AXES, (~result.errors.use).sum(axis=0).tolist(), strict=True)),
         "data": {
             "file": result.errors.name,
-            "sha256": result.sha256,
             "rows": len(result.errors),
             "positions": len(result.errors.positions),
         },
-        "notes": result.notes,
     }
     if result.other is not None:
         record["test"] = {"file": result.other_name, "errors": _errors_record(result.other)}
@@ -149,15 +129,11 @@ def weights_record(result: Result) -> dict[str, Any]:
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
     """Return the RMS error (x, y, z, yaw) of each set of weights with the half width of its
-    interval, and the gain over the better single marker with its own."""
+    interval."""
     record = {}
     for name in found.squares:
-        (rms, half), (gain, gain_half) = found.rms(name), found.gain(name, found.better_squares)
-        record[name] = _by_axis(rms) | {
-            "half_width": _by_axis(half),
-            "gain": _by_axis(gain),
-            "gain_half_width": _by_axis(gain_half),
-        }
+        rms, half = found.rms(name)
+        record[name] = _by_axis(rms) | {"half_width": _by_axis(half)}
     return record
 
 
@@ -170,7 +146,7 @@ def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> Non
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
 
-# --- The report, for a terminal of 80 columns: the verdict first, notes last ---
+# --- The report, for a terminal of 80 columns, the verdict first ---
 # Lengths are in micrometres and angles in thousandths of a degree, as that is the size of the
 # errors of good corners.
 
@@ -181,10 +157,12 @@ _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
 
 def report_text(result: Result) -> str:
-    """Return the report: verdict, errors, gains, weights, offsets, notes."""
-    errors, label = result.errors, LABELS[result.chosen]
+    """Return the report: verdict, errors, gains and weights."""
+    errors = result.errors
+    left_out = int((~errors.use).any(axis=1).sum())
     data = (
-        f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions show both markers"
+        f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions show both "
+        f"markers; {left_out} of them are outliers"
     )
     parts = [_wrapped(data), _verdict(result)]
     judged = [(result.evidence, "on positions left out of the fit")]
@@ -197,22 +175,15 @@ def report_text(result: Result) -> str:
             for name, square in found.squares.items()
             if name not in FITTED
         }
+        title = f"gain of {LABELS[result.chosen]} in RMS error {where} over"
         parts.append(_table(f"RMS error {where}, 95 % interval", _HEADS, rms))
-        parts.append(_table(f"gain of {label} in RMS error {where} over", _HEADS, gains))
+        parts.append(_table(title, _HEADS, gains))
     weights = {
         LABELS[name]: [f"{w:.3f} +-{h:.3f}" for w, h in zip(fit.weights, fit.half, strict=True)]
         for name, fit in result.fits.items()
     }
     weights[LABELS["paper"]] = [f"{w:.3f}{'':8}" for w in PAPER_WEIGHTS]
-    away = np.abs(result.fits["lms"].raw - result.fits["closed_form"].raw).max()
-    title = f"fitted weights; LMS ends {away:.4f} from the closed form"
-    parts.append(_table(title, AXES, weights))
-    offsets = {f"{name} marker": _scaled(*found, "+") for name, found in errors.biases.items()}
-    offsets["outliers left out"] = [f"{n}{'':6}" for n in (~errors.use).sum(axis=0)]
-    mend = "constant offsets (no weight can mend them: calibration, mounting or print can)"
-    parts.append(_table(mend, _HEADS, offsets))
-    if result.notes:
-        parts.append("\n".join(_wrapped(f"note: {note}") for note in result.notes))
+    parts.append(_table("fitted weights of the large marker, 95 % interval", AXES, weights))
     return "\n\n".join(parts)
 
 
@@ -244,15 +215,11 @@ def _table(title: str, heads: Sequence[str], rows: dict[str, list[str]]) -> str:
 
 
 def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
-    """Return cells as ``6.5 +-1.2``, in micrometres and thousandths of a degree; large ones in
-    thousands (k)."""
+    """Return cells as ``6.5 +-1.2``, in micrometres and thousandths of a degree."""
     cells = []
     for value, half in zip(values * _SCALES, halves * _SCALES, strict=True):
-        size = max(abs(value), abs(half))
-        unit, unit_text = (1e3, "k") if size >= 1e5 else (1.0, "")
-        digits = 1 if size < 1e3 else 0
-        shown = round(value / unit, digits) + 0.0
-        cells.append(f"{shown:{sign}.{digits}f}{unit_text} +-{half / unit:.{digits}f}{unit_text}")
+        digits = 1 if abs(value) < 1e3 else 0
+        cells.append(f"{value:{sign}.{digits}f} +-{half:.{digits}f}")
     return cells
 
 

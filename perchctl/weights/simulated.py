@@ -54,8 +54,8 @@ class SimulatedStand:
 
     def fill(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
         """Complete the session; `advance` is called with each frame. Raises InvalidValue."""
-        while len(session.done) < self._positions:
-            position = session.next_position
+        while session.done < self._positions:
+            position = session.done + 1
             place, readings = self.place(position), []
             shown = self.frames(position, place, frames)
             for reading in read_markers(shown, self._profile, self._camera):
@@ -67,7 +67,7 @@ class SimulatedStand:
                     f"position {position} of the simulated experiment cannot be used ({fault}): "
                     f"take another --seed"
                 )
-            session.append(position, session_rows(position, readings, place.actual))
+            session.append(session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> CameraPlace:
         """Return the place of a position, counted from 1. Its distance falls into its own share of

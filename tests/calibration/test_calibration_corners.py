@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import learn_gear
-from perchctl.calibration.board.capture import sharpness
 from perchctl.calibration.board.detect import BoardView, find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
@@ -131,17 +130,6 @@ def test_the_corners_of_an_interlaced_picture_are_its_first_fields() -> None:
         view = _view(CHARUCO, picture)
         there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
         assert rms(view.corners_px - there) < 0.1
-
-
-def test_a_comb_is_no_sharpness() -> None:
-    """Of a video's frames the sharpest are searched: not those that moved most."""
-    rng = np.random.default_rng(8)
-    pose = draw_poses(rng, CAMERA, CHARUCO, 1)[0]
-    still = BoardRenderer(CAMERA, CHARUCO).render(pose, rng, noise=2.0)
-    combed = still.copy()
-    combed[1::2] = np.roll(still, 3, axis=1)[1::2]
-    assert len(split_fields(combed)) == 2
-    assert sharpness(combed) < 1.2 * sharpness(still)
 
 
 # --- the vehicle's own gear, learned from pictures that move -------------------------------------

@@ -44,19 +44,21 @@ class Pictures:
     """A recording of these pictures."""
 
     live, size_px = False, SIZE_PX
+    trouble: str | None = None
+    """What is wrong with the source once its pictures are over; None: it has ended."""
 
     def __init__(self, pictures: list[NDArray[np.uint8]]) -> None:
         self._left = [Frame(k, k / 10.0, picture) for k, picture in enumerate(pictures)]
 
     @property
     def finished(self) -> bool:
-        return not self._left
+        return not (self._left or self.trouble)
 
     def poll(self, now_s: float) -> Frame | None:
         return self._left.pop(0) if self._left else None
 
     def problem(self, now_s: float) -> str | None:
-        return None
+        return self.trouble
 
     def describe(self) -> str:
         return "pictures"

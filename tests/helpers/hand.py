@@ -313,5 +313,4 @@ def record_hand(hand: Hand, profile: Profile, camera: CameraModel) -> MountingRe
         if profile.camera.mirrored:
             picture = unmirror_frame(picture)
         poses += reader.look(picture)
-    felt, by = attitudes(hand), PoseReader.basis(profile, camera)
-    return MountingRecording(hand.part, felt, poses, reader.mirrored, by)
+    return MountingRecording(hand.part, attitudes(hand), poses, reader.mirrored)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perchctl.calibration import MountingRecording, PoseReader, profile_camera
+from perchctl.calibration import MountingRecording
 from perchctl.calibration.mounting.recording import MountingPart, SeenPose
 from perchctl.profile import Profile, load_profile
 from tests.helpers.hand import Hand, R_target_cam, attitudes, cam_target_m, draw_hand
@@ -70,5 +70,4 @@ def seen(
         SeenPose(float(t), R[k], p[k], np.diag(claimed * sigma[k] ** 2))
         for k, t in enumerate(stamped_s)
     ]
-    by = PoseReader.basis(profile(), profile_camera(profile().camera))
-    return MountingRecording(held.part, attitudes(held, errors), poses, seen_by=by)
+    return MountingRecording(held.part, attitudes(held, errors), poses)

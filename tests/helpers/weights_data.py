@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
 from perchctl.geometry import Array
-from perchctl.weights.data import NEEDED, Measurements, row_text, wrap
+from perchctl.weights.data import HEADER, Measurements, row_text, wrap
 
 BEST = np.array([0.275, 0.306, 0.728, 0.469])
 """The weights that `known` data are made with."""
@@ -58,28 +58,20 @@ def measured(
         out[:, 3] = wrap(out[:, 3] + turn_rad)
         return out
 
-    n = len(actual)
     return Measurements(
         name="synthetic.csv",
-        sha256="0" * 64,
         position=number.astype(np.int64),
-        t_s=np.arange(n) / 30.0,
         large=turned(actual + a),
         small=turned(actual + b),
         actual=turned(actual),
-        joint=np.full((n, 4), np.nan),
     )
 
 
 def write(data: Measurements, path: Path) -> Path:
-    """As the documented CSV, without the optional columns."""
-    rows = [
-        row_text(int(p), float(t), [a, b, c, None]).removesuffix(",,,,\n")
-        for p, t, a, b, c in zip(
-            data.position, data.t_s, data.large, data.small, data.actual, strict=True
-        )
-    ]
-    path.write_text("\n".join([",".join(NEEDED), *rows, ""]), encoding="utf-8")
+    """As the documented CSV."""
+    rows = zip(data.position, data.large, data.small, data.actual, strict=True)
+    lines = [row_text(int(p), k / 30.0, poses) for k, (p, *poses) in enumerate(rows)]
+    path.write_text("".join([f"{HEADER}\n", *lines]), encoding="utf-8")
     return path
 
 

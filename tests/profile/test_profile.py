@@ -44,7 +44,6 @@ def test_paper_constants() -> None:
     assert (weights.x, weights.y, weights.z, weights.yaw) == (0.275, 0.306, 0.728, 0.469)
     assert (paper.merge.z2_m, paper.merge.z3_m) == (0.25, 0.12)
     assert paper.merge.method == "weights"
-    assert paper.planner.recover.descend_m == 0.10
     assert load_calibration(find_calibration(paper.camera.calibration)).size_px == (640, 480)
 
 
@@ -65,7 +64,7 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("planer: {}", ["planer", "unknown", "extends", "planner"]),
         ("kalman: {alfa: 0.85}", ["kalman.alfa", "unknown", "alpha"]),
         ("target: {large: {dictionary: DICT_4X4_100, id: 997, side_m: 0.15}}",
-         ["target.large", "997", "0..99", "DICT_4X4_1000"]),
+         ["target.large", "997", "0..99"]),
         ("target: {large: {dictionary: DICT_4X4_1000, id: 1000, side_m: 0.15}}",
          ["0..999"]),
         ("target: {large: {dictionary: DICT_9X9, id: 1, side_m: 0.15}}",
@@ -90,7 +89,7 @@ def _refusal(tmp_path: Path, text: str) -> str:
           for value, found in [("80", "80"), ("-0.1", "-0.1"), ("auto", "'auto'"),
                                ("null", "None"), (".nan", "nan")]),
         *((f"camera: {{format: {value}}}",
-           ["camera.format", f"found {found};", "three or four capitals"])
+           ["camera.format", f"found {found}"])
           for value, found in [("4", "4"), ("mjpeg", "'mjpeg'"), ("[MJPG]", "['MJPG']")]),
         ("camera: {latency_s: yes}", ["camera.latency_s"]),
         ("target: {small: {dictionary: DICT_4X4_1000, id: 997, side_m: 0.025}}",
@@ -100,9 +99,6 @@ def _refusal(tmp_path: Path, text: str) -> str:
          ["target", "the same marker", "DICT_4X4_50/5 and DICT_4X4_250/5", "another id"]),
         ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "keep one"]),
         ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 is there twice"]),
-        ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
-        ("planner: {approach_xy_m: [off, 1]}", ["planner.approach_xy_m", "a number"]),
-        ("link: {parameters: {a.b: on}}", ["link.parameters", "a number"]),
         ("", ["empty", "extends: sim"]),
         ("# only a remark\n", ["empty"]),
         ("camera:\nkalman: {}", ["camera", "must hold keys", "None"]),
@@ -190,10 +186,9 @@ def test_a_profile_round_trips_through_its_own_dump() -> None:
 
 @pytest.mark.parametrize(("text", "words"), [
     ("planner: {ascend: {near_m: 0.35}}", r"planner\.ascend\.near_m .* it is 0\.35"),
-    ("simulation: {set: nominal, gloss: [0.2, 0.8]}", "no longer used"),
-    ("camera: {controls: {gain: 20}}", r"camera\.controls is no longer used"),
+    ("planner: {recover: {timeout_s: 6}}", r"timeout_s is no longer a key"),
 ])  # fmt: skip
-def test_a_key_that_is_a_constant_or_gone_is_named(tmp_path: Path, text: str, words: str) -> None:
+def test_a_key_that_is_a_constant_is_named(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "old.yaml").write_text(f"extends: sim\nname: sim\n{text}\n")
     with pytest.warns(ProfileNote, match=words):
         old = load_profile(str(tmp_path / "old.yaml"))
@@ -202,7 +197,7 @@ def test_a_key_that_is_a_constant_or_gone_is_named(tmp_path: Path, text: str, wo
 
 @pytest.mark.parametrize(("key", "value", "words"), [
     ("planner.ascend.near_m", "0.5", r"near_m.*0\.35.*and 0\.5 here"),
-    ("simulation.set", "rough", r"simulation\.set.*extend the profile rough"),
+    ("simulation.capture_delay_s", "0.02", r"capture_delay_s.*0\.01.*and 0\.02 here"),
 ])  # fmt: skip
 def test_another_value_of_a_constant_is_refused(
     tmp_path: Path, key: str, value: str, words: str
@@ -218,11 +213,8 @@ def test_another_value_of_a_constant_is_refused(
 
 def test_a_profile_in_an_old_log_is_read() -> None:
     """It holds every key, also of the world in which was flown."""
-    values = load_profile("extreme").model_dump(mode="json")
-    values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "drift_xyz_mps": None}
-    values["simulation"] |= {"camera_burst_start_s": [4.0, 22.0]}
-    assert Profile.model_validate(values) == load_profile("extreme")
     values = load_profile("sim").model_dump(mode="json")
+    values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "drift_xyz_mps": None}
     values["planner"]["ascend"]["near_m"] = 0.35
     assert Profile.lost_values(values) == []
     values["planner"]["ascend"]["near_m"] = 0.5

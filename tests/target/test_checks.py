@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target import Board, draw_target, parse_length
-from perchctl.target.boards import black_squares
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.prints import PrintCheck, size_ratio
 from perchctl.target.reading import PlainReader, check_target
@@ -126,13 +125,6 @@ def test_a_wrong_notation_is_one_sentence(text: str, said: str) -> None:
     with pytest.raises(InvalidValue, match=said) as refused:
         Board.parse(text)
     assert "\n" not in str(refused.value)
-
-
-def test_a_chessboard_has_one_more_square_than_corners() -> None:
-    board = Board.parse("chessboard:9x6:25mm")
-    assert black_squares(board).shape == (7, 10)
-    assert board.corners_m().shape == (54, 3)
-    assert board.corners_m()[0] == pytest.approx([0.0, 0.0, 0.0])
 
 
 # --- the drawing: cells, rectangles and bitmaps agree --------------------------------------------

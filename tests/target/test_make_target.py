@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import itertools
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,8 +144,7 @@ def test_the_captions_say_what_is_printed_and_which_side_it_is() -> None:
 
 
 LAYOUTS = [
-    (150.0, 25.0, "a4"), (150.0, 25.0, "letter"), (150.0, 25.0, "a3"), (150.0, 25.0, "220x240mm"),
-    (120.0, 20.0, "a4"), (100.0, 15.0, "letter"), (60.0, 10.0, "160x220mm"), (200.0, 30.0, "a3"),
+    (150.0, 25.0, "a4"), (150.0, 25.0, "220x240mm"), (60.0, 10.0, "160x220mm"), (200.0, 30.0, "a3"),
     (355.0, 35.0, "442x478mm"),
 ]  # fmt: skip
 
@@ -239,19 +237,11 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
     assert Path("target.pdf").read_bytes() == first
 
 
-def test_a_board() -> None:
-    out, _ = call("board", "chessboard:9x6:25mm", "-o", "board.pdf")
-    assert "wrote board.pdf" in out
-    assert files() == {"board.pdf"}
-
-
 @pytest.mark.long
-def test_the_design_and_a_suggestion_write_nothing() -> None:
+def test_a_design_writes_nothing() -> None:
     out, _ = call("design", CAMERA, "--ceiling", "2.4", "--blur", "2.0")
     assert "z1" in out
     assert "mounting  never blind" in out
-    out, _ = call("suggest", "--blur", "2", "--json")
-    assert json.loads(out)["command"].startswith("perchctl make-target --large ")
     assert files() == set()
 
 
@@ -273,9 +263,8 @@ REFUSALS = [
     (["board", "chessboard:9x6:25mm:measured=249x174mm"], 2, "leave out :measured="),
     (["board", "chessboard:9x6:25mm", "-o", "board.txt"], 30, "must end in .pdf"),
     (["design", "nothing.yaml"], 20, "not found"),
-    (["suggest", CAMERA, "--ceiling", "1"], 30, "below the highest search position"),
     (["design", "--blur", "-1"], 2, "--blur"),
-    (["suggest", "--ceiling", "nan"], 2, "--ceiling"),
+    (["design", "--ceiling", "nan"], 2, "--ceiling"),
     (["measured", "-p", "m.yaml"], 2, "nothing was measured"),
     (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 2, "-p my_vehicle.yaml"),
     (["measured", "--measured-large", "149.6", "-p", "m.yaml"], 20, "m.yaml does not exist"),

@@ -17,10 +17,8 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig, load_profile
 from perchctl.profile.vision import VehicleConfig
-from perchctl.target import make_design, overhead_text, suggest_target, view_from
+from perchctl.target import make_design, overhead_text, view_from
 from perchctl.target.design import TargetDesign
-from perchctl.target.reading import check_target
-from perchctl.target.sheets import fits
 from perchctl.target.sight import (
     SURE_PX,
     BlindRange,
@@ -32,7 +30,7 @@ from perchctl.target.sight import (
 )
 from perchctl.vision import project, square_corners
 from tests.helpers.flights import short_profile
-from tests.target.rig import camera_of, sized
+from tests.target.rig import camera_of
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
@@ -123,13 +121,6 @@ def test_where_the_target_is_found_overhead(
 ) -> None:
     """`rpy_deg` of pitch is nose down: the view goes forward."""
     assert words in overhead_text(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
-
-
-def test_a_way_is_named_by_the_vehicle_s_sides() -> None:
-    mount, target_m = Mounting(position_m=(0.0, 0.0, 0.0)), np.array([0.31, -0.12, 1.0])
-    seen = view_from(np.zeros(3), 0.0, target_m, 0.0, TARGET, CAMERA, mount)
-    assert seen.aside_text == "0.31 m forward and 0.12 m to the right"
-    assert seen.reach_m == overhead_reach_m(SIDE_M, CAMERA, mount, 1.0)
 
 
 # --- near the target: from where on a mounting is blind ---------------------------------------
@@ -239,7 +230,6 @@ def test_z3_is_the_geometry_s() -> None:
     [
         ({}, ""),
         ({"z1_m": 0.9}, "gap at the start"),
-        ({"start_range_m": 0.2}, "the ceiling is hardly above the search height"),
         ({"z2_m": 0.15}, "gap between the markers"),
         ({"z1_m": None}, "never read"),
         ({"small_nearest_m": 0.2}, "gap before contact"),
@@ -259,26 +249,3 @@ def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position() -> None
     for ceiling_m, gap in ((0.9 * sure_m, False), (1.1 * sure_m, True)):
         design = make_design(TARGET, PAPER_CAMERA, 0.6, ground, ceiling_m)
         assert any("gap at the start" in text for text in design.warnings) is gap
-
-
-def test_a_camera_far_from_the_gear_gets_a_target_and_a_warning() -> None:
-    aside = short_profile({"camera.mount.position_m": (0.3, 0.0, 0.0)}, base="sim")
-    found, _ = suggest_target(PAPER_CAMERA, 0.6, aside, 0.05)
-    assert any("gap before contact" in text for text in found.warnings)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("focal_px", "blur_px", "ceiling_m"), [(380.0, 2.0, 2.4), (250.0, 0.6, None)]
-)
-def test_what_is_suggested_covers_the_way(
-    profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
-) -> None:
-    found, page = suggest_target(camera_of(focal_px), blur_px, profile, 0.05, ceiling_m)
-    assert page == "a4"
-    assert found.warnings == ()
-    assert found.z1_m is not None
-    assert found.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
-    check_target(found.target, 0.05)
-    assert fits(found.target, "a4")
-    assert not fits(sized(1e3 * found.target.large.side_m + 5, 25.0), "a4")

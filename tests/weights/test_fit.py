@@ -81,13 +81,10 @@ def test_outliers_are_left_out_and_counted() -> None:
     assert abs(fitted(spoilt)[2] - fitted(clean)[2]) < 0.01
 
 
-def test_a_constant_offset_is_reported_and_moves_no_weight() -> None:
+def test_a_constant_offset_moves_no_weight() -> None:
     plain, offset = independent(8), independent(8)
     offset.large[:, :3] += [0.004, -0.002, 0.01]
     assert np.abs(fitted(plain) - fitted(offset)).max() < 1e-6
-    mean, half = fit.errors_of(offset).biases["large"]
-    assert np.abs(mean[:3] - [0.004, -0.002, 0.01]).max() < 3e-4
-    assert (np.abs(mean[:3] - [0.004, -0.002, 0.01]) < 2 * half[:3]).all()
 
 
 def judged(errors: fit.Errors) -> tuple[dict[str, fit.FittedWeights], fit.Evidence]:

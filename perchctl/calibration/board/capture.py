@@ -1,10 +1,10 @@
-"""Views of a board: from pictures, from a video, and from a live camera that a person is guided in
+"""Views of a board: from pictures, and from a video or a live camera that a person is guided in
 front of; and how alike two views are, which decides which of many are kept."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,110 +14,52 @@ import numpy as np
 from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection, find_board
 from perchctl.calibration.board.solve import MIN_VIEWS
 from perchctl.calibration.live import GuidedFrame, poll_frames
-from perchctl.camera import FrameSource, Grey, decode_picture, open_camera
+from perchctl.camera import FrameSource, decode_picture
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 from perchctl.target import Board
 from perchctl.vision import Frame
 
-VIDEO_WINDOW = 8
-"""Of so many frames in a row only the sharpest is searched for the board."""
-_BATCH = 32
-"""So many frames of a video are searched at once: a whole one would not fit into the memory."""
-Progress = Callable[[int, int | None], None]
-"""Called with the number of pictures done, and of all where it is known."""
-
-
-# --- Pictures and videos ----------------------------------------------
+# --- Pictures ---------------------------------------------------------
 
 
 def find_views(
-    pictures: Sequence[Path] | Path, board: Board, progress: Progress = lambda done, total: None
+    pictures: Sequence[Path],
+    board: Board,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
-    """Return the views of the board in picture files, or the sharp and different ones of a video's
-    frames; and the pictures that are broken or show none.
+    """Return the views of the board in picture files, and the pictures that are broken or show
+    none. `progress` is called with the number of pictures done, and of all.
 
-    Raises:
-        NotFound: no such file. InvalidValue: unequal sizes, or no video.
+    Raises InvalidValue: unequal sizes.
     """
-    if isinstance(pictures, Path):
-        return _views_of_video(pictures, board, progress)
     names = [path.name for path in pictures]
     if len(set(names)) < len(names):  # a glob reached into several folders
         names = [str(path) for path in pictures]
 
-    def search(name: str, path: Path) -> BoardView | tuple[str, tuple[int, int] | None]:
+    def search(name: str, path: Path) -> BoardView | str:
         try:
-            image = decode_picture(path.read_bytes())
+            return find_board(decode_picture(path.read_bytes()), board, name)
         except (OSError, ValueError) as error:
-            return str(error), None
-        found = find_board(image, board, name)
-        return found if isinstance(found, BoardView) else (found, (image.shape[1], image.shape[0]))
+            return str(error)
 
     views: list[BoardView] = []
     missing: list[Rejection] = []
-    first: tuple[str, tuple[int, int]] | None = None
     with ThreadPoolExecutor() as pool:
-        found = pool.map(search, names, pictures)
-        for done, (name, seen) in enumerate(zip(names, found, strict=True), start=1):
-            size_px = seen.size_px if isinstance(seen, BoardView) else seen[1]
-            if size_px is not None:
-                first = first or (name, size_px)
-                if size_px != first[1]:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise InvalidValue(
-                        f"{name} is {size_px[0]}x{size_px[1]} px but {first[0]} is "
-                        f"{first[1][0]}x{first[1][1]} px: a calibration belongs to one size, "
-                        f"keep pictures of one only"
-                    )
+        for name, seen in zip(names, pool.map(search, names, pictures), strict=True):
             if isinstance(seen, BoardView):
                 views.append(seen)
             else:
-                missing.append(Rejection(name, seen[0]))
-            progress(done, len(pictures))
+                missing.append(Rejection(name, seen))
+            progress(len(views) + len(missing), len(pictures))
+    for view in views:
+        if view.size_px != views[0].size_px:
+            (w, h), (first_w, first_h) = view.size_px, views[0].size_px
+            raise InvalidValue(
+                f"{view.name} is {w}x{h} px but {views[0].name} is {first_w}x{first_h} px: a "
+                f"calibration belongs to one size, keep pictures of one only"
+            )
     return FoundViews(tuple(views), tuple(missing))
-
-
-def _views_of_video(path: Path, board: Board, progress: Progress) -> FoundViews:
-    """Return the sharp and different views of a video, or why there are none."""
-
-    def search(frame: Frame) -> BoardView | str:
-        return find_board(frame.image, board, f"frame {frame.index}")
-
-    source = open_camera(f"video:{path}", time.monotonic)
-    found: list[BoardView] = []
-    searched = 0
-    try:
-        with ThreadPoolExecutor() as pool:
-            sharpest = _sharpest_frames(source)
-            while batch := [frame for frame, _ in zip(sharpest, range(_BATCH))]:  # noqa: B905
-                seen = list(pool.map(search, batch))
-                found += [view for view in seen if isinstance(view, BoardView)]
-                searched += len(batch)
-                progress(searched, None)
-    finally:
-        source.close()
-    if not found:
-        return FoundViews((), (Rejection(f"{searched} frames", "no board found"),))
-    return FoundViews(tuple(select_views(found, board)))
-
-
-def _sharpest_frames(source: FrameSource) -> Iterator[Frame]:
-    """Yield the sharpest frame of each window."""
-    window: list[Frame] = []
-    while (frame := source.poll(0.0)) is not None:
-        window.append(frame)
-        if len(window) == VIDEO_WINDOW:
-            yield max(window, key=lambda frame: sharpness(frame.image))
-            window = []
-    if window:
-        yield max(window, key=lambda frame: sharpness(frame.image))
-
-
-def sharpness(image: Grey) -> float:
-    """Return the variance of a picture's second derivative; of every second row, as the comb of an
-    interlaced picture that moves is no sharpness."""
-    return float(cv2.Laplacian(np.ascontiguousarray(image[::2, ::2]), cv2.CV_32F).var())
 
 
 # --- How alike two views are ------------------------------------------
@@ -129,9 +71,9 @@ GOALS = {"x": 0.5, "y": 0.5, "size": 0.3, "tilt": 0.4}
 NEW_BEYOND = 0.18
 ENOUGH_VIEWS = 15
 MOST_VIEWS = 40
+"""So many show the lens, whatever they cover."""
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.7, 0.7])
 _TILT_GAIN = 2.0
-_BLUR_FACTOR = 1.7
 
 
 def signature(view: BoardView, board: Board) -> Array:
@@ -166,19 +108,6 @@ def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
 
 
-def select_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
-    """Return the sharp and different ones of a video's views, at most `MOST_VIEWS`, the sharpest
-    first."""
-    limit_px = _BLUR_FACTOR * float(np.median([view.blur_px for view in views]))
-    taken: dict[int, Array] = {}
-    for k in sorted(range(len(views)), key=lambda k: views[k].blur_px):
-        here = signature(views[k], board)
-        is_new = all(distance(here, there) > 0.4 * NEW_BEYOND for there in taken.values())
-        if is_new and views[k].blur_px <= limit_px and len(taken) < MOST_VIEWS:
-            taken[k] = here
-    return [views[k] for k in taken]
-
-
 # --- Guided capture ---------------------------------------------------
 
 
@@ -202,32 +131,26 @@ def capture_views(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> FoundViews:
-    """Take views of a live camera until all is covered or `stopped`, whenever the view is new,
-    sharp and still. `show` gets each frame's moment.
+    """Take views of a video or a live camera until all is covered, it has ended or `stopped`,
+    whenever the view is new, sharp and still. `show` gets each frame's moment.
 
-    A source that is gone ends the capture with what there is, if that may be enough.
-
-    Raises TimedOut: the camera is gone before that.
+    Raises TimedOut: the camera is gone before there may be enough.
     """
     capture = Capture(board)
-    ended = f"{source.describe()} has ended"
     try:
         for _, frame in poll_frames(source, clock, sleep):
             if stopped():
-                return FoundViews(tuple(capture.taken))
+                break
             if frame is None or frame.repeated:  # a repeated one would look still
                 continue
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")
             taken = capture.update(seen)
             show(capture.guided(frame, seen, taken))
             if capture.finished:
-                return FoundViews(tuple(capture.taken))
+                break
     except TimedOut as gone:
-        ended = str(gone)
-    if len(capture.taken) < MIN_VIEWS:
-        raise TimedOut(
-            f"{ended}; only {len(capture.taken)} views were taken, at least {MIN_VIEWS} are needed"
-        )
+        if len(capture.taken) < MIN_VIEWS:
+            raise TimedOut(f"{gone}; only {len(capture.taken)} views were taken") from None
     return FoundViews(tuple(capture.taken))
 
 

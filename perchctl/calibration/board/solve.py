@@ -36,8 +36,6 @@ TITLES: dict[Level, str] = {
 CARE_FACTOR = 3.0
 ASIDE_FACTOR = 2.0
 _EASIER = 0.95  # a richer model must leave at most this part of the simpler one's spread
-_MOST_MISSING = 8
-"""Pictures without a board that are named one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +98,7 @@ class Calibration:
 
     def lines(self) -> list[str]:
         """Return what was left out, the lens, what it lacks, and the verdict at the end."""
-        lines = [f"left out {r.view}: {r.reason}" for r in self.missing[:_MOST_MISSING]]
-        if len(self.missing) > _MOST_MISSING:
-            left = len(self.missing) - _MOST_MISSING
-            lines.append(f"left out {left} more pictures without a board")
+        lines = [f"left out {r.view}: {r.reason}" for r in self.missing]
         for r in self.rejections:
             what = f"corners {', '.join(map(str, r.corners))} of {r.view}" if r.corners else r.view
             lines.append(f"rejected {what}: {r.reason}")
@@ -149,9 +144,6 @@ class Calibration:
                 "parameters": " ".join(PARAMETERS[self.camera.model]),
                 "parameter_std": self.std[None],
                 "parameter_covariance": self.covariance,
-                "target_error_columns": "distance in m; 95 % lines in mm wherever boards were "
-                "seen, and straight ahead",
-                "target_error": np.array([[e.z_m, e.mm95, e.axis_mm95] for e in self.errors]),
             },
         )
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
-
 import cv2
 import numpy as np
 
@@ -39,15 +37,6 @@ class PoseReader:
         self.mirrored = 0
         self.outlines: tuple[tuple[str, Array], ...] = ()
         self.trouble = ""
-
-    @staticmethod
-    def basis(profile: Profile, camera: CameraModel) -> str:
-        """Return what poses rest on beside the pictures, in words: printed sizes and lens."""
-        sides_mm = [f"{1e3 * m.side_m:g}" for m in (profile.target.large, profile.target.small)]
-        K = camera.K
-        lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(camera.dist)]
-        number = zlib.crc32(np.round(np.array(lens, dtype=np.float64), 6).tobytes())
-        return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
 
     def look(self, frame: Frame) -> list[SeenPose]:
         """Return the target's poses in a frame: one, or one in each of its two fields."""

@@ -21,10 +21,12 @@ from perchctl.files import write_files
 from perchctl.geometry import Array
 
 MountingPart = Literal["carry", "pivot"]
-_FORMAT = 1
-_DECIMALS = 9
-_POSE_SHAPES = {"t_s": (), "rotation_cam_target": (3, 3), "position_cam_target_m": (3,)}
-_MOST_NOT_A_ROTATION = 1e-3  # of R R^T - 1
+_POSE_SHAPES: dict[str, tuple[int, ...]] = {
+    "t_s": (),
+    "rotation_cam_target": (3, 3),
+    "position_cam_target_m": (3,),
+    "covariance": (6, 6),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,42 +60,26 @@ class SeenPose:
 @dataclass(eq=False)
 class MountingRecording:
     """The recording of one part, which grows while it is recorded. `mirrored_pictures` counts those
-    in which the target was seen mirrored only; `seen_by` says what else the poses rest on (see
-    `PoseReader.basis`), empty where that is not known."""
+    in which the target was seen mirrored only."""
 
     part: MountingPart
     attitudes: list[AttitudeSample] = field(default_factory=list)
     poses: list[SeenPose] = field(default_factory=list)
     mirrored_pictures: int = 0
-    seen_by: str = ""
 
     @staticmethod
     def write(path: Path, recordings: Sequence[MountingRecording]) -> None:
-        """Write the parts into one file, whole or not at all.
-
-        Raises:
-            InvalidValue: it cannot be written, or `read` would refuse a number.
-        """
+        """Write the parts into one file, whole or not at all. Raises InvalidValue: it cannot be
+        written."""
         records: list[dict[str, Any]] = []
         for recording in recordings:
-            head = {
-                key: getattr(recording, key) for key in ("part", "mirrored_pictures", "seen_by")
-            }
-            records.append(head | {"format": _FORMAT})
+            mirrored = recording.mirrored_pictures
+            records.append({"part": recording.part, "mirrored_pictures": mirrored})
             for a in recording.attitudes:
-                rpy_rad = _plain((a.roll_rad, a.pitch_rad, a.yaw_rad))
-                gyro_radps = _plain(a.gyro_radps)
-                records.append({"t_s": a.t_s, "rpy_rad": rpy_rad, "gyro_radps": gyro_radps})
-            for p in recording.poses:
-                record = {name: _plain(getattr(p, name)) for name in _POSE_SHAPES}
-                # Its numbers are small: all digits count.
-                records.append(record | {"covariance": p.covariance.tolist()})
-        try:
-            lines = [json.dumps(r, separators=(",", ":"), allow_nan=False) for r in records]
-        except ValueError:
-            raise InvalidValue(
-                f"{path} is not written: a sample holds a number that is none"
-            ) from None
+                rpy_rad = (a.roll_rad, a.pitch_rad, a.yaw_rad)
+                records.append({"t_s": a.t_s, "rpy_rad": rpy_rad, "gyro_radps": a.gyro_radps})
+            records += map(vars, recording.poses)
+        lines = [json.dumps(r, separators=(",", ":"), default=np.ndarray.tolist) for r in records]
         write_files({path: ("\n".join(lines) + "\n").encode()})
 
     @staticmethod
@@ -109,58 +95,39 @@ class MountingRecording:
         except FileNotFoundError:
             raise NotFound(f"{path} is not there: name a recording of calibrate mount") from None
         except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else "it is not text"
-            raise InvalidValue(f"{path} cannot be read: {why}") from None
+            raise InvalidValue(f"{path} cannot be read: {error}") from None
         parts: list[MountingRecording] = []
         for number, line in enumerate(text.splitlines(), start=1):
             try:
                 record = json.loads(line)
                 if "part" in record:
-                    if record["format"] != _FORMAT or record["part"] not in get_args(MountingPart):
-                        raise ValueError("the part or its format is unknown")
+                    if record["part"] not in get_args(MountingPart):
+                        raise ValueError("the part is unknown")
                     mirrored = int(record["mirrored_pictures"])
-                    seen_by = str(record["seen_by"])
-                    parts.append(MountingRecording(record["part"], [], [], mirrored, seen_by))
-                elif "rotation_cam_target" in record:
-                    parts[-1].poses.append(_pose(record))
+                    parts.append(MountingRecording(record["part"], mirrored_pictures=mirrored))
+                elif "covariance" in record:
+                    values = (_numbers(record, key, *shape) for key, shape in _POSE_SHAPES.items())
+                    parts[-1].poses.append(SeenPose(*values))
                 else:
-                    parts[-1].attitudes.append(_attitude(record))
-            except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
-                why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
+                    t_s, gyro_radps = _numbers(record, "t_s"), _numbers(record, "gyro_radps", 3)
+                    roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()
+                    parts[-1].attitudes.append(AttitudeSample(t_s, roll, pitch, yaw, gyro_radps))
+            except (LookupError, TypeError, ValueError) as error:
                 raise InvalidValue(
-                    f"{path}, line {number} is no line of a recording of calibrate mount: {why}"
+                    f"{path}, line {number} is no line of a recording of calibrate mount: {error}"
                 ) from None
         if not parts:
             raise InvalidValue(f"{path} is empty: name a recording of calibrate mount")
         return parts
 
 
-def _plain(value: Any) -> Any:
-    return np.round(np.asarray(value, dtype=np.float64), _DECIMALS).tolist()
-
-
-def _attitude(record: Mapping[str, Any]) -> AttitudeSample:
-    roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()
-    t_s = float(_numbers(record, "t_s"))
-    gyro_radps = _numbers(record, "gyro_radps", 3)
-    return AttitudeSample(t_s, roll, pitch, yaw, gyro_radps)
-
-
-def _pose(record: Mapping[str, Any]) -> SeenPose:
-    values = {key: _numbers(record, key, *shape) for key, shape in _POSE_SHAPES.items()}
-    R = values["rotation_cam_target"]
-    if np.abs(R @ R.T - np.eye(3)).max() > _MOST_NOT_A_ROTATION or np.linalg.det(R) < 0.0:
-        raise ValueError("rotation_cam_target is no rotation")
-    cov = _numbers(record, "covariance", 6, 6)
-    return SeenPose(float(values["t_s"]), R, values["position_cam_target_m"], cov)
-
-
-def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Array:
-    """Raises KeyError, TypeError or ValueError where the key does not hold such numbers."""
+def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
+    """Return the numbers of a key: an array, or a float where `shape` is (). Raises KeyError,
+    TypeError or ValueError where it does not hold such numbers."""
     values = np.array(record[key], dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{key} must hold {math.prod(shape)} numbers")
-    return values
+    return values if shape else float(values)
 
 
 @dataclass(frozen=True, eq=False)

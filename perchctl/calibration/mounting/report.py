@@ -3,52 +3,49 @@ profile's keys."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from perchctl.calibration.board.adjust import SIGMAS_95
 from perchctl.calibration.mounting.carry import CarrySolution, solve_carry
 from perchctl.calibration.mounting.pivot import PivotSolution, solve_pivot
 from perchctl.calibration.mounting.recording import MountingRecording
-from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import Profile
-
-NOTABLE_TURN_DEG = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Value:
-    """One measured number or three, their sigmas, and what the profile says, empty where it says
-    no number."""
+    """One measured number or three, their sigmas, and what the profile says, None where it says no
+    number; lines show them `scale` times as large, in `unit`."""
 
     name: str
     key: str
     unit: str
+    scale: float
+    decimals: int
     measured: Array
     sigma: Array
-    written: Array
-    decimals: int
+    written: Array | None
 
     def lines(self) -> list[str]:
         """Return the value with its 95 % interval, and what the profile says instead."""
-        interval = " ".join(f"{SIGMAS_95 * sigma:.{self.decimals}f}" for sigma in self.sigma)
-        lines = [f"{self.name:<12}{self._text(self.measured)} +- {interval} {self.unit} (95 %)"]
-        if not len(self.written):
-            return [*lines, f"{'':<12}you wrote measured: each flight measures it, and it stays so"]
+        interval = self._text(SIGMAS_95 * self.sigma)
+        line = f"{self.name:<12}{self._text(self.measured)} +- {interval} {self.unit} (95 %)"
+        if self.written is None:
+            return [line, f"{'':<12}you wrote measured: each flight measures it, and it stays so"]
         apart = self.measured - self.written
         apart = (apart + 180.0) % 360.0 - 180.0 if self.unit == "deg" else apart
         within = (np.abs(apart) <= SIGMAS_95 * self.sigma).all()
-        away = "within that" if within else f"{np.linalg.norm(apart):.1f} {self.unit} away"
-        return [*lines, f"{'':<12}you wrote {self._text(self.written)}: {away}"]
+        away = self.scale * np.linalg.norm(apart)
+        said = "within that" if within else f"{away:.1f} {self.unit} away"
+        return [line, f"{'':<12}you wrote {self._text(self.written)}: {said}"]
 
     def _text(self, values: Array) -> str:
-        return " ".join(f"{v:g}" for v in _rounded(values, self.decimals))
+        return " ".join(f"{v:g}" for v in _rounded(self.scale * np.ravel(values), self.decimals))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,52 +93,35 @@ class MountingReport:
         return "\n".join(lines)
 
     def _values(self) -> list[_Value]:
-        """Return what was measured, in the units of the lines."""
+        """Return what was measured."""
         camera, values = self.profile.camera, []
         if (carried := self.carried) is not None:
             angles = np.array(carried.rpy_deg)
             sigmas = np.array(carried.rpy_sigma_deg)
             written = np.array(camera.mount.rpy_deg)
-            values.append(_Value("turn", "rpy_deg", "deg", angles, sigmas, written, 2))
-            late, sigma = 1e3 * np.array([[carried.latency_s], [carried.latency_sigma_s]])
-            known = np.array([] if camera.latency_s == "measured" else [1e3 * camera.latency_s])
-            values.append(_Value("latency", "latency_s", "ms", late, sigma, known, 1))
+            values.append(_Value("turn", "rpy_deg", "deg", 1.0, 2, angles, sigmas, written))
+            late, sigma = np.array([carried.latency_s, carried.latency_sigma_s])
+            known = None if camera.latency_s == "measured" else np.array(camera.latency_s)
+            values.append(_Value("latency", "latency_s", "ms", 1e3, 1, late, sigma, known))
         if (pivoted := self.pivoted) is not None:
-            tip = 1e3 * pivoted.gear_cam_m
-            sigma = 1e3 * pivoted.gear_cam_sigma_m
-            known = 1e3 * self.written_gear_cam_m
-            values.append(_Value("gear's tip", "gear_cam_m", "mm", tip, sigma, known, 2))
+            tip, sigmas = pivoted.gear_cam_m, pivoted.gear_cam_sigma_m
+            written = self.written_gear_cam_m
+            values.append(_Value("gear's tip", "gear_cam_m", "mm", 1e3, 2, tip, sigmas, written))
         return values
 
     def record(self) -> dict[str, Any]:
-        """Return the measured part of the object of `calibrate mount --json`; null is not
-        measured."""
-        found: dict[str, dict[str, Any]] = {
-            group: dict.fromkeys(("rpy_deg", "latency_s", "gear_cam_m"))
-            for group in ("measured", "sigma", "written")
+        """Return the measured part of the object of `calibrate mount --json`: what was measured,
+        the sigmas, what the profile says, and what it is to say."""
+        values = self._values()
+        return {v.key: v.measured.tolist() for v in values} | {
+            "sigma": {v.key: v.sigma.tolist() for v in values},
+            "written": {v.key: v.written.tolist() for v in values if v.written is not None},
+            "profile_values": self.profile_values(),
         }
-        for value in self._values():
-            unit = 1.0 if value.unit == "deg" else 1e-3
-            for group, record in found.items():
-                numbers = (unit * getattr(value, group)).tolist()
-                single = value.key == "latency_s"
-                record[value.key] = (*numbers, None)[0] if single else numbers
-        values = {key: np.asarray(v).tolist() for key, v in self.profile_values().items()}
-        return found.pop("measured") | found | {"profile_values": values}
 
     def lines(self) -> list[str]:
         """Return each number, its 95 % interval, and what the profile says instead."""
-        lines = [line for value in self._values() for line in value.lines()]
-        if self.carried is None:
-            lines.append("the gear's place in the body rests on the profile's camera.mount.rpy_deg")
-        elif self.pivoted is None:
-            R = self.profile.camera.mount.T_body_cam[:3, :3]
-            turned = Rotation.from_matrix(R.T @ self.carried.R_body_cam)
-            if math.degrees(turned.magnitude()) > NOTABLE_TURN_DEG:
-                lines.append(
-                    "the gear's place in the camera changes with the turn: do the pivot as well"
-                )
-        return lines
+        return [line for value in self._values() for line in value.lines()]
 
 
 def _rounded(values: Any, decimals: int) -> tuple[float, ...]:
@@ -156,14 +136,8 @@ def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) ->
     by_part = {recording.part: recording for recording in recordings}
     carry = by_part.get("carry")
     pivot = by_part.get("pivot")
-    carried, pivoted = None, None
-    try:
-        carried = None if carry is None else solve_carry(carry)
-        if pivot is not None:
-            pivoted = solve_pivot(pivot, profile.target.size_sigma)
-    except InvalidValue as error:
-        if len(by_part) < 2:
-            raise
-        other = "pivot" if carried is None else "carry"
-        raise InvalidValue(f"{error} (--part {other} takes the {other} alone)") from None
-    return MountingReport(profile, carried, pivoted)
+    return MountingReport(
+        profile,
+        None if carry is None else solve_carry(carry),
+        None if pivot is None else solve_pivot(pivot, profile.target.size_sigma),
+    )
