@@ -24,7 +24,7 @@ from tests.target.rig import target_of
 
 REFUSED = {
     "magnet too small": (target_of(small=("DICT_ARUCO_ORIGINAL", 5, 36.0)), 0.05,
-                         "at most --small 35.3mm"),
+                         "at most 35.3 mm"),
     "magnet too large": (target_of(), 0.16, "does not fit behind the large marker"),
     "small too large": (target_of(small=("DICT_ARUCO_ORIGINAL", 5, 35.0)), 0.05,
                         "the large marker cannot be read from this drawing: take a smaller "
