@@ -258,7 +258,7 @@ def pressed_at(module: str) -> str:
     return textwrap.dedent(PRESSED_AT.format(module=module))
 
 
-@pytest.mark.parametrize("module", ["typer", "cv2"])
+@pytest.mark.parametrize("module", ["lazy_loader", "typer", "cv2"])
 def test_ctrl_c_while_loading_is_one_sentence(module: str) -> None:
     done = run_apart("fly", "--dry-run", before=pressed_at(module))
     assert (done.code, done.stdout, done.stderr) == (130, "", "perchctl: Ctrl-C\n")

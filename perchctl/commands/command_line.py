@@ -221,7 +221,7 @@ def main() -> Any:
         return end.exit_code
     finally:
         # A key that is still held down must not end what is over with a traceback.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, lambda _signal, _frame: os._exit(Interrupted.exit_code))
 
 
 @contextlib.contextmanager
