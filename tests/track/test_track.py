@@ -166,28 +166,19 @@ def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
 def test_the_filter_bridges_a_lost_frame(tmp_path: Path) -> None:
     images = [picture(moving(i), i) for i in range(8)]
     images[5] = picture(VIEWS["away"])
-    for i, image in enumerate(images):
-        cv2.imwrite(str(tmp_path / f"{i}.png"), image)
-    lost = lines(tmp_path, "--video")[5]
+    lost = lines(write_video(tmp_path / "lost.mp4", images))[5]
     assert lost["stage"] == "none"
     assert lost["large"] is None
     assert np.abs(np.array(lost["target"]["tvec_m"]) - true_pose(moving(5))[1]).max() < 0.02
-    assert lines(tmp_path)[5]["target"] is None
 
 
-def test_files_of_pictures_are_stills_unless_the_user_says_otherwise(pictures: Path) -> None:
-    """Filtered as one movement at 30 Hz, unrelated pictures drag each other along."""
+def test_each_picture_file_is_measured_alone(pictures: Path) -> None:
+    """Filtered as one movement, unrelated pictures would drag each other along."""
     stills = {line["frame"]: line for line in lines(pictures)}
     for source in (f"images:{pictures}", str(pictures / "*.png")):
         assert {line["frame"]: line for line in lines(source)} == stills
     (alone,) = lines(pictures / "near.png")
     assert stills["near.png"] | {"t_s": 0.0} == alone
-    one_video = lines(pictures, "--video")
-    far = true_pose(VIEWS["far"])[1]
-    assert np.abs(np.array(one_video[2]["target"]["tvec_m"]) - far).max() > 0.05
-    assert [line["t_s"] for line in one_video] == pytest.approx(
-        [k / 30.0 for k in range(len(VIEWS))]
-    )
 
 
 def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
@@ -317,22 +308,6 @@ def test_markers_that_contradict_are_named() -> None:
     doubting = tracker(sim.model_copy(update={"target": target}), live=False, stills=True)
     [seen] = doubting.results(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))), 0)
     assert [note.partition(":")[0] for note in seen.notes] == ["the two markers contradict"]
-
-
-def test_a_print_error_is_named(video: Path, tmp_path: Path) -> None:
-    """The profile says a small marker 4 % smaller than the one in the picture."""
-    profile = tmp_path / "wrong.yaml"
-    profile.write_text(
-        "extends: sim\ntarget: {small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.024}}\n"
-    )
-    own = tmp_path / "camera.yaml"
-    own.write_text(f"# of this camera\n{CALIBRATION.read_text()}")
-    said = track(video, "-p", profile, calibration=own).stderr
-    assert "print error: the small marker is" in said
-    assert "print good within its noise" in track(video, calibration=own).stderr
-    example = track(video).stderr  # whose lens would call a good print wrong
-    assert "the shipped example" in example
-    assert "print" not in example
 
 
 class Script:
