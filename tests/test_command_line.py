@@ -160,7 +160,6 @@ def test_each_note_is_one_sentence_once_and_before_a_failure(
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("simulate --only 3 -n 5", ["--only 3", "-n"]),
         ("simulate --resume", ["--resume", "--out"]),
         ("calibrate pictures --view", ["no live camera", "--view"]),
     ],

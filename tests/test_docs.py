@@ -107,9 +107,8 @@ def cheap(line: str) -> list[str]:
                 words[3:5] = ["quick.yaml", "quick.yaml"]
             else:
                 words += ["-p", "quick.yaml"]
-            for option in ("-n", "--only"):
-                if option in words:
-                    words[words.index(option) + 1] = "1"
+            if "-n" in words:
+                words[words.index("-n") + 1] = "1"
         case ["perchctl", "fit-weights"] if "collect" in words:
             words += ["--positions", "3", "--frames", "10"]
         case ["perchctl", "calibrate"] if words[2] == "mount":  # without a vehicle in a hand

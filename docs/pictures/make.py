@@ -437,7 +437,7 @@ def _write(file: Path, picture: NDArray[np.uint8]) -> None:
 
 def fly(profile: str, seed: int, folder: Path) -> FlightLog:
     where = ("--log-dir", str(folder), "--record")
-    _perchctl("simulate", "-p", profile, "--only", str(seed), *where)
+    _perchctl("simulate", "-p", profile, "-n", "1", "--seed", str(seed), *where)
     return read_log(folder / f"flight_seed{seed}.jsonl")
 
 

@@ -22,7 +22,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import print_result, say
+from perchctl.commands.output import print_result, say, with_problem
 from perchctl.commands.progress import count_bar
 from perchctl.errors import PerchError, UsageError, no_simulator
 from perchctl.files import check_output, same_file
@@ -97,12 +97,10 @@ def fit(
             f"the interval; take more positions, or write them all the same with --anyway"
         )
         say(str(problem))
-    code = 0 if problem is None else problem.exit_code
     if as_json:
-        failure = {} if problem is None else {"error": str(problem), "exit_code": code}
         written = None if problem or output is None else str(output)
-        print_result(weights_record(result) | {"weights_file": written} | failure)
-    return code
+        print_result(with_problem(weights_record(result) | {"weights_file": written}, problem))
+    return 0 if problem is None else problem.exit_code
 
 
 # --- collect ----------------------------------------------------------

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from perchctl.errors import PerchError
+
 
 def say(sentence: str) -> None:
     """Print one sentence on stderr, as stdout is for the result. Never raises."""
@@ -47,6 +49,13 @@ def ask_to_confirm(question: str) -> bool:
     except EOFError:
         return False
     return answer.strip().lower() in ("y", "yes")
+
+
+def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
+    """Return a command's one object, with what kept it from its end."""
+    if problem is None:
+        return dict(record)
+    return {**record, "error": str(problem), "exit_code": problem.exit_code}
 
 
 def print_result(result: Mapping[str, Any] | Sequence[Any] | str | Path) -> None:
