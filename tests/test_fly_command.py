@@ -63,12 +63,6 @@ def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> 
     assert "udp://h:1" in run("fly", "--dry-run", "-u", "udp://h:1", "--source", "camera:0").stdout
 
 
-def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:
-    at = ("--uri", "usb://0", "--source", "camera:0", "--dry-run")
-    assert "--seed 7" in run("fly", "--seed", "7", *at).complaint
-    assert run("fly", *at).stderr == ""
-
-
 # --- Bad input, before anything is opened ---------------------------------------------------
 
 

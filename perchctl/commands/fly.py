@@ -153,8 +153,6 @@ def resolve(
     )
     options = replace(options, record=not options.simulated if record is None else record)
     check_options(options)
-    if seed is not None and not options.simulated:
-        say(f"--seed {seed} is of simulated flights: it changes nothing at {options.uri}")
     return options
 
 
@@ -167,13 +165,10 @@ def with_positioning(profile: Profile, by: str | None) -> Profile:
         raise InvalidValue(
             f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
         )
-    own = profile.positioning
-    if by == own.by:
+    if by == profile.positioning.by:
         return profile
-    if by == "mocap" and own.by == "deck":
-        config = own.model_copy(update={"by": by})
-    else:  # what belongs to another kind would be of no use, and puzzle
-        config = PositioningConfig.model_validate({"by": by, "decks": own.decks})
+    # What belongs to another kind would be of no use, and puzzle.
+    config = PositioningConfig.model_validate({"by": by, "decks": profile.positioning.decks})
     return profile.model_copy(update={"positioning": config})
 
 
@@ -334,11 +329,10 @@ def _compared(options: FlyOptions) -> list[Row]:
 
 
 def plan_text(options: FlyOptions) -> str:
-    """Return the plan for people, at 80 columns: what, where, the phases with their numbers, and
-    which values of the profile are implausible."""
+    """Return the plan for people, at 80 columns: what, where, the way, and which values of the
+    profile are implausible."""
     resolved, profile, planner = plan(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
-    search, align, ascend, perch = planner.search, planner.align, planner.ascend, planner.perch
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""
     turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)
     edges = picture_edges(camera.mount, camera.mirrored)
@@ -361,26 +355,11 @@ def plan_text(options: FlyOptions) -> str:
             + (f": picture's {edges[0]} is the front, {edges[1]} the left side" if edges else ""),
         ),
         ("latency", late if isinstance(late, str) else f"{late * 1e3:g} ms"),
-        ("merge", _merge_text(profile)),
-        ("1 APPROACH", f"take off to {planner.takeoff_height_m:g} m"),
         (
-            "2 SEARCH",
-            f"{search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m higher each, "
-            f"at most {search.max_height_m:g} m",
+            "way",
+            f"take off to {planner.takeoff_height_m:g} m, search up to "
+            f"{planner.search.max_height_m:g} m, ascend at {planner.ascend.speed_mps:g} m/s",
         ),
-        ("3 ESTIMATE", f"{planner.estimate.dwell_s:g} s of steady pose"),
-        (
-            "4 ALIGN",
-            f"within {align.xy_m * 1e3:g} mm and {align.yaw_deg:g} deg for {align.dwell_s:g} s",
-        ),
-        (
-            "5 ASCEND",
-            f"at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the target, "
-            f"settle within {ascend.settle_xy_m * 1e3:g} mm",
-        ),
-        ("6 PERCH", f"at most {perch.timeout_s:g} s"),
-        ("7 COMPLETE", f"watch for {planner.complete.watch_s:g} s"),
-        ("attempts", f"{planner.attempts}, perching time {planner.perching_time_s:g} s"),
         (
             "limits",
             f"{profile.safety.fence_radius_m:g} m around the place of take-off, "
@@ -421,12 +400,3 @@ def _positioning(options: FlyOptions) -> str:
 
 def _mm(place_m: tuple[float, float, float]) -> str:
     return f"{' '.join(mm_text(part) for part in place_m)} mm"
-
-
-def _merge_text(profile: Profile) -> str:
-    """Return how the markers are merged; of weights also where they are from."""
-    merge = profile.merge
-    if merge.method != "weights":
-        return "joint solve"
-    numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
-    return f"weights {numbers} ({merge.weights_file or 'of the profile'})"
