@@ -17,7 +17,7 @@ import typer
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
-from perchctl.check import Row, Verdict, comparison_rows, profile_rows, warnings_before_flight
+from perchctl.check import Verdict, comparison_rows, profile_rows, warnings_before_flight
 from perchctl.commands.command_line import (
     EXIT_TABLE,
     PositioningOption,
@@ -299,6 +299,13 @@ def plan(options: FlyOptions) -> dict[str, Any]:
     """Return what would be flown, fully resolved; nothing is connected."""
     calibration = find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
+    rows = profile_rows(options.profile, source=options.source)
+    compared = comparison_rows(
+        options.profile.positioning,
+        options.uri,
+        datetime.now().astimezone(),
+        simulated=options.simulated,
+    )
     return {
         "uri": options.uri,
         "source": without_password(options.source),
@@ -309,23 +316,8 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "log_directory": str(options.log_dir),
         "record": options.record,
         "profile": profile_record(options.profile),
-        "check": [
-            dataclasses.asdict(row)
-            for row in (
-                *profile_rows(options.profile, source=options.source),
-                *_compared(options),
-            )
-        ],
+        "check": [dataclasses.asdict(row) for row in (*rows, *compared)],
     }
-
-
-def _compared(options: FlyOptions) -> list[Row]:
-    return comparison_rows(
-        options.profile.positioning,
-        options.uri,
-        datetime.now().astimezone(),
-        simulated=options.simulated,
-    )
 
 
 def plan_text(options: FlyOptions) -> str:
@@ -393,9 +385,9 @@ def _positioning(options: FlyOptions) -> str:
     if config.by != "mocap":
         return "the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
-    compared = [row.found for row in _compared(options) if row.verdict == Verdict.PASS]
-    capture = f"motion capture {where}, body {config.body!r}"
-    return "; ".join([f"{capture}, {config.send} at most {config.rate_hz:g} Hz", *compared])
+    return (
+        f"motion capture {where}, body {config.body!r}, {config.send} at most {config.rate_hz:g} Hz"
+    )
 
 
 def _mm(place_m: tuple[float, float, float]) -> str:
