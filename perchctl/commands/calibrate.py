@@ -9,7 +9,7 @@ import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -48,7 +48,7 @@ from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, check_place, same_file, write_files
+from perchctl.files import check_output, check_place, write_files
 from perchctl.target import Board
 from perchctl.vision import CameraModel
 
@@ -105,13 +105,6 @@ def camera(
     view: ViewOption = False,
     as_json: JsonOption = False,
     size: SizeOption = None,
-    model: Annotated[
-        Literal["auto", "plumb_bob", "fisheye"],
-        typer.Option(
-            "--model",
-            help="Lens model; auto takes the simplest one that follows the lens.",
-        ),
-    ] = "auto",
 ) -> None:
     """Calibrate the camera, and report what its error means in mm at the target.
 
@@ -132,7 +125,7 @@ def camera(
     _check_output(file, force)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
-    result = calibrate_camera(found, layout.notation(), model)
+    result = calibrate_camera(found, layout.notation())
     write_files({file: result.text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
@@ -171,7 +164,6 @@ def mask(
     ] = Path("gear.png"),
     force: ForceOption = False,
     size: SizeOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Learn what the vehicle itself covers of the picture, while it is turned about."""
     pictures = _source(source)
@@ -184,10 +176,9 @@ def mask(
             say("turn the vehicle about for 20 s (Ctrl-C ends and writes the mask)")
         covered = learn_gear(frames, stop.requested.is_set)
     write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
-    share = float(covered.mean())
-    say(f"wrote {output}: the vehicle covers {100 * share:.1f} % of the picture; set camera.mask")
-    record = {"file": str(output), "covered": round(share, 4)}
-    print_result(record if as_json else output)
+    share = 100.0 * covered.mean()
+    say(f"wrote {output}: the vehicle covers {share:.1f} % of the picture; set camera.mask")
+    print_result(output)
 
 
 @command(
@@ -231,18 +222,15 @@ def convert(
     output: OutputOption = None,
     cam: CamOption = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
     model = load_calibration(calibration, cam=cam)
     file = _file(output, model.size_px)
-    if same_file(file, calibration):
-        raise UsageError(f"{file} is the file to convert; name another with --output")
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
     write_files({file: calibration_text(model, file.stem, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
-    print_result({"file": str(file)} if as_json else file)
+    print_result(file)
 
 
 # -- files -------------------------------------------------------------
