@@ -35,13 +35,12 @@ from perchctl.commands.command_line import (
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
-from perchctl.commands.output import print_lines, print_result, say
+from perchctl.commands.output import print_lines, print_result, say, with_problem
 from perchctl.commands.progress import guide
 from perchctl.display import live_page
 from perchctl.errors import (
     Interrupted,
     InvalidValue,
-    NotFound,
     SafetyAbort,
     UsageError,
 )
@@ -112,11 +111,8 @@ def mount(
     The vehicle is turned in the hand in view of the target (carry), then tilted around the tip of
     its gear (pivot). Its motors are off, and nothing arms.
     """
-    if logs:
-        live = {"--uri": uri, "--source": source, "--view": view or None}
-        for option, value in live.items():
-            if value is not None:
-                raise UsageError(f"--from takes no camera, no vehicle, no page: leave {option} out")
+    if logs and (uri is not None or source is not None or view):
+        raise UsageError("--from takes no vehicle, camera or page: no --uri, --source, --view")
     vehicle = load_profile(profile)
     into = writable_profile(profile) if write else None
     camera = profile_camera(vehicle.camera)
@@ -136,26 +132,21 @@ def mount(
     written, before, problem = None, None, None
     if into is not None:
         try:
-            _check_unchanged(profile, vehicle)
             before = write_profile_values(into, measured.profile_values())
             written = into
             say(f"wrote these into {written}; as it was before it is {before}")
-        except (InvalidValue, NotFound) as error:  # the numbers stand
+        except InvalidValue as error:  # the numbers stand
             problem = error
             say(str(error))
     else:
         say("--write puts these numbers into the profile")
-    code = 0 if problem is None else problem.exit_code
-    if not as_json:
-        print(measured.keys_text())
-        return code
     record = measured.record() | {
         "recordings": [str(path) for path in logs],
         "profile": written and str(written),
         "profile_before": before and str(before),
     }
-    print_result(record | ({} if problem is None else {"error": str(problem), "exit_code": code}))
-    return code
+    print_result(with_problem(record, problem) if as_json else measured.keys_text())
+    return 0 if problem is None else problem.exit_code
 
 
 # -- what is refused at once -------------------------------------------
@@ -213,25 +204,11 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
 def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
     """Raise InvalidValue if the poses rest on other sizes or another lens than the profile's."""
     for recording in recordings:
-        if not recording.seen_by:
-            say(f"the {recording.part} does not say by which sizes and lens it was seen: unchecked")
-        elif recording.seen_by != now:
+        if recording.seen_by not in ("", now):
             raise InvalidValue(
                 f"the {recording.part} was seen by {recording.seen_by}; the profile has {now}: "
                 f"record it anew, or name the profile that it was recorded with"
             )
-
-
-def _check_unchanged(name: str, then: Profile) -> None:
-    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
-    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
-    now = load_profile(name)
-    rests_on = [(p.camera.mount, p.camera.latency_s, p.vehicle) for p in (now, then)]
-    if rests_on[0] != rests_on[1]:
-        raise InvalidValue(
-            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
-            f"rest on what it said before; measure again, with --from"
-        )
 
 
 # -- a live recording --------------------------------------------------
@@ -255,20 +232,17 @@ def _record_live(
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
         Those of `open_camera`, `MotionLink.connect` and `record_mounting`.
     """
-    start_s = time.monotonic()
-
-    def now() -> float:
-        return time.monotonic() - start_s
-
     recordings: list[MountingRecording] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
-        frames = open_camera(source, now, profile.camera, size_px=camera.size_px, latency_s=0.0)
+        frames = open_camera(
+            source, time.monotonic, profile.camera, size_px=camera.size_px, latency_s=0.0
+        )
         stack.callback(frames.close)
         check_size(frames.size_px, camera, frames.describe())
         sensors: Sensors = (list, lambda now_s: None)
         if uri is not None:
-            sensors = stack.enter_context(_vehicle(uri, profile, now))
+            sensors = stack.enter_context(_vehicle(uri, profile))
         page = stack.enter_context(live_page(camera, "perchctl calibrate mount", view, say))
         stack.callback(_keep, recordings, log)
         for part in parts:
@@ -280,11 +254,17 @@ def _record_live(
             recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)
             if frames.live:
-                frames.poll(now())  # from before
+                frames.poll(time.monotonic())  # from before
             with Stopper().installed() as stop, guide(page) as show:
                 stopped = stop.requested.is_set
                 record_mounting(
-                    recording, frames, reader, show, *sensors, clock=now, stopped=stopped
+                    recording,
+                    frames,
+                    reader,
+                    show,
+                    *sensors,
+                    clock=time.monotonic,
+                    stopped=stopped,
                 )
             if stopped():
                 raise Interrupted("Ctrl-C: nothing was measured")
@@ -292,9 +272,9 @@ def _record_live(
 
 
 @contextlib.contextmanager
-def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[Sensors]:
+def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
     """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors turn."""
-    link = MotionLink(uri, profile.link, now)
+    link = MotionLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri}, to read from it and nothing else")
     link.connect()
 
@@ -307,7 +287,7 @@ def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[S
         return link.problem(now_s)
 
     with contextlib.closing(link):
-        problem(now())
+        problem(time.monotonic())
         yield link.samples, problem
 
 

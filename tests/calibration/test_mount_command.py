@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import MountingRecording
 from perchctl.calibration.mounting.carry import CarrySolution
 from perchctl.calibration.mounting.report import MountingReport
-from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
 from tests.helpers.calibrating import calibrate, refused
@@ -192,45 +190,6 @@ def test_numbers_that_cannot_be_written_are_still_reported(
     assert Path("odd.yaml").read_text(encoding="utf-8") == odd
 
 
-@pytest.mark.parametrize(
-    ("changed", "code"),
-    [
-        ("camera: {mount: {rpy_deg: [0, 0, 90]}}", 30),
-        ("vehicle: {gear_body_m: [0, 0, 0.04]}", 30),
-        ("camera: {latency_s: measured}", 30),
-        ("safety: {max_height_m: 1.9}", 0),
-        (None, 20),
-    ],
-)
-def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
-    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, changed: str | None,
-    code: int,
-) -> None:  # fmt: skip
-    """A gear by the old turn beside a new one would be a gear in another place. The numbers are
-    printed all the same, also where the profile (None) is gone."""
-    mine, text = Path("mine.yaml"), f"extends: crazyflie\n{changed}\n"
-    mine.write_text("extends: crazyflie\n", encoding="utf-8")
-    solved = calibrate_mount.solve_mounting
-
-    def long_work(*given: Any) -> MountingReport:
-        mine.unlink() if changed is None else mine.write_text(text, encoding="utf-8")
-        return solved(*given)
-
-    monkeypatch.setattr(calibrate_mount, "solve_mounting", long_work)
-    words = ["-p", "mine.yaml", "--from", str(logs["both"]), "--part", "pivot", "--write"]
-    result = mount(*words)
-    assert result.exit_code == code, result.stderr
-    assert result.stdout.startswith("vehicle.gear_body_m: [")
-    if code == 0:
-        assert mine.read_text(encoding="utf-8").startswith(text)
-        return
-    assert not Path("mine.yaml.bak").exists()
-    assert mine.exists() is (changed is not None)
-    if changed is not None:
-        assert mine.read_text(encoding="utf-8") == text
-        assert "changed meanwhile, and nothing is written" in result.stderr
-
-
 def test_the_carry_alone_says_that_the_gear_is_still_to_do() -> None:
     turned = Mounting(rpy_deg=(0.0, 0.0, 90.0)).T_body_cam[:3, :3]
     c = MountingReport(load_profile("crazyflie"), carried(turned), None)
@@ -268,8 +227,3 @@ def test_a_recording_goes_with_the_sizes_and_the_lens_that_it_was_seen_by(
         "seen by markers of 150 and 25 mm", "the profile has markers of 160 and 25 mm",
     )  # fmt: skip
     assert "rpy_deg" not in (place / "larger.yaml").read_text()
-    (pivot,) = MountingRecording.read(logs["pivot"])
-    MountingRecording.write(place / "old.jsonl", [replace(pivot, seen_by="")])
-    unnamed = mount("-p", "mine.yaml", "--from", "old.jsonl")
-    assert unnamed.exit_code == 0
-    assert "unchecked" in unnamed.stderr
