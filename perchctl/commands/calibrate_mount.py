@@ -35,7 +35,7 @@ from perchctl.commands.command_line import (
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
-from perchctl.commands.output import print_lines, print_result, say, with_problem
+from perchctl.commands.output import ask, print_lines, print_result, say, with_problem
 from perchctl.commands.progress import guide
 from perchctl.display import live_page
 from perchctl.errors import (
@@ -248,8 +248,7 @@ def _record_live(
         for part in parts:
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
-                print("press Enter when it is held so: ", end="", file=sys.stderr, flush=True)
-                sys.stdin.readline()
+                ask("press Enter when it is held so:")
             recording = MountingRecording(part, seen_by=PoseReader.basis(profile, camera))
             recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)

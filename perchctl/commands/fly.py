@@ -347,6 +347,7 @@ def plan_text(options: FlyOptions) -> str:
             + (f": picture's {edges[0]} is the front, {edges[1]} the left side" if edges else ""),
         ),
         ("latency", late if isinstance(late, str) else f"{late * 1e3:g} ms"),
+        ("merge", f"{profile.merge.method} {profile.merge.weights_file or ''}".rstrip()),
         (
             "way",
             f"take off to {planner.takeoff_height_m:g} m, search up to "

@@ -37,18 +37,22 @@ def drop_stream(stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def ask(question: str) -> str:
+    """Return the line that somebody types. The question goes to stderr, as stdout is for the
+    result. Raises EOFError at the end of the input."""
+    print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
+    return input()
+
+
 def ask_to_confirm(question: str) -> bool:
     """Return True if somebody at the terminal says yes now: what was typed before the question
     appeared is no answer to it."""
     with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
-    # On stderr: stdout is for the result.
-    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
-        answer = input()
+        return ask(f"{question} [y/N]").strip().lower() in ("y", "yes")
     except EOFError:
         return False
-    return answer.strip().lower() in ("y", "yes")
 
 
 def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +27,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import print_lines, print_result, say
+from perchctl.commands.output import ask, print_lines, print_result, say
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
 from perchctl.geometry import Array
@@ -248,10 +247,8 @@ def ask_person(given: Answers) -> Answers:
 
 
 def _typed(question: str) -> str:
-    # On stderr: stdout is for the result.
-    print(f"{question} ", end="", file=sys.stderr, flush=True)
     try:
-        return input().strip()
+        return ask(question).strip()
     except EOFError:
         raise UsageError(
             "there is nobody to ask, and nothing was written: answer by --set, or add "
