@@ -340,7 +340,7 @@ def fly_each(
         with (
             contextlib.suppress(KeyboardInterrupt),
             executor_of(total - len(results)) as executor,
-            progress_bar(total, earlier=list(results)) as advance,
+            progress_bar(total, list(results)) as advance,
         ):
             begun = True
 
