@@ -35,7 +35,6 @@ from perchctl.camera import (
 )
 from perchctl.commands.calibrate_mount import mount
 from perchctl.commands.command_line import (
-    CamOption,
     ForceOption,
     Group,
     JsonOption,
@@ -184,22 +183,20 @@ def mask(
 @command(
     app,
     "perchctl calibrate check camera.yaml images:board",
-    "perchctl calibrate check camera.yaml camera:0 --view",
-    "perchctl calibrate check camchain.yaml images:board --cam cam0",
+    "perchctl calibrate check camera.yaml camera:0",
+    "perchctl calibrate check camera.yaml video:board.mp4 --json",
 )
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
-    cam: CamOption = None,
-    view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
-    pictures = _source(source, view)
+    pictures = _source(source)
     layout = Board.parse(board)
-    model = load_calibration(calibration, cam=cam)
-    found = _find_views(pictures, model.size_px, layout, view)
+    model = load_calibration(calibration)
+    found = _find_views(pictures, model.size_px, layout)
     check_size(found.views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, found)
     for item in found.missing:
@@ -220,7 +217,10 @@ def check(
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
-    cam: CamOption = None,
+    cam: Annotated[
+        str | None,
+        typer.Option("--cam", help="Which camera of a Kalibr file of several: cam0, cam1, ..."),
+    ] = None,
     force: ForceOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
@@ -283,7 +283,7 @@ def _find_views(
     spec: str,
     size_px: tuple[int, int] | None,
     board: Board,
-    view: bool,
+    view: bool = False,
     check: Callable[[tuple[int, int]], None] = lambda size_px: None,
 ) -> FoundViews:
     """Return the views, at least one, and the pictures without a board.

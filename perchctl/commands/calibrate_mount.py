@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +31,9 @@ from perchctl.camera import (
 )
 from perchctl.commands.command_line import (
     JsonOption,
+    ProfileOption,
+    SourceOption,
+    UriOption,
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
@@ -69,22 +71,9 @@ _SIMULATED = "stands on the simulator's floor, where no hand moves it: name a re
 
 
 def mount(
-    profile: Annotated[
-        str,
-        typer.Option(
-            "--profile", "-p", help="The vehicle's profile, which the numbers are compared with."
-        ),
-    ],
-    uri: Annotated[
-        str | None,
-        typer.Option(
-            "--uri", "-u", help="Vehicle, only read from. Default: CFLIB_URI, the profile's."
-        ),
-    ] = None,
-    source: Annotated[
-        str | None,
-        typer.Option("--source", help="Its camera; else the profile's."),
-    ] = None,
+    profile: ProfileOption,
+    uri: UriOption = None,
+    source: SourceOption = None,
     part: Annotated[
         Part | None,
         typer.Option(
@@ -111,8 +100,6 @@ def mount(
     The vehicle is turned in the hand in view of the target (carry), then tilted around the tip of
     its gear (pivot). Its motors are off, and nothing arms.
     """
-    if logs and (uri is not None or source is not None or view):
-        raise UsageError("--from takes no vehicle, camera or page: no --uri, --source, --view")
     vehicle = load_profile(profile)
     into = writable_profile(profile) if write else None
     camera = profile_camera(vehicle.camera)
@@ -155,21 +142,21 @@ def mount(
 def _live_sources(
     source: str | None, uri: str | None, profile: Profile, parts: tuple[Part, ...]
 ) -> tuple[str, str | None]:
-    """Return the camera, and the vehicle where the carry needs it (or it was named)."""
+    """Return the camera, and the vehicle if the carry needs it."""
     given = profile.camera.source if source is None else source
     if given.startswith("sim:"):
         raise UsageError(
             f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
         )
     name = parse_source(given, files=True)
-    if "carry" not in parts and uri is None:
+    if "carry" not in parts:
         return name.spec, None
     if not name.live:
         raise UsageError(
             f"{name} is a recording, and has not the vehicle's clock: the "
             f"carry needs a live camera; --part pivot needs no vehicle"
         )
-    link_uri = uri if uri is not None else os.environ.get("CFLIB_URI", profile.link.uri)
+    link_uri = profile.link.uri if uri is None else uri
     if check_uri(link_uri) == "sim":
         raise UsageError(f"vehicle {link_uri} {_SIMULATED} with -u; --part pivot needs none")
     return name.spec, link_uri

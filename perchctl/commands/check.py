@@ -14,6 +14,7 @@ from perchctl.camera import find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
+    JsonOption,
     ProfileOption,
     SourceOption,
     UriOption,
@@ -29,7 +30,6 @@ from perchctl.errors import (
     NotFound,
     PerchError,
     SafetyAbort,
-    UsageError,
 )
 
 WIDTH = 80
@@ -66,10 +66,7 @@ def check(
         bool,
         typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
     ] = False,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="A list of name, verdict, found and advice on stdout."),
-    ] = False,
+    as_json: JsonOption = False,
 ) -> int:
     """Look at vehicle, camera, computer and profile on the ground, and say what is not fit to fly.
 
@@ -77,11 +74,6 @@ def check(
     no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
     when the camera gives no picture, 52 for any other failing row.
     """
-    given = any(value not in (None, False) for value in (source, lift))
-    if scan and given:
-        raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
-    if cameras and (given or scan or uri is not None):
-        raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
     if cameras:
         return report(camera_rows(), as_json)
     if scan:

@@ -176,14 +176,10 @@ PositioningOption = Annotated[
         help="What measures the position: deck, mocap or target; by default the profile's.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
-]
-CamOption = Annotated[
-    str | None,
-    typer.Option("--cam", help="Which camera of a Kalibr file of several: cam0, cam1, ..."),
 ]
 
 

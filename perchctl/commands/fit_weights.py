@@ -18,6 +18,7 @@ from perchctl.commands.command_line import (
     Group,
     JsonOption,
     ProfileOption,
+    SourceOption,
     command,
     new_app,
 )
@@ -120,10 +121,7 @@ def collect(
     ] = "typed",
     positions: Annotated[int, typer.Option("--positions", min=2, help="To collect.")] = 10,
     frames: Annotated[int, typer.Option("--frames", min=10, help="At each position.")] = 100,
-    source: Annotated[
-        str | None,
-        typer.Option("--source", help="Camera; else the profile's."),
-    ] = None,
+    source: SourceOption = None,
     target_body: Annotated[
         str, typer.Option("--target-body", help="Rigid body of the target, for --truth mocap.")
     ] = "target",

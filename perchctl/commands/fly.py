@@ -20,6 +20,7 @@ from perchctl.camera import profile_record, without_password
 from perchctl.check import Verdict, comparison_rows, profile_rows, warnings_before_flight
 from perchctl.commands.command_line import (
     EXIT_TABLE,
+    JsonOption,
     PositioningOption,
     ProfileOption,
     SourceOption,
@@ -107,9 +108,7 @@ def fly(
         bool, typer.Option("--dry-run", help="Show the resolved plan; connect nothing.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before arming.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object on stdout at the end.")
-    ] = False,
+    as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> int:
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.

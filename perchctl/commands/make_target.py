@@ -10,7 +10,6 @@ import typer
 
 from perchctl.calibration import load_calibration
 from perchctl.commands.command_line import (
-    CamOption,
     ForceOption,
     Group,
     JsonOption,
@@ -135,12 +134,11 @@ def design(
     profile: ProfileOption = "sim",
     ceiling: CeilingOption = None,
     blur: BlurOption = 1.0,
-    cam: CamOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
-    name, model = _camera(config, camera, cam)
+    name, model = _camera(config, camera)
     found = make_design(config.target, model, blur, config, ceiling)
     record = found.record() | {"target": config.target.model_dump(mode="json")}
     print_result(record if as_json else found.text(name))
@@ -159,12 +157,11 @@ def suggest(
     page: PageOption = "a4",
     magnet: MagnetOption = "50mm",
     blur: BlurOption = 1.0,
-    cam: CamOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Propose sizes and ids for a camera, the largest that the page holds and that are seen."""
     config = load_profile(profile)
-    name, model = _camera(config, camera, cam)
+    name, model = _camera(config, camera)
     magnet_m = parse_length(magnet, "--magnet")
     found, held_by = suggest_target(model, blur, config, magnet_m, ceiling, page)
     target = found.target.model_dump(mode="json", include={"large", "small"})
@@ -182,9 +179,7 @@ def suggest(
     "perchctl make-target measured -p b.yaml --measured-large 15.1cm",
 )
 def measured(
-    profile: Annotated[
-        str, typer.Option("--profile", "-p", help="The profile, which gets the sizes.")
-    ],
+    profile: ProfileOption,
     large: Annotated[
         str | None,
         typer.Option("--measured-large", help="Side of the large black square as printed, mm."),
@@ -216,7 +211,7 @@ def measured(
     print(f"changed {path}; as it was before it is {before}")
 
 
-def _camera(profile: Profile, name: str | None, cam: str | None) -> tuple[str, CameraModel]:
+def _camera(profile: Profile, name: str | None) -> tuple[str, CameraModel]:
     """Return the calibration's file, and the camera."""
     path = find_calibration(name or profile.camera.calibration)
-    return str(path), load_calibration(path, cam=cam)
+    return str(path), load_calibration(path, cam=None if name else profile.camera.cam)

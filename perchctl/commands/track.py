@@ -36,7 +36,7 @@ from perchctl.camera import (
     without_password,
 )
 from perchctl.commands.command_line import (
-    CamOption,
+    JsonOption,
     ProfileOption,
     ViewOption,
     command,
@@ -91,8 +91,7 @@ def track(
             "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
         ),
     ] = None,
-    cam: CamOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
+    as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> None:
     """Find the target in a camera, video or pictures, without a vehicle.
@@ -107,8 +106,7 @@ def track(
     """
     flown = load_profile(profile)
     source = parse_source(source, files=True).spec
-    if calibration is None:
-        cam = cam or flown.camera.cam
+    cam = flown.camera.cam if calibration is None else None
     file = find_calibration(str(calibration or flown.camera.calibration))
     lines = as_json or not view
     start_s = time.monotonic()

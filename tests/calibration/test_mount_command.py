@@ -85,8 +85,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["-p", "mine.yaml", "--from", "no.jsonl"], 20, ["no.jsonl"]),
         (["-p", "mine.yaml", "--from", "mine.yaml"], 30, ["mine.yaml", "line 1"]),
         (["-p", "mine.yaml", "--from", "."], 30, ["."]),
-        (["-p", "mine.yaml", "--from", "x.jsonl", "-u", "usb://0"], 2, ["--uri"]),
-        (["-p", "mine.yaml", "--from", "x.jsonl", "--view"], 2, ["--view"]),
         (["-p", "crazyflie", "--write"], 30, ["shipped", "cp ", "-p my_"]),
         (["-p", "mine.yaml", "--board", "chessboard:9x6:25mm"], 2, ["--board"]),
     ],

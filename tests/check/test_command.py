@@ -57,9 +57,6 @@ def test_json_is_a_list_of_rows(quick: None) -> None:
     (("--source", "nonsense:1"), 30, "camera source"),
     (("-u", NOWHERE), 2, "belongs to the simulated vehicle"),
     (("-u", NOWHERE, "--source", "video:old.mp4"), 2, "is a recording"),
-    (("--scan", "--lift"), 2, "--scan only shows"),
-    (("--cameras", "--scan"), 2, "--cameras only lists"),
-    (("--cameras", "--source", "camera:0"), 2, "--cameras only lists"),
 ])  # fmt: skip
 def test_bad_input_is_one_sentence(words: tuple[str, ...], code: int, complaint: str) -> None:
     said = invoke(*words)
