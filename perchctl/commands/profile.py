@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from perchctl.analysis import profile_differences
 from perchctl.calibration import load_calibration
 from perchctl.camera import (
     parse_source,
@@ -124,14 +125,6 @@ OVER_THE_CEILING_M = 0.4
 FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
 """The search goes up to where the ceiling is that near, or to `LOW_SEARCH_M` where that is
 higher and there is room."""
-AIDECK_KEYS = (
-    "kalman.drift_mps2",
-    "kalman.n_max",
-    "planner.ascend.settle_xy_m",
-    "planner.ascend.fresh_s",
-    "safety.max_frame_age_s",
-)
-"""What an AI-deck's few and late pictures need besides: as the shipped profile has it."""
 SHOWN_KEYS = (
     "target.large.dictionary",
     "target.large.id",
@@ -278,15 +271,15 @@ def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
         derived["description"] = f"a vehicle at {uri}, its camera at {without_password(source)}"
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
-    if _is_aideck(source):
-        shipped = load_profile("aideck")
-        derived |= {path: profile_value(shipped, path) for path in AIDECK_KEYS}
+    # An AI-deck's few and late pictures need more than their calibration.
+    base = load_profile("aideck") if _is_aideck(source) else Profile()
+    shipped = profile_differences(*(p.model_dump(mode="json") for p in (Profile(), base)))
     settings = {key: json.dumps(value) for key, value in derived.items()}
     for key, text in texts.items():
         is_text = isinstance(profile_value(Profile(), key), str)
         settings[key] = json.dumps(text) if is_text else text
-    profile = changed_profile(Profile(), [f"{key}={text}" for key, text in settings.items()])
-    return profile, {*settings, *SHOWN_KEYS} - {"name"}
+    profile = changed_profile(base, [f"{key}={text}" for key, text in settings.items()])
+    return profile, {*settings, *shipped, *SHOWN_KEYS} - {"name"}
 
 
 def _mount_keys(answers: Answers) -> dict[str, Any]:
