@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -124,7 +124,7 @@ def run(
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = range(seed, seed + flights)
-    executor = executor_of(jobs, cluster, [flown])
+    flyers = executor_of(jobs, cluster, [flown], flights)
     if faults is None:
         names = None
         campaign = _Campaign(
@@ -165,7 +165,7 @@ def run(
             lambda executor, note: campaigns.fly_all(campaign.fly, kept.left, executor, note),
             report,
             len(seeds),
-            executor,
+            flyers,
             kept.earlier,
             kept.note,
             campaign.objection,
@@ -273,7 +273,7 @@ def _fly_by_each(
             lambda executor, note: campaigns.fly_variants(profiles, seeds, executor, note),
             report,
             len(profiles) * len(seeds),
-            executor_of(jobs, cluster, profiles),
+            executor_of(jobs, cluster, profiles, len(profiles) * len(seeds)),
         )
 
 
@@ -286,15 +286,13 @@ def _require_simulator() -> None:
 # --- Who flies, and how it may end ------------------------------------
 
 
-ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
-"""Who flies so many flights."""
-
-
-def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profile]) -> ExecutorOf:
+def executor_of(
+    jobs: int | None, cluster: str | None, profiles: Sequence[Profile], flights: int
+) -> AbstractContextManager[Executor]:
     """Return who flies: processes of this computer, or the workers of a cluster. `profiles`: with
     the files that flights read. Errors: UsageError."""
     if cluster is None:
-        return lambda flights: campaigns.flight_processes(max(1, min(jobs or 1, flights)))
+        return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
         raise UsageError(
             f"--cluster {cluster} flies as many at a time as it has workers: --jobs {jobs} does "
@@ -302,25 +300,19 @@ def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profil
         )
     if find_spec("distributed") is None:
         raise no_cluster()
-
-    @contextlib.contextmanager
-    def workers(_flights: int) -> Iterator[Executor]:
-        try:
-            with campaigns.defer_interrupts():
-                from perchctl.campaign import cluster_pool
-        except ImportError as error:
-            raise no_cluster(str(error)) from error
-        with cluster_pool(cluster, profiles) as pool:
-            yield pool
-
-    return workers
+    try:
+        with campaigns.defer_interrupts():
+            from perchctl.campaign import cluster_pool
+    except ImportError as error:
+        raise no_cluster(str(error)) from error
+    return cluster_pool(cluster, profiles)
 
 
 def fly_each(
     campaign: Callable[[Executor, Callable[[Any], None]], object],
     report: Callable[[list[Any], PerchError | None], None],
     total: int,
-    executor_of: ExecutorOf,
+    flyers: AbstractContextManager[Executor],
     earlier: Sequence[Any] = (),
     keep: Callable[[Any], None] = lambda result: None,
     objection: Callable[[list[Any]], PerchError | None] = lambda results: None,
@@ -328,7 +320,7 @@ def fly_each(
     """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
     by Ctrl-C, or when a flight fails. Returns the exit code.
 
-    `campaign` gets who flies, and the function to call with each result; `report` gets the
+    `campaign` gets who flies and the function to call with each result; `report` gets the
     results, and why not all were flown. `earlier`: those that were flown before, which count, too;
     `keep` writes each of the others. `objection`: what all of them together amount to. Errors:
     PerchError if none was flown.
@@ -339,7 +331,7 @@ def fly_each(
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            executor_of(total - len(results)) as executor,
+            flyers as executor,
             progress_bar(total, list(results)) as advance,
         ):
             begun = True

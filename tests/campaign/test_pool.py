@@ -140,7 +140,7 @@ def test_with_nothing_flown_there_is_nothing_to_report() -> None:
         signal.raise_signal(signal.SIGINT)
 
     with signals_to(stop_handler()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
-        fly_each(flown, Reported(), 10, executor_of(None, None, []))
+        fly_each(flown, Reported(), 10, executor_of(None, None, [], 10))
 
 
 def test_a_second_press_ends_the_program_at_once() -> None:
