@@ -221,17 +221,14 @@ def page(flown: Flight, file: Path) -> None:
     closing = threading.Event()
 
     def feed() -> None:
-        """As a flight does: 30 pictures a second, so that the page shows a rate."""
-        number = 0
+        """As a flight does: 30 pictures a second."""
         while not closing.wait(1.0 / 30.0):
-            number += 1
-            live.show(number, picture)
+            live.show(picture)
 
     live.set_state(lambda: flight_state(tick), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:
-        # The rate that it shows is that of the last seconds.
         _photograph(file, live.url, PAGE_PX, "performance.now() > 4000")
     finally:
         closing.set()

@@ -130,8 +130,7 @@ def guide(
                 line = f"perchctl: {guided.line}"
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
             if page is not None:
-                sketch = Sketch(guided.image, guided.outlines)
-                page.show(guided.index, sketch)
+                page.show(Sketch(guided.image, guided.outlines))
                 page.set_state(lambda: page_state(guided))
 
         yield show

@@ -141,7 +141,7 @@ def track(
                     print(line, flush=opened.live)
                 if page is not None:
                     sketch = sketch_of(tracked.picture, tracked.output, flown.target.large.side_m)
-                    page.show(frame.index, sketch)
+                    page.show(sketch)
                     page.set_state(partial(track_state, tracked))
             advance()
         took_s = time.monotonic() - start_s

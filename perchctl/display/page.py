@@ -46,7 +46,7 @@ class FlightPage:
             frame = self._frame
             if frame is not None:
                 self._frame = None
-                self.page.show(frame.index, sketch_of(frame, tick.output, self._side_m))
+                self.page.show(sketch_of(frame, tick.output, self._side_m))
             self.page.set_state(partial(flight_state, tick), live=not tick.state.phase.is_over)
         except Exception as error:
             self.page.remember(error)
@@ -78,7 +78,7 @@ class FlightPage:
     def _seen(self, frame: Frame) -> None:
         self._frame = frame
         if not self._flying:  # no ticks yet that would show it
-            self.page.show(frame.index, Sketch(frame.image))
+            self.page.show(Sketch(frame.image))
 
 
 def flight_state(tick: Tick) -> dict[str, Any]:

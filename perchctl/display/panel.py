@@ -88,11 +88,6 @@ def event_text(event: Event) -> str:
     return f"{text} (simulated: {event.simulated})" if event.simulated else text
 
 
-def timed_event_text(event: Event, start_s: float) -> str:
-    """Return an event's line with the time since the start."""
-    return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
-
-
 # --- The live display: a panel on a terminal, one plain line an event elsewhere ---
 # The flight loop only leaves its newest tick and its events here; a thread of
 # the display's own draws them. So neither an exception nor a terminal that stands
@@ -167,32 +162,25 @@ class FlightPanel:
         self._drawn: Tick | None = None
         self._start_s: float | None = None
         self._next_s = -math.inf
-        self._phase = self._shown = ""  # as a line has it, and as the panel has it
         self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
         self._thread.start()
 
     def tick(self, tick: Tick) -> None:
         """Show this tick of the loop: at once if the phase is a new one, or 0.1 s after the last
         one that was shown, or as the last one of all."""
-        if self.failure is not None:
-            return
-        self._tick, phase = tick, tick.state.phase.value
-        if phase != self._phase:  # a change without an event
-            self._line(tick.t_s, f"{phase}: {tick.state.reason}")
-            self._phase = phase
-        elif phase == self._shown and tick.t_s < self._next_s:
-            return
-        self._shown = phase
-        self._next_s = tick.t_s + PERIOD_S
-        self._wake.set()
+        is_new = self._tick is None or self._tick.state.phase is not tick.state.phase
+        self._tick = tick
+        if is_new or tick.t_s >= self._next_s:
+            self._next_s = tick.t_s + PERIOD_S
+            self._wake.set()
 
     def event(self, event: Event) -> None:
         """Write the line of an event, at once."""
         if self.failure is not None:
             return
-        if event.kind is EventKind.PHASE and event.phase is not None:
-            self._phase = event.phase.value
-        self._line(event.t_s, event_text(event))
+        if self._start_s is None:
+            self._start_s = event.t_s
+        self._lines.append(f"[{event.t_s - self._start_s:7.2f} s] {event_text(event)}")
         self._wake.set()
 
     def close(self) -> None:
@@ -200,11 +188,6 @@ class FlightPanel:
         self._closing.set()
         self._wake.set()
         self._thread.join(CLOSE_TIMEOUT_S)
-
-    def _line(self, t_s: float, text: str) -> None:
-        if self._start_s is None:
-            self._start_s = t_s
-        self._lines.append(f"[{t_s - self._start_s:7.2f} s] {text}")
 
     def _draw(self) -> None:
         try:
