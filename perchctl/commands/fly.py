@@ -34,8 +34,8 @@ from perchctl.commands.output import ask_to_confirm, print_lines, print_result, 
 from perchctl.commands.profile import picture_edges
 from perchctl.display import (
     FlightPage,
+    FlightPanel,
     live_page,
-    open_panel,
 )
 from perchctl.errors import (
     EXIT_CODES,
@@ -189,7 +189,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         simulated_seed,
         options.record,
     )
-    panel = open_panel(stream=sys.stderr)
+    panel = FlightPanel(sys.stderr)
     say(f"connecting to {options.uri}")
     switch, page = OperatorSwitch(), None
     # Once it has landed nothing is left to stop, but much to tell.
