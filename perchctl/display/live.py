@@ -152,11 +152,6 @@ class LivePage:
                 self._jpeg = (newest, jpeg.tobytes())
             return self._jpeg
 
-    def pause(self, seconds: float) -> bool:
-        """Wait, less when the page closes; return True when it has."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self.closed, seconds)
-
     def may_stop(self, token: str) -> bool:
         given, own = token.encode("utf-8", "replace"), self.token.encode()
         return self._on_stop is not None and hmac.compare_digest(given, own)
@@ -312,7 +307,7 @@ class _Handler(BaseHTTPRequestHandler):
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             # The next boundary goes out with the picture, or a browser shows it one late.
             self.wfile.write(head.encode() + jpeg + f"\r\n--{_BOUNDARY}\r\n".encode())
-            page.pause(LEAST_PERIOD_S)
+            time.sleep(LEAST_PERIOD_S)
 
     def _refuse(self, status: int, why: str) -> None:
         self._send(status, "text/plain; charset=utf-8", f"{why}\n".encode())

@@ -85,12 +85,10 @@ def flight_state(tick: Tick) -> dict[str, Any]:
     """Return what the page shows of a tick: phase, battery, the rows of the terminal's panel, and
     whether the flight is over."""
     state, volts = tick.state, tick.telemetry.battery_v
-    mirrored = tick.output is not None and tick.output.detections.mirrored
-    seen = "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
     return {
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "rows": [list(row) for row in status_rows(tick)],
-        "note": f"held: {state.hold}" if state.hold else seen,
+        "note": f"held: {state.hold}" if state.hold else "",
         "over": state.phase.is_over,
     }

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.live import TOKEN_HEADER, is_loopback
+from perchctl.display.live import TOKEN_HEADER, draw_sketch, is_loopback
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.recording import camera
 
@@ -77,6 +77,13 @@ def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
             pass
 
 
+def test_an_axis_behind_the_camera_and_a_wild_corner_are_left_out() -> None:
+    image = np.full((480, 640), 110, np.uint8)
+    pose = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.2]), 0.075)
+    wild = (("large", np.full((4, 2), 1e9)), ("small", np.full((4, 2), np.nan)))
+    assert (draw_sketch(Sketch(image, wild, pose), camera()) == 110).all()
+
+
 def test_without_stop_there_is_none() -> None:
     page = LivePage(camera(), "t")
     try:
@@ -84,16 +91,6 @@ def test_without_stop_there_is_none() -> None:
         assert stop(page.url, page.token) == 403
     finally:
         page.close()
-
-
-def test_the_page_looks_by_itself_at_the_age_of_what_it_shows(page: LivePage) -> None:
-    """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
-    without end, and a STOP that is ready again at a program that was gone."""
-    script = page._server.html.partition("<script")[2]
-    for part in ("setInterval(watch", "AbortSignal.timeout ?", "known = stop;"):
-        assert part in script
-    assert script.count("...within(") == 2
-    assert 'showStop(silent ? known : "gone")' in script
 
 
 def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
