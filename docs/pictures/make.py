@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import io
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -200,19 +199,6 @@ def terminal(flown: Flight, file: Path) -> None:
     file.write_text(svg.replace("Fira Code, ", ""), encoding="utf-8")
 
 
-def calibration(_: Flight, file: Path) -> None:
-    """The report of a calibration from rendered pictures of a board."""
-    from tests.helpers.boards import CHARUCO, draw_camera, render_folder
-
-    with tempfile.TemporaryDirectory() as folder:
-        board = Path(folder) / "board"
-        camera = draw_camera(np.random.default_rng(4))
-        render_folder(board, camera, CHARUCO, 14, seed=4)
-        result = Path(folder) / "camera.yaml"
-        _perchctl("calibrate", f"images:{board}", "-o", str(result))
-        shutil.copyfile(result.with_suffix(".png"), file)
-
-
 def page(flown: Flight, file: Path) -> None:
     """The live page of the flight, in a browser without a window."""
     index = _shown(flown)
@@ -382,7 +368,6 @@ PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "flight.png": flight,
     "film.gif": film,
     "panel.svg": terminal,
-    "calibration.png": calibration,
     "page.png": page,
     "report.png": report,
 }

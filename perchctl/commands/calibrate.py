@@ -42,12 +42,12 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import Stopper, draw_unless_interrupted
+from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, check_place, write_files
+from perchctl.files import check_output, write_files
 from perchctl.target import Board
 from perchctl.vision import CameraModel
 
@@ -112,16 +112,16 @@ def camera(
     """
     pictures = _source(source, view)
     if output is not None:
-        _check_output(output, force)
+        check_output(output, SUFFIXES, force, CONTENT)
     layout = Board.parse(board)
 
     def check_place_of(size_px: tuple[int, int]) -> None:
         """Raise before a person has worked for a file that cannot be written."""
-        _check_output(_file(output, size_px), force)
+        check_output(_file(output, size_px), SUFFIXES, force, CONTENT)
 
     found = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
     file = _file(output, found.views[0].size_px)
-    _check_output(file, force)
+    check_output(file, SUFFIXES, force, CONTENT)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
     result = calibrate_camera(found, layout.notation())
@@ -129,16 +129,8 @@ def camera(
     for line in result.lines():
         say(line)
 
-    def draw() -> Path:
-        from perchctl.calibration import draw_calibration
-
-        picture = file.with_suffix(".png")
-        write_files({picture: draw_calibration(result)})
-        return picture
-
-    report = draw_unless_interrupted(draw)
-    say(f"wrote {file}" + ("" if report is None else f" and {report}"))
-    record = result.record() | {"file": str(file), "report": report and str(report)}
+    say(f"wrote {file}")
+    record = result.record() | {"file": str(file)}
     print_result(record if as_json else file)
 
 
@@ -211,20 +203,16 @@ def check(
 @command(
     app,
     "perchctl calibrate convert opencv.yaml",
-    "perchctl calibrate convert camchain.yaml --cam cam0 -o mine.yaml",
+    "perchctl calibrate convert camchain.yaml -o mine.yaml",
     "perchctl calibrate convert ost.yaml -o calib/fpv.yaml",
 )
 def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
-    cam: Annotated[
-        str | None,
-        typer.Option("--cam", help="Which camera of a Kalibr file of several: cam0, cam1, ..."),
-    ] = None,
     force: ForceOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
-    model = load_calibration(calibration, cam=cam)
+    model = load_calibration(calibration)
     file = _file(output, model.size_px)
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
@@ -238,11 +226,6 @@ def convert(
 
 def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
     return output or FOLDER / f"camera_{size_px[0]}x{size_px[1]}.yaml"
-
-
-def _check_output(file: Path, force: bool) -> None:
-    check_output(file, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
-    check_place(file.with_suffix(".png"), force)
 
 
 def _now() -> str:

@@ -106,7 +106,6 @@ def mount(
     recordings: Sequence[MountingRecording]
     if logs:
         recordings = _read_parts(logs, part)
-        _check_seen_by(recordings, PoseReader.basis(vehicle, camera))
     else:
         parts: tuple[Part, ...] = ("carry", "pivot") if part is None else (part,)
         frames, link_uri = _live_sources(source, uri, vehicle, parts)
@@ -186,16 +185,6 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
             f"name the other recording too"
         )
     return list(found.values())
-
-
-def _check_seen_by(recordings: Sequence[MountingRecording], now: str) -> None:
-    """Raise InvalidValue if the poses rest on other sizes or another lens than the profile's."""
-    for recording in recordings:
-        if recording.seen_by not in ("", now):
-            raise InvalidValue(
-                f"the {recording.part} was seen by {recording.seen_by}; the profile has {now}: "
-                f"record it anew, or name the profile that it was recorded with"
-            )
 
 
 # -- a live recording --------------------------------------------------

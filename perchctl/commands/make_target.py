@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -33,7 +32,6 @@ from perchctl.target import (
     make_design,
     measured_target,
     parse_length,
-    suggest_target,
     target_pdf,
 )
 from perchctl.vision import CameraModel
@@ -146,34 +144,6 @@ def design(
 
 @command(
     app,
-    "perchctl make-target suggest --ceiling 2.4",
-    "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
-    "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
-)
-def suggest(
-    camera: CameraArgument = None,
-    profile: ProfileOption = "sim",
-    ceiling: CeilingOption = None,
-    page: PageOption = "a4",
-    magnet: MagnetOption = "50mm",
-    blur: BlurOption = 1.0,
-    as_json: JsonOption = False,
-) -> None:
-    """Propose sizes and ids for a camera, the largest that the page holds and that are seen."""
-    config = load_profile(profile)
-    name, model = _camera(config, camera)
-    magnet_m = parse_length(magnet, "--magnet")
-    found, held_by = suggest_target(model, blur, config, magnet_m, ceiling, page)
-    target = found.target.model_dump(mode="json", include={"large", "small"})
-    text = (
-        f"in the profile, for perchctl make-target --page {held_by}:\n"
-        f"target: {json.dumps(target)}\n\n{found.text(name)}"
-    )
-    print_result(found.record() | {"page": held_by, "target": target} if as_json else text)
-
-
-@command(
-    app,
     "perchctl make-target measured -p mine.yaml --measured-large 149.6",
     "perchctl make-target measured -p mine.yaml --measured-small 24.9mm",
     "perchctl make-target measured -p b.yaml --measured-large 15.1cm",
@@ -214,4 +184,4 @@ def measured(
 def _camera(profile: Profile, name: str | None) -> tuple[str, CameraModel]:
     """Return the calibration's file, and the camera."""
     path = find_calibration(name or profile.camera.calibration)
-    return str(path), load_calibration(path, cam=None if name else profile.camera.cam)
+    return str(path), load_calibration(path)

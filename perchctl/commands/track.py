@@ -106,13 +106,12 @@ def track(
     """
     flown = load_profile(profile)
     source = parse_source(source, files=True).spec
-    cam = flown.camera.cam if calibration is None else None
     file = find_calibration(str(calibration or flown.camera.calibration))
     lines = as_json or not view
     start_s = time.monotonic()
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
-        camera = load_calibration(file, cam=cam)
+        camera = load_calibration(file)
         opened = open_camera(source, time.monotonic, flown.camera, size_px=camera.size_px)
         stack.callback(opened.close)
         recording = opened.inner if isinstance(opened, WrappedSource) else opened

@@ -212,16 +212,3 @@ def carried(R: Array) -> CarrySolution:
     """A solution with that turn."""
     known = np.eye(3) * np.radians(0.05) ** 2
     return CarrySolution(R, known, 0.0803, 0.001)
-
-
-def test_a_recording_goes_with_the_sizes_and_the_lens_that_it_was_seen_by(
-    logs: dict[str, Path], place: Path
-) -> None:
-    """Its poses are a larger sheet's, or another lens's: numbers from them would look fine."""
-    larger = "target: {large: {side_m: 0.16}, small: {side_m: 0.025}}\n"
-    (place / "larger.yaml").write_text(f"extends: mine.yaml\n{larger}")
-    refused(
-        mount("-p", "larger.yaml", "--from", logs["pivot"], "--write"), 30,
-        "seen by markers of 150 and 25 mm", "the profile has markers of 160 and 25 mm",
-    )  # fmt: skip
-    assert "rpy_deg" not in (place / "larger.yaml").read_text()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import itertools
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -246,12 +245,10 @@ def test_a_board() -> None:
 
 
 @pytest.mark.long
-def test_the_design_and_a_suggestion_write_nothing() -> None:
+def test_a_design_writes_nothing() -> None:
     out, _ = call("design", CAMERA, "--ceiling", "2.4", "--blur", "2.0")
     assert "z1" in out
     assert "mounting  never blind" in out
-    out, _ = call("suggest", "--blur", "2", "--json")
-    assert json.loads(out)["target"].keys() == {"large", "small"}
     assert files() == set()
 
 
@@ -268,7 +265,6 @@ REFUSALS = [
     (["board", "chessboard:9x6:25mm:measured=249x174mm"], 2, "leave out :measured="),
     (["board", "chessboard:9x6:25mm", "-o", "board.txt"], 30, "must end in .pdf"),
     (["design", "nothing.yaml"], 20, "not found"),
-    (["suggest", CAMERA, "--ceiling", "1"], 30, "below the highest search position"),
     (["design", "--blur", "-1"], 2, "--blur"),
     (["measured", "-p", "m.yaml"], 2, "nothing was measured"),
     (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 30, "is shipped with perchctl"),
