@@ -274,7 +274,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
     told = json.loads(out)
     assert (code, told["exit_code"], told["outcome"], told["plot"]) == (130, 130, "landed", None)
     assert told["error"] == f"{EXIT_CODES[130]}: Ctrl-C"
-    assert "the plot is not drawn" in err
+    assert "the plot could not be drawn" in err
 
 
 @pytest.mark.usefixtures("flown")

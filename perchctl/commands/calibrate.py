@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -38,6 +37,7 @@ from perchctl.commands.command_line import (
     ForceOption,
     Group,
     JsonOption,
+    SourceArgument,
     ViewOption,
     command,
     new_app,
@@ -55,13 +55,6 @@ FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
 
-SourceArgument = Annotated[
-    str,
-    typer.Argument(
-        help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-        "http://..., aideck://HOST, or a path.",
-    ),
-]
 BoardOption = Annotated[
     str,
     typer.Option(
@@ -72,11 +65,8 @@ BoardOption = Annotated[
     ),
 ]
 SizeOption = Annotated[
-    str | None,
-    typer.Option(
-        "--size",
-        help="Asked of camera:N, as in 720x576; else its driver's own.",
-    ),
+    tuple[int, int] | None,
+    typer.Option("--size", help="Width and height asked of camera:N; else its driver's own."),
 ]
 OutputOption = Annotated[
     Path | None,
@@ -115,13 +105,14 @@ def camera(
         check_output(output, SUFFIXES, force, CONTENT)
     layout = Board.parse(board)
 
-    def check_place_of(size_px: tuple[int, int]) -> None:
-        """Raise before a person has worked for a file that cannot be written."""
-        check_output(_file(output, size_px), SUFFIXES, force, CONTENT)
+    def checked_file(size_px: tuple[int, int]) -> Path:
+        """Return where the calibration goes; raises before a person has worked for nothing."""
+        file = _file(output, size_px)
+        check_output(file, SUFFIXES, force, CONTENT)
+        return file
 
-    found = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
-    file = _file(output, found.views[0].size_px)
-    check_output(file, SUFFIXES, force, CONTENT)
+    found = _find_views(pictures, size, layout, view, checked_file)
+    file = checked_file(found.views[0].size_px)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
     result = calibrate_camera(found, layout.notation())
@@ -160,7 +151,7 @@ def mask(
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
-        frames = open_camera(pictures, time.monotonic, size_px=_size(size, pictures))
+        frames = open_camera(pictures, time.monotonic, size_px=size)
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
@@ -244,21 +235,6 @@ def _source(text: str, view: bool = False) -> str:
     return source.spec
 
 
-def _size(text: str | None, source: str) -> tuple[int, int] | None:
-    """Return the `--size` that a camera of this computer is asked for. Raises InvalidValue,
-    UsageError."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
-    if found is None:
-        raise InvalidValue(f"--size: found {text!r}; needed is WIDTHxHEIGHT, as in 720x576")
-    if not source.startswith("camera:"):
-        raise UsageError(
-            f"--size is asked of camera:N, and {without_password(source)} has its own: leave it out"
-        )
-    return int(found[1]), int(found[2])
-
-
 # -- the board and its views -------------------------------------------
 
 
@@ -267,7 +243,7 @@ def _find_views(
     size_px: tuple[int, int] | None,
     board: Board,
     view: bool = False,
-    check: Callable[[tuple[int, int]], None] = lambda size_px: None,
+    check: Callable[[tuple[int, int]], object] = lambda size_px: None,
 ) -> FoundViews:
     """Return the views, at least one, and the pictures without a board.
 

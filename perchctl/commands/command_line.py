@@ -169,6 +169,13 @@ SourceOption = Annotated[
         "images:DIR, sim:.",
     ),
 ]
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
+        "http://..., aideck://HOST, or a path.",
+    ),
+]
 PositioningOption = Annotated[
     str | None,
     typer.Option(

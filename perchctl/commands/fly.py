@@ -29,7 +29,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
+from perchctl.commands.interrupt import ignore_signals, interruptible, signals_to_operator
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.profile import picture_edges
 from perchctl.display import (
@@ -211,7 +211,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         if page is not None:
             page.end(summary, log.path)
     code = exit_code(report.outcome, summary)
-    plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
+    plot = plot_of(log.path, options.profile)
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
     if as_json:
@@ -221,16 +221,17 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
 
 def plot_of(log_path: Path, profile: Profile) -> Path | None:
     """Draw the flight beside its log if the profile asks for it, and return the picture's path.
-    A plot that fails is a warning: the flight is over."""
+    A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
     if not profile.log.plot:
         return None
     from perchctl.analysis import plot_flight
 
     picture = path_beside(log_path, ".png")
     try:
-        plot_flight(read_log(log_path), picture)
-    except Exception as error:
-        say(f"the plot could not be drawn: {error}")
+        with interruptible():
+            plot_flight(read_log(log_path), picture)
+    except (Exception, KeyboardInterrupt) as error:
+        say(f"the plot could not be drawn: {str(error) or 'Ctrl-C'}")
         return None
     return picture
 

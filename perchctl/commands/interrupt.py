@@ -8,10 +8,8 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import FrameType
 
-from perchctl.commands.output import say
 from perchctl.flight import OperatorSwitch
 
 Handler = Callable[[int, FrameType | None], None]
@@ -86,17 +84,6 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if switch.listening and signal.SIGTSTP in numbers:
             # Not from this thread: a terminal that stands still would hold up the signals.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
-
-
-def draw_unless_interrupted(draw: Callable[[], Path | None]) -> Path | None:
-    """Return what `draw` does, the path of a picture or None; None too if Ctrl-C or SIGTERM ends
-    it: a picture comes after the result, and does not take its place."""
-    try:
-        with interruptible():
-            return draw()
-    except KeyboardInterrupt:
-        say("Ctrl-C: the plot is not drawn; the result stands")
-        return None
 
 
 @contextlib.contextmanager

@@ -38,6 +38,7 @@ from perchctl.camera import (
 from perchctl.commands.command_line import (
     JsonOption,
     ProfileOption,
+    SourceArgument,
     ViewOption,
     command,
     new_app,
@@ -77,13 +78,7 @@ app = new_app()
     "perchctl track 'images:pictures/*.png' --json",
 )
 def track(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="camera:N or its name, rtsp://..., http://..., aideck://HOST, video:FILE, "
-            "images:DIR (or a pattern), or a path."
-        ),
-    ],
+    source: SourceArgument,
     profile: ProfileOption = "sim",
     calibration: Annotated[
         Path | None,
