@@ -24,9 +24,6 @@ _NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
 @contextlib.contextmanager
 def signals_to(handler: Handler) -> Iterator[None]:
     """Hand SIGINT and SIGTERM to `handler` during the block (main thread only)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     old = {name: signal.signal(name, handler) for name in SIGNALS}
     try:
         yield
@@ -43,9 +40,6 @@ def signals_to_operator(switch: OperatorSwitch, report: Callable[[str], None]) -
     once, so they count while the main thread hangs in a library. A hang-up that is ignored
     already (nohup) stays ignored. `report` prints a line.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def handler(_signal: int, _frame: FrameType | None) -> None:
         switch.leave()

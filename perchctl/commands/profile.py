@@ -140,10 +140,6 @@ HEAD = """\
 # it means (unit, what is allowed). Body axes: x forward, y left, z up, from the
 # vehicle's centre. A key that is not here has its default; all of them:
 #   perchctl profile -p {name}
-# An editor that knows YAML schemas completes keys and shows what they mean with
-#   perchctl profile schema > perchctl.schema.json
-# beside this file, and here in a line of its own, behind a #:
-#   yaml-language-server: $schema=perchctl.schema.json
 
 """
 
@@ -206,8 +202,6 @@ def new(
 def default_answer(name: str, answers: Answers) -> str:
     """Return what Enter stands for, after the answers to the questions before."""
     uri, source = answers.get("link.uri", ""), answers.get("camera.source", "")
-    if name == "link.uri" and source == "sim:":  # no other vehicle flies by those pictures
-        return SIMULATED
     if name == "camera.source" and uri.startswith(SIMULATED):
         return "sim:"
     if name == "camera.calibration" and _is_aideck(source):

@@ -251,8 +251,6 @@ def sweep(
     """Fly the same seeds with several values of a profile's key: which is the best."""
     _require_simulator()
     asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
-    cells = len(asked.profiles)
-    say(f"{cells} cells of {flights} seeds are {cells * flights} flights")
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
         record = asked.record(results)
