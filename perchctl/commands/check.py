@@ -118,21 +118,9 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def table(rows: Sequence[Row], finished: bool = True) -> str:
-    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do.
-
-    Rows that were skipped for one and the same reason share a line. Of a check that did not come
-    to its end nothing good is said.
-    """
-    lines: list[str] = []
-    skipped: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        if row.verdict is Verdict.SKIPPED:
-            skipped.setdefault((row.found, row.advice), []).append(row.name)
-        else:
-            lines += _lines(SHOWN[row.verdict], row.name, row.found, row.advice)
-    for (why, advice), names in skipped.items():
-        name, found = (names[0], why) if len(names) == 1 else ("", f"{', '.join(names)}: {why}")
-        lines += _lines(SHOWN[Verdict.SKIPPED], name, found, advice)
+    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do. Of a
+    check that did not come to its end nothing good is said."""
+    lines = [line for row in rows for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
     failing = [row.name for row in rows if row.verdict is Verdict.FAIL]
@@ -142,13 +130,13 @@ def table(rows: Sequence[Row], finished: bool = True) -> str:
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
 
 
-def _lines(verdict: str, name: str, found: str, advice: str) -> list[str]:
-    head = f"{verdict}  {name:<{NAME_WIDTH}}"
+def _lines(row: Row) -> list[str]:
+    head = f"{SHOWN[row.verdict]}  {row.name:<{NAME_WIDTH}}"
     margin = " " * len(head)
-    lines = _wrapped(found, head, margin) or [head.rstrip()]
-    if "\n" in advice:  # lines to be copied stay as they are
-        return lines + [f"  {line}" for line in advice.splitlines()]
-    return lines + _wrapped(advice, f"{margin}-> ", f"{margin}   ")
+    lines = _wrapped(row.found, head, margin) or [head.rstrip()]
+    if "\n" in row.advice:  # lines to be copied stay as they are
+        return lines + [f"  {line}" for line in row.advice.splitlines()]
+    return lines + _wrapped(row.advice, f"{margin}-> ", f"{margin}   ")
 
 
 def _wrapped(text: str, first: str, others: str) -> list[str]:

@@ -284,8 +284,6 @@ def film(
     path = _log_file(file)
     place = _place(path, output, FILMS, force)
     is_recorded = path_beside(path, ".mcap").is_file()
-    if not is_recorded:
-        say(f"there is no recording beside {path}: the film has no camera picture")
     with _opened(path) as log:
         flight = FlightAnalysis(log)
     from perchctl.analysis import write_film
