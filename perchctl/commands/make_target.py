@@ -20,7 +20,6 @@ from perchctl.commands.output import print_result
 from perchctl.errors import UsageError
 from perchctl.files import check_output, write_files
 from perchctl.profile import (
-    Profile,
     find_calibration,
     load_profile,
     writable_profile,
@@ -34,7 +33,6 @@ from perchctl.target import (
     parse_length,
     target_pdf,
 )
-from perchctl.vision import CameraModel
 
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
 MagnetOption = Annotated[
@@ -136,10 +134,10 @@ def design(
 ) -> None:
     """Compute from where to where a camera sees each marker, and where a gap is."""
     config = load_profile(profile)
-    name, model = _camera(config, camera)
-    found = make_design(config.target, model, blur, config, ceiling)
+    path = find_calibration(camera or config.camera.calibration)
+    found = make_design(config.target, load_calibration(path), blur, config, ceiling)
     record = found.record() | {"target": config.target.model_dump(mode="json")}
-    print_result(record if as_json else found.text(name))
+    print_result(record if as_json else found.text(str(path)))
 
 
 @command(
@@ -179,9 +177,3 @@ def measured(
     for note in notes:
         print(note)
     print(f"changed {path}; as it was before it is {before}")
-
-
-def _camera(profile: Profile, name: str | None) -> tuple[str, CameraModel]:
-    """Return the calibration's file, and the camera."""
-    path = find_calibration(name or profile.camera.calibration)
-    return str(path), load_calibration(path)
