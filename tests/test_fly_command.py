@@ -3,7 +3,6 @@ follows the flight."""
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import socket
@@ -20,8 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import load_calibration
 from perchctl.commands import app
 from perchctl.commands.fly import fly_and_report, resolve
-from perchctl.errors import EXIT_CODES, ConnectionFailed, Interrupted
-from perchctl.link.connection import open_connection
+from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
 from perchctl.sim import SimProcess
@@ -73,7 +71,6 @@ def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> 
         ("-p misspelt.yaml", 30, ["misspelt.yaml", "kalman.alfa", "unknown", "alpha"]),
         ("-p ./none.yaml", 20, ["none.yaml", "does not exist"]),
         ("--uri bogus", 30, ["'bogus'", "radio://0/80/2M"]),
-        ("--uri=", 30, ["radio://0/80/2M"]),
         ("--uri udp://127.0.0.1:99999 --yes", 30, ["65535"]),
         (f"--uri {NOWHERE}", 2, ["sim:", "--source"]),
         (f"--uri {NOWHERE} --source sim: --yes", 2, ["sim:", "--source"]),
@@ -81,10 +78,8 @@ def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> 
         ("--source=", 30, ["camera:N"]),
         ("--dry-run --source webcam", 30, ["'webcam'", "camera:N"]),
         ("--seed -1", 30, ["-1", "negative"]),
-        (f"--uri {NOWHERE} --source camera:x --yes", 20, ["camera:x"]),
         (f"--uri {NOWHERE} --source camera:9 --yes", 20, ["camera:9"]),
         ("--source video:none.mp4", 20, ["none.mp4"]),
-        ("--source images:none", 20, ["none"]),
         (f"--uri {NOWHERE} --source video:none.mp4", 2, ["recording", NOWHERE]),
         ("-p crazyflie --source video:none.mp4 --dry-run", 2, ["recording", "--source"]),
     ],
@@ -186,17 +181,6 @@ def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str) -> None:
     assert said.code == 10
     assert "nothing listens there" in said.stderr
     assert "link error callback" not in said.stderr
-
-
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
-)
-def test_the_library_s_prints_stay_off_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    """cflib tells of its sockets on stdout, where the one object belongs. (It leaves one open.)"""
-    with pytest.raises(ConnectionFailed, match="nothing listens there"):
-        open_connection("tcp://127.0.0.1:9", 5.0)
-    assert capfd.readouterr().out == ""
-    gc.collect()
 
 
 @pytest.mark.long
