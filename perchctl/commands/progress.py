@@ -26,7 +26,6 @@ from rich.text import Text
 from perchctl.calibration import GuidedFrame
 from perchctl.display import LivePage, Sketch
 
-_REFRESH_HZ = 4
 _WHOLE_RUN_S = 1e6
 """Over which the time left is estimated: in rich's own 30 s no flight may have ended."""
 
@@ -93,7 +92,6 @@ def _bar(
         MofNCompleteColumn(),
         *more,
         console=console,
-        refresh_per_second=_REFRESH_HZ,
         redirect_stdout=False,
         speed_estimate_period=_WHOLE_RUN_S,
     ) as progress:

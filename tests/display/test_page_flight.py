@@ -51,13 +51,11 @@ def seen_in(frame: Frame) -> PipelineOutput:
 
 
 def one_frame(frame: Frame) -> Any:
-    """A live source that gives this frame and is then silent."""
+    """A source that gives this frame and is then silent."""
     left = [frame]
     return SimpleNamespace(
-        live=True, finished=False, size_px=(640, 480), close=left.clear,
-        poll=lambda now_s: left.pop() if left else None, problem=lambda now_s: "silent",
-        describe=lambda: "one frame",
-    )  # fmt: skip
+        poll=lambda now_s: left.pop() if left else None, problem=lambda now_s: "silent"
+    )
 
 
 # --- what it shows ---------------------------------------------------------------------------
