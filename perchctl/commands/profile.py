@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import re
 import shlex
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,19 +107,31 @@ WORDS: dict[str, str] = {
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
     "aideck://HOST",
     "camera.calibration": "Its calibration file, of perchctl calibrate",
-    "camera.latency_s": "How late the picture is, from exposure to arrival, s; or measured",
+    "camera.latency_s": "How late the picture is, from exposure to arrival (often 60 to 100 ms),\n"
+    "or measured: by each flight",
     "front": "Hold a hand over the front of the vehicle. At which edge of the picture does it\n"
     "come in: top, right, bottom or left?",
     "left": "And a hand over its left side (a camera that mirrors has it at the other edge)?",
-    "camera.mount.position_m": "Where is the lens from the vehicle's centre, m: forward, left, up?",
-    "vehicle.gear_body_m": "Where is the tip of the magnet gear, m: forward, left, up?",
-    "target.large.side_m": "Side of the target's large black square as printed, m",
-    "target.small.side_m": "Side of the small black square, m",
-    "ceiling": "Height of the ceiling over the floor, m",
-    "safety.fence_radius_m": "Radius of the free space around the place of take-off, m",
+    "camera.mount.position_m": "Where is the lens from the vehicle's centre: forward, left, up?",
+    "vehicle.gear_body_m": "Where is the tip of the magnet gear: forward, left, up?",
+    "target.large.side_m": "Side of the target's large black square as printed",
+    "target.small.side_m": "Side of the small black square",
+    "ceiling": "Height of the ceiling over the floor",
+    "safety.fence_radius_m": "Radius of the free space around the place of take-off",
 }
+MEASURES: dict[str, tuple[str, float]] = {
+    "camera.latency_s": ("ms", 1e-3),
+    "camera.mount.position_m": ("mm", 1e-3),
+    "vehicle.gear_body_m": ("mm", 1e-3),
+    "target.large.side_m": ("mm", 1e-3),
+    "target.small.side_m": ("mm", 1e-3),
+    "ceiling": ("m", 1.0),
+    "safety.fence_radius_m": ("m", 1.0),
+}
+"""The unit that people answer in, and its size in the key's."""
 EDGES_AND_CEILING = ("front", "left", "ceiling")
 """Questions that are no keys of the profile."""
+BACK = "back"
 CEILING_M = (1.0, 10.0)
 OVER_THE_CEILING_M = 0.4
 """The height limit is so far above the ceiling: an estimate that drifts must not end a flight."""
@@ -184,7 +197,9 @@ def new(
     for name in [name for name in QUESTIONS if name not in given] if defaults else []:
         answers[name] = default_answer(name, answers)
     if not QUESTIONS.keys() <= answers.keys():
-        print_lines(f"A new profile: {output}. Enter takes what stands in brackets.")
+        print_lines(
+            f"A new profile: {output}. Enter takes what stands in brackets, {BACK} goes back."
+        )
         answers = ask_person(given)
     profile, keys = new_profile(answers, output.stem)
     shown = shlex.quote(str(output))
@@ -218,19 +233,33 @@ def default_answer(name: str, answers: Answers) -> str:
 
 
 def ask_person(given: Answers) -> Answers:
-    """Return `given` with what somebody types: each question until its answer is valid. Raises
-    UsageError if the input has ended."""
-    answers = dict(given)
-    for name in [name for name in QUESTIONS if name not in given]:
-        default = default_answer(name, answers)
-        while name not in answers:
-            typed = _typed(f"{WORDS[name]}\n  [{default}]") or default
-            try:
-                new_profile({**answers, name: typed}, "new")
-                answers[name] = typed
-            except PerchError as error:
-                print_lines(f"  {str(error).removeprefix('--set: ')}")
-    return answers
+    """Return `given` with what somebody types: each question until its answer is valid, and what
+    was answered once more before it is taken. Raises UsageError if the input has ended."""
+    names = [name for name in QUESTIONS if name not in given]
+    before: list[Answers] = [given]
+    while True:
+        answers, number = before[-1], len(before)
+        if number > len(names):
+            print_lines(summary(answers))
+            question, default = "Enter writes it", ""
+        else:
+            name = names[number - 1]
+            default = default_answer(name, answers)
+            question = f"{number} of {len(names)}: {WORDS[name]}\n  [{_shown(name, default)}]"
+        try:
+            typed = _typed(question)
+            if typed.lower() == BACK:
+                before = before[: max(1, number - 1)]
+            elif number > len(names):
+                return answers
+            else:
+                answered = {**answers, name: _read(name, typed) if typed else default}
+                new_profile(answered, "new")
+                before.append(answered)
+        except (PerchError, UnicodeDecodeError) as error:
+            if isinstance(error, UsageError):
+                raise
+            print_lines(f"  {str(error).removeprefix('--set: ')}")
 
 
 def _typed(question: str) -> str:
@@ -241,6 +270,47 @@ def _typed(question: str) -> str:
             "there is nobody to ask, and nothing was written: answer by --set, or add "
             "--defaults for what is not answered"
         ) from None
+
+
+def _read(name: str, typed: str) -> str:
+    """Return the text of a key's value for what a person types: numbers, with the question's unit
+    or without. Raises InvalidValue."""
+    if name not in MEASURES:
+        return typed
+    unit, size = MEASURES[name]
+    words = re.sub(rf"(?<=[\d.])\s*{unit}(?![a-zA-Z])", " ", typed).replace(",", " ").split()
+    if (name, typed) == ("camera.latency_s", "measured"):
+        return typed
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        raise InvalidValue(f"found {typed!r}; numbers in {unit} are needed") from None
+    if size < 1.0 and any(numbers) and all(abs(number) < 1.0 for number in numbers):
+        raise InvalidValue(f"found {typed!r}: too small for {unit}, in which the question is")
+    values = [f"{number * size:.12g}" for number in numbers]
+    return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
+
+
+def _shown(name: str, value: str) -> str:
+    """Return the text of a key's value as a person would type it."""
+    if name not in MEASURES:
+        return value
+    unit, size = MEASURES[name]
+    try:
+        numbers = [float(part) / size for part in value.strip("[]").split(",")]
+    except ValueError:  # a word, or a number with its unit, as --set may give it
+        return value
+    return f"{' '.join(f'{number:.4g}' for number in numbers)} {unit}"
+
+
+def summary(answers: Answers) -> str:
+    """Return what the profile would say, for a last look."""
+    profile, _ = new_profile(answers, "new")
+    mirrored = "mirrored" if profile.camera.mirrored else "not mirrored"
+    turn = profile.camera.mount.rpy_deg[2]
+    rows = [(name, _shown(name, answers[name])) for name in QUESTIONS if name in answers]
+    rows.append(("picture", f"{mirrored}, turned by {turn:g} deg about the vertical"))
+    return "\n".join(f"  {name:<24} {text}" for name, text in rows)
 
 
 def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
@@ -295,7 +365,7 @@ def _height_keys(answers: Answers) -> dict[str, Any]:
     if "ceiling" not in answers:
         return {}
     try:
-        ceiling_m = float(answers["ceiling"])
+        ceiling_m = float(answers["ceiling"].removesuffix("m"))
     except ValueError:
         ceiling_m = math.nan
     low_m, high_m = CEILING_M

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from pathlib import Path
 
@@ -93,7 +94,7 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
 
 def test_enter_takes_every_default(tmp_path: Path) -> None:
     asked, silent = tmp_path / "asked.yaml", tmp_path / "silent.yaml"
-    assert new(asked, typed="\n" * len(QUESTIONS)).exit_code == 0
+    assert new(asked, typed="\n" * (len(QUESTIONS) + 1)).exit_code == 0
     one, other = load_profile(str(asked)), made(silent)
     assert one.model_copy(update={"name": ""}) == other.model_copy(update={"name": ""})
     assert one.link.uri.startswith("radio://")
@@ -137,26 +138,48 @@ WRONG: dict[str, tuple[str, str]] = {
 }
 
 
+MISTYPED = WRONG | {
+    "camera.latency_s": ("0.08", "too small for ms"),
+    "camera.mount.position_m": ("0.03 0 0.01", "too small for mm"),
+    "vehicle.gear_body_m": ("0 0 400", "0.4"),
+    "target.large.side_m": ("15 cm", "numbers in mm"),
+    "target.small.side_m": ("80", "less than half"),
+    "safety.fence_radius_m": ("far", "numbers in m"),
+}
+
+
 def test_a_wrong_answer_is_asked_again_with_what_is_allowed(tmp_path: Path) -> None:
     output = tmp_path / "mine.yaml"
-    done = new(output, typed="".join(f"{WRONG[name][0]}\n\n" for name in QUESTIONS))
+    done = new(output, typed="".join(f"{MISTYPED[name][0]}\n\n" for name in QUESTIONS) + "\n")
     assert done.exit_code == 0
-    for _, allowed in WRONG.values():
+    for _, allowed in MISTYPED.values():
         assert allowed in done.stderr
     assert load_profile(str(output)).link.uri.startswith("radio://")
 
 
-def test_what_is_typed_is_written(tmp_path: Path) -> None:
+def test_a_ruler_s_millimetres_are_written_as_metres_and_one_may_go_back(tmp_path: Path) -> None:
     output = tmp_path / "mine.yaml"
-    typed = ["usb://0", "", "", "measured", "top", "left", "[0.0315, 0, -0.004]", "", "0.18"]
-    done = new(output, typed="\n".join([*typed, "", "", "1.2"]) + "\n")
+    typed = ["usb://0", "", "", "80", "back", "95 ms", "top", "left", "31.5, 0 -4 mm", "", "180"]
+    done = new(output, typed="\n".join([*typed, "", "", "", "back", "1.2", ""]) + "\n")
     assert done.exit_code == 0, done.stderr
     mine = load_profile(str(output))
-    assert (mine.link.uri, mine.camera.latency_s) == ("usb://0", "measured")
+    assert mine.camera.latency_s == 0.095
     assert mine.camera.mount.position_m == (0.0315, 0.0, -0.004)
     assert (mine.target.large.side_m, mine.target.small.side_m) == (0.18, 0.03)
     assert mine.safety.fence_radius_m == 1.2
-    assert mine.camera.mirrored
+    assert "picture                  mirrored, turned by" in done.stderr
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_latency_that_flights_measure_may_be_answered(tmp_path: Path, given: bool) -> None:
+    output, settings = tmp_path / "mine.yaml", ["--set", "ceiling=2.4m"]
+    settings += ["--set", "camera.latency_s=measured"] if given else []
+    typed = "\n" * 3 + ("" if given else "measured\n") + "\n" * 8
+    done = new(output, *settings, typed=typed)
+    assert done.exit_code == 0, done.stderr
+    assert load_profile(str(output)).camera.latency_s == "measured"
+    assert re.search(r"camera.latency_s +measured\n", done.stderr)
+    assert re.search(r"ceiling +2.4m\n", done.stderr)
 
 
 def test_a_calibration_that_lies_there_is_offered(
