@@ -257,15 +257,32 @@ def test_an_ignored_ctrl_c_stays_ignored() -> None:
     assert run_apart("fly", "--dry-run", before=ignored + pressed_at("numpy")).code == 0
 
 
-def test_what_is_no_command_is_the_main_ones_argument() -> None:
-    assert "shwo does not exist" in run("log", "shwo").stderr
-    assert run("fyl").code == UsageError.exit_code
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("fyl",), "Did you mean 'fly'"),
+        (("log", "shwo"), "did you mean show?"),
+        (("calibrate", "monut", "-p", "x.yaml"), "did you mean mount?"),
+    ],
+)
+def test_a_misspelt_command_is_named(words: tuple[str, ...], meant: str) -> None:
+    said = run(*words)
+    assert said.code == UsageError.exit_code
+    assert meant in said.stderr
+
+
+def test_what_is_like_no_command_is_the_main_ones_argument(tmp_path: Path) -> None:
+    """A file may have a command's name, misspelt or not."""
+    file = tmp_path / "shwo"
+    file.write_text("no log")
+    assert "did you mean" not in run("log", str(file)).stderr
+    assert "does not exist" in run("log", "flight_17.jsonl").stderr
 
 
 def test_what_a_device_refuses_is_not_the_disk_s(capsys: pytest.CaptureFixture[str]) -> None:
     for error, said in (
         (PermissionError(errno.EACCES, "Permission denied"), "unforeseen PermissionError"),
-        (PermissionError(errno.EACCES, "Permission denied", "/x"), "/x cannot be written"),
+        (PermissionError(errno.EACCES, "Permission denied", "/x"), "/x cannot be used"),
         (OSError(errno.ENOSPC, "No space left", "/x"), "/x cannot be written"),
     ):
         with pytest.raises(typer.Exit), report_failures():

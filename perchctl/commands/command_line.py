@@ -7,6 +7,7 @@ only as it is used, so that the help is quick, and may import whatever it needs 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
 import functools
 import importlib
@@ -15,7 +16,6 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Annotated, Any, NoReturn, ParamSpec
 
 import typer
@@ -26,18 +26,29 @@ from perchctl.commands.output import drop_stream, say
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
+    InvalidValue,
     Note,
     PerchError,
     UsageError,
 )
-from perchctl.files import cannot_be_written
 from perchctl.startup import failure_record, restore_ctrl_c
 
 # \b keeps the lines of a paragraph as they are.
 EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
     f"{code:>5}  {meaning}" for code, meaning in sorted(EXIT_CODES.items())
 )
-_FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FREE_SPACE = "free some space"
+_REFUSED: dict[int | None, str] = {
+    errno.ENOSPC: _FREE_SPACE,
+    errno.EDQUOT: _FREE_SPACE,
+    errno.EFBIG: _FREE_SPACE,
+    errno.EROFS: "choose another place",
+    errno.EACCES: "choose another place",
+    errno.EPERM: "choose another place",
+    errno.ENAMETOOLONG: "choose another place",
+    errno.ENOTDIR: "choose another place",
+}
+"""Why the operating system refuses a place, and what to do."""
 _LONGEST_PLACE = 200
 
 COMMANDS: dict[str, str] = {
@@ -60,6 +71,8 @@ COMMANDS: dict[str, str] = {
 }
 """In the order in which one uses them, with the first sentence of their help."""
 
+_CLOSE = 0.75
+"""Alike enough to be a misspelt command rather than a file's name."""
 _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
@@ -70,6 +83,13 @@ class Group(TyperGroup):
         named = (*self.commands, *_SETTINGS["help_option_names"])
         # A shell that completes words asks for what may come, and wants no main one.
         if not ctx.resilient_parsing and (not args or args[0] not in named):
+            # A file or a source has more in its name than letters.
+            word = args[0] if args and args[0].isalpha() and not os.path.exists(args[0]) else ""
+            if meant := difflib.get_close_matches(word, self.commands, 1, _CLOSE):
+                raise UsageError(
+                    f"{ctx.command_path} {word} is no command; did you mean {meant[0]}? "
+                    f"({ctx.command_path} --help lists all)"
+                )
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
@@ -231,12 +251,15 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
         # Without a place it is stdout's disk that is full, or a device that is refused.
-        if isinstance(error, OSError) and (error.filename or error.errno in _FULL_DISK):
+        is_full = isinstance(error, OSError) and _REFUSED.get(error.errno) == _FREE_SPACE
+        if isinstance(error, OSError) and error.errno in _REFUSED and (error.filename or is_full):
             if error.filename is None:
                 drop_stream(sys.stdout)
-            place = Path(str(error.filename or "the result")[:_LONGEST_PLACE])
-            refused = cannot_be_written(place, error)
-            _leave(str(refused), refused.exit_code, as_json)
+            place = str(error.filename or "the result")[:_LONGEST_PLACE]
+            advice = _REFUSED[error.errno]
+            what = "written" if is_full else "used"
+            sentence = f"{place} cannot be {what}: {error.strerror}: {advice}"
+            _leave(sentence, InvalidValue.exit_code, as_json)
         _leave(
             f"unforeseen {type(error).__name__}: {error} "
             f"(PERCHCTL_DEBUG=1 shows where; please report it)",
