@@ -43,6 +43,7 @@ from perchctl.display import live_page
 from perchctl.errors import (
     Interrupted,
     InvalidValue,
+    NotFound,
     SafetyAbort,
     UsageError,
 )
@@ -118,10 +119,11 @@ def mount(
     written, before, problem = None, None, None
     if into is not None:
         try:
+            _check_unchanged(profile, vehicle)
             before = write_profile_values(into, measured.profile_values())
             written = into
             say(f"wrote these into {written}; as it was before it is {before}")
-        except InvalidValue as error:  # the numbers stand
+        except (InvalidValue, NotFound) as error:  # the numbers stand
             problem = error
             say(str(error))
     else:
@@ -185,6 +187,17 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
             f"name the other recording too"
         )
     return list(found.values())
+
+
+def _check_unchanged(name: str, then: Profile) -> None:
+    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
+    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
+    now = load_profile(name)
+    if (now.camera, now.vehicle) != (then.camera, then.vehicle):
+        raise InvalidValue(
+            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
+            f"rest on what it said before; measure again, with --from"
+        )
 
 
 # -- a live recording --------------------------------------------------

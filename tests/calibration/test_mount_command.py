@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import MountingRecording
 from perchctl.calibration.mounting.carry import CarrySolution
 from perchctl.calibration.mounting.report import MountingReport
+from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
 from tests.helpers.calibrating import calibrate, refused
@@ -173,6 +175,28 @@ def test_the_pivot_alone_leaves_the_turn_open(place: Path, logs: dict[str, Path]
     assert record["rpy_deg"] is record["latency_s"] is record["sigma"]["rpy_deg"] is None
     assert list(record["profile_values"]) == ["vehicle.gear_body_m"]
     assert "rests on the profile's camera.mount.rpy_deg" in result.stderr
+
+
+@pytest.mark.parametrize("changed", ["camera: {latency_s: measured}", None])
+def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
+    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, changed: str | None
+) -> None:
+    """A gear by the old turn beside a new one would be a gear in another place. The numbers are
+    printed all the same, also where the profile (None) is gone."""
+    mine, text = Path("mine.yaml"), f"extends: crazyflie\n{changed}\n"
+    mine.write_text("extends: crazyflie\n", encoding="utf-8")
+    solved = calibrate_mount.solve_mounting
+
+    def long_work(*given: Any) -> Any:
+        mine.unlink() if changed is None else mine.write_text(text, encoding="utf-8")
+        return solved(*given)
+
+    monkeypatch.setattr(calibrate_mount, "solve_mounting", long_work)
+    result = mount("-p", "mine.yaml", "--from", str(logs["pivot"]), "--write")
+    assert result.exit_code == (20 if changed is None else 30), result.stderr
+    assert result.stdout.startswith("vehicle.gear_body_m: [")
+    if changed is not None:
+        assert mine.read_text(encoding="utf-8") == text
 
 
 def test_numbers_that_cannot_be_written_are_still_reported(
