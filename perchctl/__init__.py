@@ -4,6 +4,11 @@ The names of `__init__.pyi` are the public ones, for notebooks and scripts; `doc
 them at work. They are loaded when they are first used, so that the command line starts at once.
 """
 
+from perchctl.startup import is_program, leave_at_ctrl_c
+
+if is_program():
+    leave_at_ctrl_c()  # before lazy_loader, which takes a while to load
+
 import lazy_loader
 
 __version__ = "0.2.0"

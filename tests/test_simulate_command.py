@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -101,46 +100,15 @@ def _flights(path: Path) -> list[dict[str, Any]]:
     return records
 
 
-@pytest.fixture(scope="module")
-def repeated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, Path]:
-    """The one flight of the seed, told for people, with its log."""
-    folder = tmp_path_factory.mktemp("only") / "made"
-    arguments = ("-p", SHORT, "--only", str(SEED), "--log-dir", str(folder))
-    return run_apart("simulate", *arguments, PYTHONHASHSEED="7"), folder
-
-
 def test_one_seed_is_the_flight_that_it_was_in_the_campaign(
-    campaign: Said, repeated: tuple[Said, Path], logs: Path
+    campaign: Said, logs: Path, tmp_path: Path
 ) -> None:
     """The same log, from another process."""
+    arguments = ("-p", SHORT, "-n", "1", "--seed", str(SEED), "--log-dir", str(tmp_path / "made"))
+    said = run_apart("simulate", *arguments, PYTHONHASHSEED="7")
+    assert said.code == 0
     name = f"flight_seed{SEED}.jsonl"
-    assert (repeated[1] / name).read_bytes() == (logs / name).read_bytes()
+    assert (tmp_path / "made" / name).read_bytes() == (logs / name).read_bytes()
     assert sorted(path.name for path in logs.iterdir()) == [name, f"flight_seed{SEED + 1}.jsonl"]
     misses = [read_log(path).summary["miss_m"] for path in logs.iterdir()]  # type: ignore[index]
     assert json.loads(campaign.stdout)["miss_m"]["max"] == pytest.approx(max(misses), abs=1e-6)
-
-
-def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Path]) -> None:
-    said, folder = repeated
-    assert said.code == 0
-    assert said.stderr == ""
-    lines = said.stdout.splitlines()
-    assert lines[0] == "PERCHED: hanging still with the motors off"
-    assert re.search(r"COMPLETE .*contact proven by", said.stdout)
-    log = folder / f"flight_seed{SEED}.jsonl"
-    assert lines[-2:] == [f"log:       {log}", f"plot:      {log.with_suffix('.png')}"]
-    assert {path.suffix for path in folder.iterdir()} == {".jsonl", ".png"}
-
-
-def test_one_seed_as_json_is_its_flight_logged_where_the_profile_says(tmp_path: Path) -> None:
-    profile = tmp_path / "mine.yaml"
-    profile.write_text(
-        f"extends: {SHORT}\nplanner: {{perching_time_s: 0.3}}\n"
-        "log: {directory: here, plot: false}\n"
-    )
-    said = run("simulate", "-p", str(profile), "--only", "5", "--json")
-    record = json.loads(said.stdout)
-    assert (said.code, record["seed"], record["outcome"]) == (0, 5, "landed")
-    assert record["reason"] == "the perching time is over; motors off"
-    assert (record["log"], record["plot"]) == ("here/flight_seed5.jsonl", None)
-    assert read_log(tmp_path / record["log"]).header["seed"] == 5

@@ -212,12 +212,12 @@ def page(flown: Flight, file: Path) -> None:
     closing = threading.Event()
 
     def feed() -> None:
-        """As a flight does: 30 pictures a second, so that the page shows a rate."""
+        """As a flight does: 30 pictures a second."""
         start_s = time.monotonic()
         while not closing.wait(1.0 / 30.0):
             passed = min(1.0, (time.monotonic() - start_s) / PAGE_S)
             shown.append(first + round(passed * (last - first)))
-            live.show(len(shown), picture)
+            live.show(picture)
 
     live.set_state(lambda: flight_state(flown.tick(shown[-1]), drawn), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
@@ -427,7 +427,7 @@ def _write(file: Path, picture: NDArray[np.uint8]) -> None:
 
 def fly(profile: str, seed: int, folder: Path) -> FlightLog:
     where = ("--log-dir", str(folder), "--record")
-    _perchctl("simulate", "-p", profile, "--only", str(seed), *where)
+    _perchctl("simulate", "-p", profile, "-n", "1", "--seed", str(seed), *where)
     return read_log(folder / f"flight_seed{seed}.jsonl")
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -38,6 +37,7 @@ from perchctl.commands.command_line import (
     ForceOption,
     Group,
     JsonOption,
+    SourceArgument,
     ViewOption,
     command,
     new_app,
@@ -47,7 +47,7 @@ from perchctl.commands.output import print_result, say
 from perchctl.commands.progress import guide, search_bar
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_output, same_file, write_files
+from perchctl.files import check_output, write_files
 from perchctl.target import Board
 from perchctl.vision import CameraModel
 
@@ -55,13 +55,6 @@ FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
 
-SourceArgument = Annotated[
-    str,
-    typer.Argument(
-        help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-        "http://..., aideck://HOST, or a path.",
-    ),
-]
 BoardOption = Annotated[
     str,
     typer.Option(
@@ -72,11 +65,8 @@ BoardOption = Annotated[
     ),
 ]
 SizeOption = Annotated[
-    str | None,
-    typer.Option(
-        "--size",
-        help="Asked of camera:N, as in 720x576; else its driver's own.",
-    ),
+    tuple[int, int] | None,
+    typer.Option("--size", help="Width and height asked of camera:N; else its driver's own."),
 ]
 OutputOption = Annotated[
     Path | None,
@@ -104,13 +94,6 @@ def camera(
     view: ViewOption = False,
     as_json: JsonOption = False,
     size: SizeOption = None,
-    model: Annotated[
-        Literal["auto", "plumb_bob", "fisheye"],
-        typer.Option(
-            "--model",
-            help="Lens model; auto takes the simplest one that follows the lens.",
-        ),
-    ] = "auto",
 ) -> None:
     """Calibrate the camera, and report what its error means in mm at the target.
 
@@ -122,19 +105,21 @@ def camera(
         check_output(output, SUFFIXES, force, CONTENT)
     layout = Board.parse(board)
 
-    def check_place_of(size_px: tuple[int, int]) -> None:
-        """Raise before a person has worked for a file that cannot be written."""
-        check_output(_file(output, size_px), SUFFIXES, force, CONTENT)
+    def checked_file(size_px: tuple[int, int]) -> Path:
+        """Return where the calibration goes; raises before a person has worked for nothing."""
+        file = _file(output, size_px)
+        check_output(file, SUFFIXES, force, CONTENT)
+        return file
 
-    found = _find_views(pictures, _size(size, pictures), layout, view, check_place_of)
-    file = _file(output, found.views[0].size_px)
-    check_output(file, SUFFIXES, force, CONTENT)
+    found = _find_views(pictures, size, layout, view, checked_file)
+    file = checked_file(found.views[0].size_px)
     without = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{without}")
-    result = calibrate_camera(found, layout.notation(), model)
+    result = calibrate_camera(found, layout.notation())
     write_files({file: result.text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
+
     say(f"wrote {file}")
     record = result.record() | {"file": str(file)}
     print_result(record if as_json else file)
@@ -161,43 +146,40 @@ def mask(
     ] = Path("gear.png"),
     force: ForceOption = False,
     size: SizeOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Learn what the vehicle itself covers of the picture, while it is turned about."""
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
-        frames = open_camera(pictures, time.monotonic, size_px=_size(size, pictures))
+        frames = open_camera(pictures, time.monotonic, size_px=size)
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
             say("turn the vehicle about for 20 s (Ctrl-C ends and writes the mask)")
         covered = learn_gear(frames, stop.requested.is_set)
     write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
-    share = float(covered.mean())
-    say(f"wrote {output}: the vehicle covers {100 * share:.1f} % of the picture; set camera.mask")
-    record = {"file": str(output), "covered": round(share, 4)}
-    print_result(record if as_json else output)
+    share = 100.0 * covered.mean()
+    say(f"wrote {output}: the vehicle covers {share:.1f} % of the picture; set camera.mask")
+    print_result(output)
 
 
 @command(
     app,
     "perchctl calibrate check camera.yaml images:board",
-    "perchctl calibrate check camera.yaml camera:0 --view",
-    "perchctl calibrate check camchain.yaml images:board",
+    "perchctl calibrate check camera.yaml camera:0",
+    "perchctl calibrate check camera.yaml video:board.mp4 --json",
 )
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
     board: BoardOption = DEFAULT_BOARD,
-    view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
-    pictures = _source(source, view)
+    pictures = _source(source)
     layout = Board.parse(board)
     model = load_calibration(calibration)
-    found = _find_views(pictures, model.size_px, layout, view)
+    found = _find_views(pictures, model.size_px, layout)
     check_size(found.views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, found)
     for item in found.missing:
@@ -219,18 +201,15 @@ def convert(
     calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
     output: OutputOption = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Write another program's calibration as perchctl's file."""
     model = load_calibration(calibration)
     file = _file(output, model.size_px)
-    if same_file(file, calibration):
-        raise UsageError(f"{file} is the file to convert; name another with --output")
     check_output(file, SUFFIXES, force, CONTENT)
     notes = {"date": _now(), "converted_from": calibration.name}
     write_files({file: calibration_text(model, file.stem, notes).encode()})
     say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
-    print_result({"file": str(file)} if as_json else file)
+    print_result(file)
 
 
 # -- files -------------------------------------------------------------
@@ -256,21 +235,6 @@ def _source(text: str, view: bool = False) -> str:
     return source.spec
 
 
-def _size(text: str | None, source: str) -> tuple[int, int] | None:
-    """Return the `--size` that a camera of this computer is asked for. Raises InvalidValue,
-    UsageError."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
-    if found is None:
-        raise InvalidValue(f"--size: found {text!r}; needed is WIDTHxHEIGHT, as in 720x576")
-    if not source.startswith("camera:"):
-        raise UsageError(
-            f"--size is asked of camera:N, and {without_password(source)} has its own: leave it out"
-        )
-    return int(found[1]), int(found[2])
-
-
 # -- the board and its views -------------------------------------------
 
 
@@ -278,8 +242,8 @@ def _find_views(
     spec: str,
     size_px: tuple[int, int] | None,
     board: Board,
-    view: bool,
-    check: Callable[[tuple[int, int]], None] = lambda size_px: None,
+    view: bool = False,
+    check: Callable[[tuple[int, int]], object] = lambda size_px: None,
 ) -> FoundViews:
     """Return the views, at least one, and the pictures without a board.
 

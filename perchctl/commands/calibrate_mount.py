@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,10 +31,13 @@ from perchctl.camera import (
 )
 from perchctl.commands.command_line import (
     JsonOption,
+    ProfileOption,
+    SourceOption,
+    UriOption,
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
-from perchctl.commands.output import print_lines, print_result, say
+from perchctl.commands.output import ask, print_lines, print_result, say, with_problem
 from perchctl.commands.progress import guide
 from perchctl.display import live_page
 from perchctl.errors import (
@@ -70,22 +72,9 @@ _SIMULATED = "stands on the simulator's floor, where no hand moves it: name a re
 
 
 def mount(
-    profile: Annotated[
-        str,
-        typer.Option(
-            "--profile", "-p", help="The vehicle's profile, which the numbers are compared with."
-        ),
-    ],
-    uri: Annotated[
-        str | None,
-        typer.Option(
-            "--uri", "-u", help="Vehicle, only read from. Default: CFLIB_URI, the profile's."
-        ),
-    ] = None,
-    source: Annotated[
-        str | None,
-        typer.Option("--source", help="Its camera; else the profile's."),
-    ] = None,
+    profile: ProfileOption,
+    uri: UriOption = None,
+    source: SourceOption = None,
     part: Annotated[
         Part | None,
         typer.Option(
@@ -112,11 +101,6 @@ def mount(
     The vehicle is turned in the hand in view of the target (carry), then tilted around the tip of
     its gear (pivot). Its motors are off, and nothing arms.
     """
-    if logs:
-        live = {"--uri": uri, "--source": source, "--view": view or None}
-        for option, value in live.items():
-            if value is not None:
-                raise UsageError(f"--from takes no camera, no vehicle, no page: leave {option} out")
     vehicle = load_profile(profile)
     into = writable_profile(profile) if write else None
     camera = profile_camera(vehicle.camera)
@@ -144,17 +128,13 @@ def mount(
             say(str(error))
     else:
         say("--write puts these numbers into the profile")
-    code = 0 if problem is None else problem.exit_code
-    if not as_json:
-        print(measured.keys_text())
-        return code
     record = measured.record() | {
         "recordings": [str(path) for path in logs],
         "profile": written and str(written),
         "profile_before": before and str(before),
     }
-    print_result(record | ({} if problem is None else {"error": str(problem), "exit_code": code}))
-    return code
+    print_result(with_problem(record, problem) if as_json else measured.keys_text())
+    return 0 if problem is None else problem.exit_code
 
 
 # -- what is refused at once -------------------------------------------
@@ -163,21 +143,21 @@ def mount(
 def _live_sources(
     source: str | None, uri: str | None, profile: Profile, parts: tuple[Part, ...]
 ) -> tuple[str, str | None]:
-    """Return the camera, and the vehicle where the carry needs it (or it was named)."""
+    """Return the camera, and the vehicle if the carry needs it."""
     given = profile.camera.source if source is None else source
     if given.startswith("sim:"):
         raise UsageError(
             f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
         )
     name = parse_source(given)
-    if "carry" not in parts and uri is None:
+    if "carry" not in parts:
         return name.spec, None
     if not name.live:
         raise UsageError(
             f"{name} is a recording, and has not the vehicle's clock: the "
             f"carry needs a live camera; --part pivot needs no vehicle"
         )
-    link_uri = uri if uri is not None else os.environ.get("CFLIB_URI", profile.link.uri)
+    link_uri = profile.link.uri if uri is None else uri
     if check_uri(link_uri) == "sim":
         raise UsageError(f"vehicle {link_uri} {_SIMULATED} with -u; --part pivot needs none")
     return name.spec, link_uri
@@ -213,8 +193,7 @@ def _check_unchanged(name: str, then: Profile) -> None:
     """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
     turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
     now = load_profile(name)
-    rests_on = [(p.camera.mount, p.camera.latency_s, p.vehicle) for p in (now, then)]
-    if rests_on[0] != rests_on[1]:
+    if (now.camera, now.vehicle) != (then.camera, then.vehicle):
         raise InvalidValue(
             f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
             f"rest on what it said before; measure again, with --from"
@@ -242,36 +221,38 @@ def _record_live(
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
         Those of `open_camera`, `MotionLink.connect` and `record_mounting`.
     """
-    start_s = time.monotonic()
-
-    def now() -> float:
-        return time.monotonic() - start_s
-
     recordings: list[MountingRecording] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
-        frames = open_camera(source, now, profile.camera, size_px=camera.size_px, latency_s=0.0)
+        frames = open_camera(
+            source, time.monotonic, profile.camera, size_px=camera.size_px, latency_s=0.0
+        )
         stack.callback(frames.close)
         check_size(frames.size_px, camera, frames.describe())
         sensors: Sensors = (list, lambda now_s: None)
         if uri is not None:
-            sensors = stack.enter_context(_vehicle(uri, profile, now))
+            sensors = stack.enter_context(_vehicle(uri, profile))
         page = stack.enter_context(live_page(camera, "perchctl calibrate mount", view, say))
         stack.callback(_keep, recordings, log)
         for part in parts:
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
-                print("press Enter when it is held so: ", end="", file=sys.stderr, flush=True)
-                sys.stdin.readline()
+                ask("press Enter when it is held so:")
             recording = MountingRecording(part)
             recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)
             if frames.live:
-                frames.poll(now())  # from before
+                frames.poll(time.monotonic())  # from before
             with Stopper().installed() as stop, guide(page) as show:
                 stopped = stop.requested.is_set
                 record_mounting(
-                    recording, frames, reader, show, *sensors, clock=now, stopped=stopped
+                    recording,
+                    frames,
+                    reader,
+                    show,
+                    *sensors,
+                    clock=time.monotonic,
+                    stopped=stopped,
                 )
             if stopped():
                 raise Interrupted("Ctrl-C: nothing was measured")
@@ -279,9 +260,9 @@ def _record_live(
 
 
 @contextlib.contextmanager
-def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[Sensors]:
+def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
     """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors turn."""
-    link = MotionLink(uri, profile.link, now)
+    link = MotionLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri}, to read from it and nothing else")
     link.connect()
 
@@ -294,7 +275,7 @@ def _vehicle(uri: str, profile: Profile, now: Callable[[], float]) -> Iterator[S
         return link.problem(now_s)
 
     with contextlib.closing(link):
-        problem(now())
+        problem(time.monotonic())
         yield link.samples, problem
 
 

@@ -14,6 +14,7 @@ from perchctl.camera import find_cameras
 from perchctl.check import CheckScope, Row, Verdict, scan_rows
 from perchctl.check import check as check_rows
 from perchctl.commands.command_line import (
+    JsonOption,
     ProfileOption,
     SourceOption,
     UriOption,
@@ -29,7 +30,6 @@ from perchctl.errors import (
     NotFound,
     PerchError,
     SafetyAbort,
-    UsageError,
 )
 
 WIDTH = 80
@@ -66,10 +66,7 @@ def check(
         bool,
         typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
     ] = False,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="A list of name, verdict, found and advice on stdout."),
-    ] = False,
+    as_json: JsonOption = False,
 ) -> int:
     """Look at vehicle, camera, computer and profile on the ground, and say what is not fit to fly.
 
@@ -77,11 +74,6 @@ def check(
     no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
     when the camera gives no picture, 52 for any other failing row.
     """
-    given = any(value not in (None, False) for value in (source, lift))
-    if scan and given:
-        raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
-    if cameras and (given or scan or uri is not None):
-        raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
     if cameras:
         return report(camera_rows(), as_json)
     if scan:
@@ -126,21 +118,9 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def table(rows: Sequence[Row], finished: bool = True) -> str:
-    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do.
-
-    Rows that were skipped for one and the same reason share a line. Of a check that did not come
-    to its end nothing good is said.
-    """
-    lines: list[str] = []
-    skipped: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        if row.verdict is Verdict.SKIPPED:
-            skipped.setdefault((row.found, row.advice), []).append(row.name)
-        else:
-            lines += _lines(SHOWN[row.verdict], row.name, row.found, row.advice)
-    for (why, advice), names in skipped.items():
-        name, found = (names[0], why) if len(names) == 1 else ("", f"{', '.join(names)}: {why}")
-        lines += _lines(SHOWN[Verdict.SKIPPED], name, found, advice)
+    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do. Of a
+    check that did not come to its end nothing good is said."""
+    lines = [line for row in rows for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)
     failing = [row.name for row in rows if row.verdict is Verdict.FAIL]
@@ -150,13 +130,13 @@ def table(rows: Sequence[Row], finished: bool = True) -> str:
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
 
 
-def _lines(verdict: str, name: str, found: str, advice: str) -> list[str]:
-    head = f"{verdict}  {name:<{NAME_WIDTH}}"
+def _lines(row: Row) -> list[str]:
+    head = f"{SHOWN[row.verdict]}  {row.name:<{NAME_WIDTH}}"
     margin = " " * len(head)
-    lines = _wrapped(found, head, margin) or [head.rstrip()]
-    if "\n" in advice:  # lines to be copied stay as they are
-        return lines + [f"  {line}" for line in advice.splitlines()]
-    return lines + _wrapped(advice, f"{margin}-> ", f"{margin}   ")
+    lines = _wrapped(row.found, head, margin) or [head.rstrip()]
+    if "\n" in row.advice:  # lines to be copied stay as they are
+        return lines + [f"  {line}" for line in row.advice.splitlines()]
+    return lines + _wrapped(row.advice, f"{margin}-> ", f"{margin}   ")
 
 
 def _wrapped(text: str, first: str, others: str) -> list[str]:

@@ -189,6 +189,13 @@ SourceOption = Annotated[
         "images:DIR, sim:.",
     ),
 ]
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
+        "http://..., aideck://HOST, or a path.",
+    ),
+]
 PositioningOption = Annotated[
     str | None,
     typer.Option(
@@ -196,7 +203,7 @@ PositioningOption = Annotated[
         help="What measures the position: deck, mocap or target; by default the profile's.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
@@ -217,7 +224,7 @@ def main() -> Any:
         return end.exit_code
     finally:
         # A key that is still held down must not end what is over with a traceback.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, lambda _signal, _frame: os._exit(Interrupted.exit_code))
 
 
 @contextlib.contextmanager

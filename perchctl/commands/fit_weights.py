@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from contextlib import closing
 from datetime import UTC, datetime
@@ -19,10 +18,11 @@ from perchctl.commands.command_line import (
     Group,
     JsonOption,
     ProfileOption,
+    SourceOption,
     command,
     new_app,
 )
-from perchctl.commands.output import print_result, say
+from perchctl.commands.output import ask, print_result, say, with_problem
 from perchctl.commands.progress import count_bar
 from perchctl.errors import PerchError, UsageError, no_simulator
 from perchctl.files import check_output, same_file
@@ -93,12 +93,10 @@ def fit(
             f"the interval; take more positions, or write them all the same with --anyway"
         )
         say(str(problem))
-    code = 0 if problem is None else problem.exit_code
     if as_json:
-        failure = {} if problem is None else {"error": str(problem), "exit_code": code}
         written = None if problem or output is None else str(output)
-        print_result(weights_record(result) | {"weights_file": written} | failure)
-    return code
+        print_result(with_problem(weights_record(result) | {"weights_file": written}, problem))
+    return 0 if problem is None else problem.exit_code
 
 
 # --- collect ----------------------------------------------------------
@@ -119,10 +117,7 @@ def collect(
     ] = "typed",
     positions: Annotated[int, typer.Option("--positions", min=2, help="To collect.")] = 10,
     frames: Annotated[int, typer.Option("--frames", min=10, help="At each position.")] = 100,
-    source: Annotated[
-        str | None,
-        typer.Option("--source", help="Camera; else the profile's."),
-    ] = None,
+    source: SourceOption = None,
     target_body: Annotated[
         str, typer.Option("--target-body", help="Rigid body of the target, for --truth mocap.")
     ] = "target",
@@ -176,28 +171,24 @@ def _collect_with_person(
     poses: TypedTruth | MocapTruth,
     source: str | None,
 ) -> None:
-    start_s = time.monotonic()
-
-    def now() -> float:
-        return time.monotonic() - start_s
-
     spec = profile.camera.source if source is None else source
     if spec.startswith("sim:"):
         raise UsageError(
             "the simulator has the truth itself: add --truth sim, or name a real camera "
             "with --source (camera:N, http://..., aideck://HOST)"
         )
-    with closing(open_camera(spec, now, profile.camera, size_px=camera.size_px)) as frame_source:
+    opened = open_camera(spec, time.monotonic, profile.camera, size_px=camera.size_px)
+    with closing(opened) as frame_source:
         experiment = Experiment(
             _open_session(path, frames),
             frame_source,
             profile,
             camera,
             poses,
-            ask=_ask,
+            ask=ask,
             say=say,
             bar=count_bar,
-            now=now,
+            now=time.monotonic,
             wait=time.sleep,
         )
         experiment.run(positions, frames)
@@ -212,13 +203,3 @@ def _open_capture(profile: Profile, target_body: str) -> MocapTruth:
         )
     gear = np.asarray(profile.vehicle.gear_body_m, dtype=np.float64)
     return MocapTruth(open_capture(profile.positioning), profile.positioning, target_body, gear)
-
-
-def _ask(question: str) -> str:
-    """Ask on stderr, as stdout is for the result, and return the answer. Raises EOFError at the end
-    of the input."""
-    print(question, end="", file=sys.stderr, flush=True)
-    line = sys.stdin.readline()
-    if not line:
-        raise EOFError
-    return line.rstrip("\n")

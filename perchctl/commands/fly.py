@@ -17,9 +17,10 @@ import typer
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
-from perchctl.check import Row, Verdict, comparison_rows, profile_rows, warnings_before_flight
+from perchctl.check import Verdict, comparison_rows, profile_rows, warnings_before_flight
 from perchctl.commands.command_line import (
     EXIT_TABLE,
+    JsonOption,
     PositioningOption,
     ProfileOption,
     SourceOption,
@@ -28,13 +29,13 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import draw_unless_interrupted, ignore_signals, signals_to_operator
+from perchctl.commands.interrupt import ignore_signals, interruptible, signals_to_operator
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.profile import picture_edges
 from perchctl.display import (
     FlightPage,
+    FlightPanel,
     live_page,
-    open_panel,
 )
 from perchctl.errors import (
     EXIT_CODES,
@@ -107,9 +108,7 @@ def fly(
         bool, typer.Option("--dry-run", help="Show the resolved plan; connect nothing.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before arming.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object on stdout at the end.")
-    ] = False,
+    as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> int:
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
@@ -153,8 +152,6 @@ def resolve(
     )
     options = replace(options, record=not options.simulated if record is None else record)
     check_options(options)
-    if seed is not None and not options.simulated:
-        say(f"--seed {seed} is of simulated flights: it changes nothing at {options.uri}")
     return options
 
 
@@ -167,13 +164,10 @@ def with_positioning(profile: Profile, by: str | None) -> Profile:
         raise InvalidValue(
             f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
         )
-    own = profile.positioning
-    if by == own.by:
+    if by == profile.positioning.by:
         return profile
-    if by == "mocap" and own.by == "deck":
-        config = own.model_copy(update={"by": by})
-    else:  # what belongs to another kind would be of no use, and puzzle
-        config = PositioningConfig.model_validate({"by": by, "decks": own.decks})
+    # What belongs to another kind would be of no use, and puzzle.
+    config = PositioningConfig.model_validate({"by": by, "decks": profile.positioning.decks})
     return profile.model_copy(update={"positioning": config})
 
 
@@ -195,7 +189,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         simulated_seed,
         options.record,
     )
-    panel = open_panel(stream=sys.stderr)
+    panel = FlightPanel(sys.stderr)
     say(f"connecting to {options.uri}")
     switch, page = OperatorSwitch(), None
     # Once it has landed nothing is left to stop, but much to tell.
@@ -217,7 +211,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         if page is not None:
             page.end(summary, log.path)
     code = exit_code(report.outcome, summary)
-    plot = draw_unless_interrupted(lambda: plot_of(log.path, options.profile))
+    plot = plot_of(log.path, options.profile)
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
     if as_json:
@@ -227,16 +221,17 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
 
 def plot_of(log_path: Path, profile: Profile) -> Path | None:
     """Draw the flight beside its log if the profile asks for it, and return the picture's path.
-    A plot that fails is a warning: the flight is over."""
+    A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
     if not profile.log.plot:
         return None
     from perchctl.analysis import plot_flight
 
     picture = path_beside(log_path, ".png")
     try:
-        plot_flight(read_log(log_path), picture)
-    except Exception as error:
-        say(f"the plot could not be drawn: {error}")
+        with interruptible():
+            plot_flight(read_log(log_path), picture)
+    except (Exception, KeyboardInterrupt) as error:
+        say(f"the plot could not be drawn: {str(error) or 'Ctrl-C'}")
         return None
     return picture
 
@@ -308,6 +303,13 @@ def plan(options: FlyOptions) -> dict[str, Any]:
     """Return what would be flown, fully resolved; nothing is connected."""
     calibration = find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
+    rows = profile_rows(options.profile, source=options.source)
+    compared = comparison_rows(
+        options.profile.positioning,
+        options.uri,
+        datetime.now().astimezone(),
+        simulated=options.simulated,
+    )
     return {
         "uri": options.uri,
         "source": without_password(options.source),
@@ -318,31 +320,15 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "log_directory": str(options.log_dir),
         "record": options.record,
         "profile": profile_record(options.profile),
-        "check": [
-            dataclasses.asdict(row)
-            for row in (
-                *profile_rows(options.profile, source=options.source),
-                *_compared(options),
-            )
-        ],
+        "check": [dataclasses.asdict(row) for row in (*rows, *compared)],
     }
 
 
-def _compared(options: FlyOptions) -> list[Row]:
-    return comparison_rows(
-        options.profile.positioning,
-        options.uri,
-        datetime.now().astimezone(),
-        simulated=options.simulated,
-    )
-
-
 def plan_text(options: FlyOptions) -> str:
-    """Return the plan for people, at 80 columns: what, where, the phases with their numbers, and
-    which values of the profile are implausible."""
+    """Return the plan for people, at 80 columns: what, where, the way, and which values of the
+    profile are implausible."""
     resolved, profile, planner = plan(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
-    search, align, ascend, perch = planner.search, planner.align, planner.ascend, planner.perch
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""
     turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)
     edges = picture_edges(camera.mount, camera.mirrored)
@@ -365,26 +351,12 @@ def plan_text(options: FlyOptions) -> str:
             + (f": picture's {edges[0]} is the front, {edges[1]} the left side" if edges else ""),
         ),
         ("latency", late if isinstance(late, str) else f"{late * 1e3:g} ms"),
-        ("merge", _merge_text(profile)),
-        ("1 APPROACH", f"take off to {planner.takeoff_height_m:g} m"),
+        ("merge", f"{profile.merge.method} {profile.merge.weights_file or ''}".rstrip()),
         (
-            "2 SEARCH",
-            f"{search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m higher each, "
-            f"at most {search.max_height_m:g} m",
+            "way",
+            f"take off to {planner.takeoff_height_m:g} m, search up to "
+            f"{planner.search.max_height_m:g} m, ascend at {planner.ascend.speed_mps:g} m/s",
         ),
-        ("3 ESTIMATE", f"{planner.estimate.dwell_s:g} s of steady pose"),
-        (
-            "4 ALIGN",
-            f"within {align.xy_m * 1e3:g} mm and {align.yaw_deg:g} deg for {align.dwell_s:g} s",
-        ),
-        (
-            "5 ASCEND",
-            f"at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the target, "
-            f"settle within {ascend.settle_xy_m * 1e3:g} mm",
-        ),
-        ("6 PERCH", f"at most {perch.timeout_s:g} s"),
-        ("7 COMPLETE", f"watch for {planner.complete.watch_s:g} s"),
-        ("attempts", f"{planner.attempts}, perching time {planner.perching_time_s:g} s"),
         (
             "limits",
             f"{profile.safety.fence_radius_m:g} m around the place of take-off, "
@@ -418,19 +390,10 @@ def _positioning(options: FlyOptions) -> str:
     if config.by != "mocap":
         return "the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
-    compared = [row.found for row in _compared(options) if row.verdict == Verdict.PASS]
-    capture = f"motion capture {where}, body {config.body!r}"
-    return "; ".join([f"{capture}, {config.send} at most {config.rate_hz:g} Hz", *compared])
+    return (
+        f"motion capture {where}, body {config.body!r}, {config.send} at most {config.rate_hz:g} Hz"
+    )
 
 
 def _mm(place_m: tuple[float, float, float]) -> str:
     return f"{' '.join(mm_text(part) for part in place_m)} mm"
-
-
-def _merge_text(profile: Profile) -> str:
-    """Return how the markers are merged; of weights also where they are from."""
-    merge = profile.merge
-    if merge.method != "weights":
-        return "joint solve"
-    numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
-    return f"weights {numbers} ({merge.weights_file or 'of the profile'})"

@@ -8,10 +8,8 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import FrameType
 
-from perchctl.commands.output import say
 from perchctl.flight import OperatorSwitch
 
 Handler = Callable[[int, FrameType | None], None]
@@ -26,9 +24,6 @@ _NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
 @contextlib.contextmanager
 def signals_to(handler: Handler) -> Iterator[None]:
     """Hand SIGINT and SIGTERM to `handler` during the block (main thread only)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     old = {name: signal.signal(name, handler) for name in SIGNALS}
     try:
         yield
@@ -45,9 +40,6 @@ def signals_to_operator(switch: OperatorSwitch, report: Callable[[str], None]) -
     once, so they count while the main thread hangs in a library. A hang-up that is ignored
     already (nohup) stays ignored. `report` prints a line.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def handler(_signal: int, _frame: FrameType | None) -> None:
         switch.leave()
@@ -86,17 +78,6 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if switch.listening and signal.SIGTSTP in numbers:
             # Not from this thread: a terminal that stands still would hold up the signals.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
-
-
-def draw_unless_interrupted(draw: Callable[[], Path | None]) -> Path | None:
-    """Return what `draw` does, the path of a picture or None; None too if Ctrl-C or SIGTERM ends
-    it: a picture comes after the result, and does not take its place."""
-    try:
-        with interruptible():
-            return draw()
-    except KeyboardInterrupt:
-        say("Ctrl-C: the plot is not drawn; the result stands")
-        return None
 
 
 @contextlib.contextmanager

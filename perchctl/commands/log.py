@@ -26,8 +26,8 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.output import print_result, say
-from perchctl.errors import ReplayDiffers, UsageError
-from perchctl.files import check_output, same_file, write_files
+from perchctl.errors import ReplayDiffers
+from perchctl.files import check_output, write_files
 from perchctl.profile import Profile, changed_profile, load_profile
 from perchctl.record import (
     FlightLog,
@@ -37,11 +37,11 @@ from perchctl.record import (
     recorded_pictures,
 )
 
-FORMATS = (".png", ".pdf", ".svg")
-FILMS = (".mp4", ".gif")
-DRAWN_IN = "what plots are drawn in"
-EXPORTS = (".csv",)
-PAGE_SUFFIXES = (".html", ".htm")
+PLOTS = ((".png", ".pdf", ".svg"), "what plots are drawn in")
+FILMS = ((".mp4", ".gif"), "what films are made in")
+EXPORTS = ((".csv",), "what a log is exported to")
+PAGES = ((".html", ".htm"), "a page for a browser")
+"""The suffixes of what is written, the default first, and what they are."""
 
 LogArgument = Annotated[
     Path | None,
@@ -64,6 +64,14 @@ def _log_file(place: Path | None) -> Path:
     (newest,) = newest_logs(folder, 1)
     say(f"the newest log: {newest}")
     return newest
+
+
+def _place(log: Path, output: Path | None, kind: tuple[tuple[str, ...], str], force: bool) -> Path:
+    """Return where to write: `output`, by default beside the log. Errors: InvalidValue."""
+    suffixes, content = kind
+    place = output or path_beside(log, suffixes[0])
+    check_output(place, suffixes, force, content)
+    return place
 
 
 @contextlib.contextmanager
@@ -115,9 +123,8 @@ def plot(
 ) -> None:
     """Draw a flight: detections, lost frames, height, battery, the last seconds."""
     path = _log_file(file)
-    picture = output or path_beside(path, ".png")
     with _opened(path) as log:
-        check_output(picture, FORMATS, force, DRAWN_IN)
+        picture = _place(path, output, PLOTS, force)
     from perchctl.analysis import plot_flight
 
     plot_flight(log, picture)
@@ -158,8 +165,7 @@ def export(
 ) -> None:
     """Write a log as a table that other programs open."""
     path = _log_file(file)
-    place = output or path_beside(path, ".csv")
-    check_output(place, EXPORTS, force, "what a log is exported to")
+    place = _place(path, output, EXPORTS, force)
     with _opened(path) as log:
         table = log.csv()
     write_files({place: table.encode("utf-8", errors="backslashreplace")})
@@ -240,24 +246,13 @@ def report(
     as_json: JsonOption = False,
 ) -> None:
     """Write one page that tells the flight, or several, in sentences and plots."""
-    logs: list[Path] = []
-    for path in map(_log_file, files or (None,)):
-        if any(path == known or same_file(path, known) for known in logs):
-            say(f"{path} is named twice: it is on the page once")
-        else:
-            logs.append(path)
-    one = path_beside(logs[0], PAGE_SUFFIXES[0])
-    output = output or (one if len(logs) == 1 else logs[0].with_name("session.html"))
-    if any(same_file(output, path) for path in logs):
-        raise UsageError(f"{output} is one of the logs; write the page to another file")
-    check_output(output, PAGE_SUFFIXES, force, "a page for a browser")
-    page = write_report(logs, output, with_film)
-    if as_json:
-        size = output.stat().st_size
-        print_result({"report": str(output), "bytes": size, "flights": page.record()})
-    else:
-        print(output)
-        say(page.counts_text)
+    logs = [_log_file(file) for file in files or (None,)]
+    if output is None and len(logs) > 1:
+        output = logs[0].with_name("session.html")
+    place = _place(logs[0], output, PAGES, force)
+    page = write_report(logs, place, with_film)
+    say(page.counts_text)
+    print_result({"report": str(place), "flights": page.record()} if as_json else place)
 
 
 @command(
@@ -287,11 +282,8 @@ def film(
     The camera's picture needs the recording beside the log (fly --record).
     """
     path = _log_file(file)
-    place = output or path_beside(path, ".mp4")
-    check_output(place, FILMS, force, "what films are made in")
+    place = _place(path, output, FILMS, force)
     is_recorded = path_beside(path, ".mcap").is_file()
-    if not is_recorded:
-        say(f"there is no recording beside {path}: the film has no camera picture")
     with _opened(path) as log:
         flight = FlightAnalysis(log)
     from perchctl.analysis import write_film

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from perchctl.errors import PerchError
+
 
 def say(sentence: str) -> None:
     """Print one sentence on stderr, as stdout is for the result. Never raises."""
@@ -35,18 +37,29 @@ def drop_stream(stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def ask(question: str) -> str:
+    """Return the line that somebody types. The question goes to stderr, as stdout is for the
+    result. Raises EOFError at the end of the input."""
+    print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
+    return input()
+
+
 def ask_to_confirm(question: str) -> bool:
     """Return True if somebody at the terminal says yes now: what was typed before the question
     appeared is no answer to it."""
     with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
-    # On stderr: stdout is for the result.
-    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
-        answer = input()
+        return ask(f"{question} [y/N]").strip().lower() in ("y", "yes")
     except EOFError:
         return False
-    return answer.strip().lower() in ("y", "yes")
+
+
+def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
+    """Return a command's one object, with what kept it from its end."""
+    if problem is None:
+        return dict(record)
+    return {**record, "error": str(problem), "exit_code": problem.exit_code}
 
 
 def print_result(result: Mapping[str, Any] | Sequence[Any] | str | Path) -> None:

@@ -8,12 +8,12 @@ import json
 import math
 import re
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from perchctl.analysis import profile_differences
 from perchctl.calibration import load_calibration
 from perchctl.camera import (
     parse_source,
@@ -29,7 +29,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import print_lines, print_result, say
+from perchctl.commands.output import ask, print_lines, print_result, say
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
 from perchctl.geometry import Array
@@ -138,14 +138,6 @@ OVER_THE_CEILING_M = 0.4
 FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
 """The search goes up to where the ceiling is that near, or to `LOW_SEARCH_M` where that is
 higher and there is room."""
-AIDECK_KEYS = (
-    "kalman.drift_mps2",
-    "kalman.n_max",
-    "planner.ascend.settle_xy_m",
-    "planner.ascend.fresh_s",
-    "safety.max_frame_age_s",
-)
-"""What an AI-deck's few and late pictures need besides: as the shipped profile has it."""
 SHOWN_KEYS = (
     "target.large.dictionary",
     "target.large.id",
@@ -161,10 +153,6 @@ HEAD = """\
 # it means (unit, what is allowed). Body axes: x forward, y left, z up, from the
 # vehicle's centre. A key that is not here has its default; all of them:
 #   perchctl profile -p {name}
-# An editor that knows YAML schemas completes keys and shows what they mean with
-#   perchctl profile schema > perchctl.schema.json
-# beside this file, and here in a line of its own, behind a #:
-#   yaml-language-server: $schema=perchctl.schema.json
 
 """
 
@@ -229,8 +217,6 @@ def new(
 def default_answer(name: str, answers: Answers) -> str:
     """Return what Enter stands for, after the answers to the questions before."""
     uri, source = answers.get("link.uri", ""), answers.get("camera.source", "")
-    if name == "link.uri" and source == "sim:":  # no other vehicle flies by those pictures
-        return SIMULATED
     if name == "camera.source" and uri.startswith(SIMULATED):
         return "sim:"
     if name == "camera.calibration" and _is_aideck(source):
@@ -277,10 +263,8 @@ def ask_person(given: Answers) -> Answers:
 
 
 def _typed(question: str) -> str:
-    # On stderr: stdout is for the result.
-    print(f"{question} ", end="", file=sys.stderr, flush=True)
     try:
-        return input().strip()
+        return ask(question).strip()
     except EOFError:
         raise UsageError(
             "there is nobody to ask, and nothing was written: answer by --set, or add "
@@ -351,15 +335,15 @@ def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
         derived["description"] = f"a vehicle at {uri}, its camera at {without_password(source)}"
         derived["camera.readout_s"] = 0.0 if source.startswith("sim:") else None
         derived["link.parameters"] = {"stabilizer.estimator": 2}
-    if _is_aideck(source):
-        shipped = load_profile("aideck")
-        derived |= {path: profile_value(shipped, path) for path in AIDECK_KEYS}
+    # An AI-deck's few and late pictures need more than their calibration.
+    base = load_profile("aideck") if _is_aideck(source) else Profile()
+    shipped = profile_differences(*(p.model_dump(mode="json") for p in (Profile(), base)))
     settings = {key: json.dumps(value) for key, value in derived.items()}
     for key, text in texts.items():
         is_text = isinstance(profile_value(Profile(), key), str)
         settings[key] = json.dumps(text) if is_text else text
-    profile = changed_profile(Profile(), [f"{key}={text}" for key, text in settings.items()])
-    return profile, {*settings, *SHOWN_KEYS} - {"name"}
+    profile = changed_profile(base, [f"{key}={text}" for key, text in settings.items()])
+    return profile, {*settings, *shipped, *SHOWN_KEYS} - {"name"}
 
 
 def _mount_keys(answers: Answers) -> dict[str, Any]:

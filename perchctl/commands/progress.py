@@ -1,12 +1,10 @@
-"""What a person sees while a command works: bars of progress on stderr, on a terminal only (in a
-pipe or a file nothing, or of campaigns a line now and then), and the guide of a measurement by
-hand, as rows with bars on terminal and page."""
+"""What a person sees while a command works: bars of progress on stderr, on a terminal only, and the
+guide of a measurement by hand, as rows with bars on terminal and page."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -28,10 +26,8 @@ from rich.text import Text
 from perchctl.calibration import GuidedFrame
 from perchctl.display import LivePage, Sketch
 
-_REFRESH_HZ = 4
 _WHOLE_RUN_S = 1e6
 """Over which the time left is estimated: in rich's own 30 s no flight may have ended."""
-LINE_S = 10.0
 
 
 class Ended(Protocol):
@@ -43,36 +39,23 @@ class Ended(Protocol):
 
 @contextlib.contextmanager
 def progress_bar(
-    total: int,
-    stream: TextIO | None = None,
-    earlier: Iterable[Ended] = (),
-    clock: Callable[[], float] = time.monotonic,
+    total: int, earlier: Iterable[Ended] = (), stream: TextIO | None = None
 ) -> Iterator[Callable[[Ended], None]]:
-    """Yield the function to call with each finished flight: a line of 80 columns that changes
-    on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
-    stream = stream or sys.stderr
+    """Yield the function to call with each finished flight. `earlier`: flown before."""
     ends = Counter(result.outcome for result in earlier)
-    printed_s = clock()
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
     with _bar("flights", *columns, total=total, stream=stream, width=8) as update:
-        update(completed=ends.total(), description=_counted(ends))
+
+        def show() -> None:
+            counted = " ".join(f"{n} {end}" for end, n in ends.items())
+            update(completed=ends.total(), description=counted)
 
         def advance(result: Ended) -> None:
-            nonlocal printed_s
             ends[result.outcome] += 1
-            flown, text = ends.total(), _counted(ends)
-            update(completed=flown, description=text)
-            if stream.isatty() or flown >= total or clock() - printed_s < LINE_S:
-                return
-            printed_s = clock()
-            with contextlib.suppress(OSError, ValueError):  # nobody reads any more
-                print(f"perchctl: flown {flown} of {total} {text}", file=stream, flush=True)
+            show()
 
+        show()
         yield advance
-
-
-def _counted(ends: Counter[str]) -> str:
-    return " ".join(f"{n} {end}" for end, n in ends.items())
 
 
 @contextlib.contextmanager
@@ -109,7 +92,6 @@ def _bar(
         MofNCompleteColumn(),
         *more,
         console=console,
-        refresh_per_second=_REFRESH_HZ,
         redirect_stdout=False,
         speed_estimate_period=_WHOLE_RUN_S,
     ) as progress:
@@ -146,8 +128,7 @@ def guide(
                 line = f"perchctl: {guided.line}"
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
             if page is not None:
-                sketch = Sketch(guided.image, guided.outlines)
-                page.show(guided.index, sketch)
+                page.show(Sketch(guided.image, guided.outlines))
                 page.set_state(lambda: page_state(guided))
 
         yield show

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,7 +20,7 @@ import typer
 # By their packages, whose names load as they are used: the help needs no simulator.
 from perchctl import campaign as campaigns
 from perchctl import faults as fault_campaigns
-from perchctl.analysis import FlightAnalysis, profile_differences, show_text
+from perchctl.analysis import profile_differences
 from perchctl.commands.command_line import (
     ForceOption,
     Group,
@@ -30,32 +30,26 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.fly import plot_of, with_positioning
+from perchctl.commands.fly import with_positioning
 from perchctl.commands.interrupt import signals_to
-from perchctl.commands.output import print_result, say
+from perchctl.commands.output import print_result, say, with_problem
 from perchctl.commands.progress import progress_bar
 from perchctl.errors import (
     Interrupted,
-    InvalidValue,
     PerchError,
     UsageError,
     no_cluster,
     no_simulator,
 )
 from perchctl.profile import Profile, load_profile
-from perchctl.record import read_log, to_exact
 
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
 _NO_DIFFERENCE = ("name", "description", "date")
 
 
-FlightsOption = Annotated[
-    int | None, typer.Option("-n", "--flights", min=1, help="How many; 10 by default.")
-]
-SeedOption = Annotated[
-    int | None, typer.Option("--seed", min=0, help="Of the first flight; 0 by default.")
-]
+FlightsOption = Annotated[int, typer.Option("-n", "--flights", min=1, help="How many.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Of the first flight.")]
 JobsOption = Annotated[
     int | None, typer.Option("--jobs", "-j", min=1, help="Flights at a time; 1 by default.")
 ]
@@ -73,18 +67,14 @@ app = new_app(Group)
 @command(
     app,
     "perchctl simulate -n 100 --jobs 4",
-    "perchctl simulate --only 17 --log-dir logs",
+    "perchctl simulate -n 1 --seed 17 --log-dir logs",
     "perchctl simulate --faults all -n 1000 --jobs 4 --out flown.jsonl",
 )
 def run(
-    flights: FlightsOption = None,
-    seed: SeedOption = None,
+    flights: FlightsOption = 10,
+    seed: SeedOption = 0,
     jobs: JobsOption = None,
     profile: ProfileOption = "sim",
-    only: Annotated[
-        int | None,
-        typer.Option("--only", min=0, help="One flight, of this seed, told in full and logged."),
-    ] = None,
     faults: Annotated[
         str | None,
         typer.Option(
@@ -124,26 +114,17 @@ def run(
     _require_simulator()
     if faults == "list":
         return _list_faults(as_json)
-    if only is not None and (flights is not None or seed is not None):
-        raise UsageError(
-            f"--only {only} repeats the one flight of seed {only}: leave out -n and --seed"
-        )
-    if record and log_dir is None and only is None:
+    if record and log_dir is None:
         raise UsageError(
             "--record concerns the logs of the flights: name their folder with --log-dir"
         )
     if resume and out is None:
         raise UsageError("--resume goes on with a file of results: name it with --out")
-    if out is not None and out.suffix != ".jsonl":
-        raise InvalidValue(f"{out} must end in .jsonl: a result is one line of JSON")
     flown = with_positioning(load_profile(profile), positioning)
-    if only is not None:
-        flights, seed = 1, only
-        log_dir = log_dir or Path(flown.log.directory)
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
-    seeds = _seeds(flights, seed)
-    executor = executor_of(jobs, cluster, [flown])
+    seeds = range(seed, seed + flights)
+    flyers = executor_of(jobs, cluster, [flown], flights)
     if faults is None:
         names = None
         campaign = _Campaign(
@@ -163,9 +144,6 @@ def run(
         )
 
     def report(results: list[Any], problem: PerchError | None) -> None:
-        if only is not None:
-            _report_one(results[0], flown, as_json)
-            return
         figures = with_problem(campaign.summary(results), problem) if as_json else None
         print_result(figures or campaign.table(results))
         say_where_logs_are(results, log_dir)
@@ -187,7 +165,7 @@ def run(
             lambda executor, note: campaigns.fly_all(campaign.fly, kept.left, executor, note),
             report,
             len(seeds),
-            executor,
+            flyers,
             kept.earlier,
             kept.note,
             campaign.objection,
@@ -221,8 +199,8 @@ def compare(
         str,
         typer.Argument(metavar="PROFILE_B", help="B, by name or path."),
     ],
-    flights: FlightsOption = None,
-    seed: SeedOption = None,
+    flights: FlightsOption = 10,
+    seed: SeedOption = 0,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
     positioning: PositioningOption = None,
@@ -248,7 +226,7 @@ def compare(
         if not keys:
             print("the profiles do not differ")
 
-    return _fly_by_each(profiles, _seeds(flights, seed), jobs, cluster, report)
+    return _fly_by_each(profiles, range(seed, seed + flights), jobs, cluster, report)
 
 
 @command(
@@ -263,8 +241,8 @@ def sweep(
         typer.Argument(metavar="KEY=VALUE,VALUE", help="A key of the profile with its values."),
     ],
     profile: ProfileOption = "sim",
-    flights: FlightsOption = None,
-    seed: SeedOption = None,
+    flights: FlightsOption = 10,
+    seed: SeedOption = 0,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
     positioning: PositioningOption = None,
@@ -273,14 +251,12 @@ def sweep(
     """Fly the same seeds with several values of a profile's key: which is the best."""
     _require_simulator()
     asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
-    seeds, cells = _seeds(flights, seed), len(asked.profiles)
-    say(f"{cells} cells of {len(seeds)} seeds are {cells * len(seeds)} flights")
 
     def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
         record = asked.record(results)
         print_result(with_problem(record, problem) if as_json else asked.text(record))
 
-    return _fly_by_each(asked.profiles, seeds, jobs, cluster, report)
+    return _fly_by_each(asked.profiles, range(seed, seed + flights), jobs, cluster, report)
 
 
 def _fly_by_each(
@@ -295,7 +271,7 @@ def _fly_by_each(
             lambda executor, note: campaigns.fly_variants(profiles, seeds, executor, note),
             report,
             len(profiles) * len(seeds),
-            executor_of(jobs, cluster, profiles),
+            executor_of(jobs, cluster, profiles, len(profiles) * len(seeds)),
         )
 
 
@@ -305,22 +281,16 @@ def _require_simulator() -> None:
         raise no_simulator()
 
 
-def _seeds(flights: int | None, first: int | None) -> list[int]:
-    return list(range(first or 0, (first or 0) + (flights or 10)))
-
-
 # --- Who flies, and how it may end ------------------------------------
 
 
-ExecutorOf = Callable[[int], AbstractContextManager[Executor]]
-"""Who flies so many flights."""
-
-
-def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profile]) -> ExecutorOf:
+def executor_of(
+    jobs: int | None, cluster: str | None, profiles: Sequence[Profile], flights: int
+) -> AbstractContextManager[Executor]:
     """Return who flies: processes of this computer, or the workers of a cluster. `profiles`: with
     the files that flights read. Errors: UsageError."""
     if cluster is None:
-        return lambda flights: campaigns.flight_processes(max(1, min(jobs or 1, flights)))
+        return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
         raise UsageError(
             f"--cluster {cluster} flies as many at a time as it has workers: --jobs {jobs} does "
@@ -328,25 +298,19 @@ def executor_of(jobs: int | None, cluster: str | None, profiles: Sequence[Profil
         )
     if find_spec("distributed") is None:
         raise no_cluster()
-
-    @contextlib.contextmanager
-    def workers(_flights: int) -> Iterator[Executor]:
-        try:
-            with campaigns.defer_interrupts():
-                from perchctl.campaign import cluster_pool
-        except ImportError as error:
-            raise no_cluster(str(error)) from error
-        with cluster_pool(cluster, profiles) as pool:
-            yield pool
-
-    return workers
+    try:
+        with campaigns.defer_interrupts():
+            from perchctl.campaign import cluster_pool
+    except ImportError as error:
+        raise no_cluster(str(error)) from error
+    return cluster_pool(cluster, profiles)
 
 
 def fly_each(
     campaign: Callable[[Executor, Callable[[Any], None]], object],
     report: Callable[[list[Any], PerchError | None], None],
     total: int,
-    executor_of: ExecutorOf,
+    flyers: AbstractContextManager[Executor],
     earlier: Sequence[Any] = (),
     keep: Callable[[Any], None] = lambda result: None,
     objection: Callable[[list[Any]], PerchError | None] = lambda results: None,
@@ -354,7 +318,7 @@ def fly_each(
     """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
     by Ctrl-C, or when a flight fails. Returns the exit code.
 
-    `campaign` gets who flies, and the function to call with each result; `report` gets the
+    `campaign` gets who flies and the function to call with each result; `report` gets the
     results, and why not all were flown. `earlier`: those that were flown before, which count, too;
     `keep` writes each of the others. `objection`: what all of them together amount to. Errors:
     PerchError if none was flown.
@@ -365,8 +329,8 @@ def fly_each(
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            executor_of(total - len(results)) as executor,
-            progress_bar(total, earlier=list(results)) as advance,
+            flyers as executor,
+            progress_bar(total, list(results)) as advance,
         ):
             begun = True
 
@@ -416,13 +380,6 @@ def stop_handler(
 # --- What is printed --------------------------------------------------
 
 
-def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
-    """Return the one object of `--json`, with why not all were flown."""
-    if problem is None:
-        return dict(record)
-    return {**record, "error": str(problem), "exit_code": problem.exit_code}
-
-
 def say_where_logs_are(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
     """Print on stderr where the logs are, and what they lack."""
     if log_dir is None or not results:
@@ -431,31 +388,6 @@ def say_where_logs_are(results: Sequence[campaigns.CampaignFlight], log_dir: Pat
     problems = [result.log_problem for result in results if result.log_problem is not None]
     if problems:
         say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
-
-
-def _report_one(
-    result: campaigns.FlightResult | fault_campaigns.FaultResult, profile: Profile, as_json: bool
-) -> None:
-    """Print the one flight of `--only`, with its fault if there is one, and draw its plot."""
-    known = asdict(result)
-    has_log = result.log is not None and result.log.exists()
-    if not as_json and isinstance(result, fault_campaigns.FaultResult):
-        print("\n".join(f"{name:<18} {value}" for name, value in known.items()), flush=True)
-    elif not as_json and result.log is not None and has_log:
-        print(
-            f"{show_text(FlightAnalysis(read_log(result.log)))}\nlog:       {result.log}",
-            flush=True,
-        )
-    elif not as_json:
-        print(f"{result.outcome.upper()}: {result.reason}", flush=True)
-    plot = None
-    if result.log is not None and has_log:
-        with contextlib.suppress(KeyboardInterrupt):  # the flight is reported all the same
-            plot = plot_of(result.log, profile)
-    if as_json:
-        print_result(to_exact({**known, "plot": plot}))
-    elif plot is not None:
-        print(f"plot:      {plot}")
 
 
 def _list_faults(as_json: bool) -> int:

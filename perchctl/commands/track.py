@@ -37,7 +37,9 @@ from perchctl.camera import (
     without_password,
 )
 from perchctl.commands.command_line import (
+    JsonOption,
     ProfileOption,
+    SourceArgument,
     ViewOption,
     command,
     new_app,
@@ -51,7 +53,6 @@ from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.perception import Perception
 from perchctl.places import is_shipped_example
 from perchctl.profile import Profile, find_calibration, load_profile
-from perchctl.target import PrintCheck
 from perchctl.vision import (
     MARKERS,
     CameraModel,
@@ -62,8 +63,6 @@ from perchctl.vision import (
     make_pipeline,
 )
 
-STILLS_HZ = 1.0
-"""Of files of pictures that do not belong together: so each can be looked at on the page."""
 POLL_S = 0.002
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
@@ -80,13 +79,7 @@ app = new_app()
     "perchctl track 'images:pictures/*.png' --json",
 )
 def track(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="camera:N or its name, rtsp://..., http://..., aideck://HOST, video:FILE, "
-            "images:DIR (or a pattern), or a path."
-        ),
-    ],
+    source: SourceArgument,
     profile: ProfileOption = "sim",
     calibration: Annotated[
         Path | None,
@@ -94,15 +87,7 @@ def track(
             "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
         ),
     ] = None,
-    stills: Annotated[
-        bool | None,
-        typer.Option(
-            "--stills/--video",
-            help="Each picture alone, no window, no filter, as files of pictures are tracked; or "
-            "all as one video's, files at 30 Hz.",
-        ),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
+    as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> None:
     """Find the target in a camera, video or pictures, without a vehicle.
@@ -117,66 +102,47 @@ def track(
     """
     flown = load_profile(profile)
     source = parse_source(source).spec
-    if stills is None:  # files of pictures need not belong together
-        stills = source.startswith("images:")
     file = find_calibration(str(calibration or flown.camera.calibration))
     lines = as_json or not view
     start_s = time.monotonic()
-
-    def now() -> float:
-        return time.monotonic() - start_s
-
     stop, summary = Stopper(), TrackSummary()
     with contextlib.ExitStack() as stack:
         camera = load_calibration(file)
-        pictures_hz = STILLS_HZ if stills else None
-        opened = open_camera(
-            source, now, flown.camera, size_px=camera.size_px, pictures_hz=pictures_hz
-        )
+        opened = open_camera(source, time.monotonic, flown.camera, size_px=camera.size_px)
         stack.callback(opened.close)
         recording = opened.inner if isinstance(opened, WrappedSource) else opened
         paths: Sequence[Path] = ()
         count = None
         if isinstance(recording, Recording):
             paths, count = recording.paths, recording.count
-        is_example = is_shipped_example(file)
-        ending = (
-            ", the shipped example: give your camera's with --calibration" if is_example else ""
-        )
-        say(f"calibration: {file.name}{ending}")
-        prints = PrintCheck(camera, flown.target)
-        tracker = Tracker(flown, camera, live=opened.live, stills=stills)
+        advice = ", the shipped example: give your camera's with --calibration"
+        say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
+        # Files of pictures need not belong together.
+        tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
         stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
         page = stack.enter_context(live_page(camera, title, view, say))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
-        first: tuple[float, float] | None = None  # times of the first frame and of now
-        for frame in frames(opened, now, stop):
+        for frame in frames(opened, time.monotonic, stop):
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
             for tracked in tracker.results(frame, name):
                 summary.add(tracked)
-                prints.add(tracked.output)
                 if lines:
                     line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
                     # A live result is worth nothing late.
                     print(line, flush=opened.live)
                 if page is not None:
                     sketch = sketch_of(tracked.picture, tracked.output, flown.target.large.side_m)
-                    page.show(frame.index, sketch)
+                    page.show(sketch)
                     page.set_state(partial(track_state, tracked))
             advance()
-            if page is not None and not opened.live:  # a recording is watched at its own pace
-                first = first or (frame.t_s, now())
-                stop.requested.wait(max(0.0, frame.t_s - first[0] - (now() - first[1])))
-        ended_s = now()
+        took_s = time.monotonic() - start_s
         if summary.frames == 0 and not stop.requested.is_set():
             raise NotFound(f"{opened.describe()} gave no frame at all")
-    say(summary.text(ended_s))
-    if prints.judged and not is_example:  # another lens would say something of its own
-        say(prints.verdict()[1])
+    say(summary.text(took_s))
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was printed is complete")
 
@@ -264,7 +230,7 @@ class Tracker:
             return [Tracked(name, frame, notes=about)]
         results = []
         for picture, output in self._perception.look(frame):
-            self._target = camera_pose(output, not self._stills, self._target)
+            self._target = camera_pose(output, self._target)
             notes = (*about, *self._notes(output))
             results.append(Tracked(name, picture, output, self._target, notes))
         return results
@@ -280,45 +246,24 @@ class Tracker:
             yield _DISAGREE
 
 
-def camera_pose(
-    output: PipelineOutput, filtered: bool, before: CameraPose | None
-) -> CameraPose | None:
+def camera_pose(output: PipelineOutput, before: CameraPose | None) -> CameraPose | None:
     """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
-    are one; None without a target.
-
-    `filtered` False takes the pose as measured. `before` is the last target: its tilt is kept
-    while the filter predicts.
-    """
-    target = output.target
+    are one; None without a target. `before` is the last target: its tilt is kept while the filter
+    predicts."""
+    target, poses = output.target, output.poses
     if target is None:
         return None
-    pose, is_whole = _measured_pose(output, target.stage.value)
-    if pose is not None and is_whole and not filtered:
-        R = _rotation(pose.rvec_rad)
-        return CameraPose(pose.rvec_rad, pose.tvec_m, yaw_of(R), pose.sigma_m, pose.sigma_yaw_rad)
-    known = pose or before
+    stage = target.stage.value
+    known: MarkerPose | CameraPose | None = poses.get("joint" if stage == "both" else stage, before)
+    if stage == "both" and "joint" not in poses:
+        known = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
     if known is None:
         return None
     # The filter holds position and yaw; the tilt is the picture's own.
-    R = _rotation(known.rvec_rad)
+    R = np.asarray(cv2.Rodrigues(known.rvec_rad)[0], dtype=np.float64)
     R = rot_z(target.e_yaw_rad - yaw_of(R)) @ R
     rvec = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
     return CameraPose(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
-
-
-def _measured_pose(output: PipelineOutput, stage: str) -> tuple[MarkerPose | None, bool]:
-    """Return the pose that the target rests on, and whether it alone makes the target."""
-    poses = output.poses
-    if stage != "both":
-        return poses.get(stage), True
-    if "joint" in poses:
-        return poses["joint"], True
-    surest = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
-    return surest, False
-
-
-def _rotation(rvec: Array) -> Array:
-    return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
 # --- What is printed --------------------------------------------------

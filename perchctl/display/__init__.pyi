@@ -3,5 +3,4 @@ from .live import Sketch as Sketch
 from .live import live_page as live_page
 from .live import sketch_of as sketch_of
 from .page import FlightPage as FlightPage
-from .panel import open_panel as open_panel
-from .panel import timed_event_text as timed_event_text
+from .panel import FlightPanel as FlightPanel

@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import hmac
 import json
+import math
 import secrets
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -30,10 +30,9 @@ from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput, project
 
 JPEG_QUALITY = 80
 WAIT_S = 0.5
-READS_S, LAST_READ_S = 2.5, 2.0
-"""A reader that asked so recently is waited for so long at the end, until it has the last state."""
-_RATE_FRAMES = 30  # over which the frame rate is taken
-_RATE_STALE_S = 1.0
+READS_S, LAST_READ_S = 2.5, 1.0
+"""A reader that asked so recently is given so long at the end to read the last state."""
+_PICTURE_STALE_S = 1.0
 
 
 class LivePage:
@@ -66,14 +65,12 @@ class LivePage:
         self._drawing = threading.Lock()
         self._sketch: Sketch | None = None
         self._number = 0
-        self._frame: int | None = None
-        self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
+        self._picture_s = -math.inf
         self._jpeg: tuple[int, bytes] | None = None
         self._describe: Callable[[], dict[str, Any]] = dict
         self._state_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
         self._card: dict[str, Any] | None = None
-        self._card_read = False
         self._server = PageServer(self)
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/?token={self.token}"
         self._thread = threading.Thread(
@@ -86,12 +83,10 @@ class LivePage:
 
     # --- for the loop: neither waits nor raises ------------------------------
 
-    def show(self, frame: int, sketch: Sketch) -> None:
-        """Show this picture from now on; the same `frame` again replaces it."""
+    def show(self, sketch: Sketch) -> None:
+        """Show this picture from now on."""
         with self._changed:
-            if frame != self._frame:
-                self._times.append(self._clock())
-            self._frame, self._sketch = frame, sketch
+            self._picture_s, self._sketch = self._clock(), sketch
             self._number += 1
             self._changed.notify_all()
 
@@ -102,21 +97,21 @@ class LivePage:
         self._state_s = self._clock() if live else None
 
     def end(self, card: dict[str, Any]) -> None:
-        """Show how it ended: the last picture and numbers stay, with this card. Waits, bounded,
-        until a reader that is there has it."""
+        """Show how it ended: the last picture and numbers stay, with this card. Waits for a second
+        if somebody looks, so that they get it."""
         with self._changed:
             self._card, self._state_s = card, None
             read_s = self._read_s
             if read_s is not None and self._clock() - read_s < READS_S:
-                self._changed.wait_for(lambda: self._card_read or self.closed, LAST_READ_S)
+                self._changed.wait_for(lambda: self.closed, LAST_READ_S)
 
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
-        0..1; note, phase, battery, over), and title, rate_hz, stop (``none``, ``ready``,
-        ``requested``, ``over``), age_s of these numbers (None where no others are due), card
-        (`end`'s, or None)."""
+        0..1; note, phase, battery, over), and title, fresh (whether pictures come), stop
+        (``none``, ``ready``, ``requested``, ``over``), age_s of these numbers (None where no
+        others are due), card (`end`'s, or None)."""
         try:
             described = self._describe()
         except Exception as error:
@@ -128,27 +123,16 @@ class LivePage:
             stop = "over"
         else:
             stop = "requested" if self._stop_requested else "ready"
-        fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
-        state_s, card = self._state_s, self._card
-        fixed["age_s"] = None if state_s is None else round(max(0.0, self._clock() - state_s), 2)
-        fixed["card"] = card
-        self._read_s = self._clock()
-        return described | fixed | {"page_problem": self.problem}
-
-    def was_read(self, state: dict[str, Any]) -> None:
-        """Note that this state has reached a reader."""
-        if state.get("card") is not None:
-            with self._changed:
-                self._card_read = True
-                self._changed.notify_all()
-
-    def rate_hz(self) -> float:
-        """Return the frames a second, 0 if none has come for a second."""
-        with self._changed:
-            times, now_s = list(self._times), self._clock()
-        if len(times) < 2 or now_s - times[-1] > _RATE_STALE_S or times[-1] <= times[0]:
-            return 0.0
-        return (len(times) - 1) / (times[-1] - times[0])
+        now_s, state_s = self._clock(), self._state_s
+        self._read_s = now_s
+        return described | {
+            "title": self.title,
+            "fresh": now_s - self._picture_s < _PICTURE_STALE_S,
+            "stop": stop,
+            "age_s": None if state_s is None else round(max(0.0, now_s - state_s), 2),
+            "card": self._card,
+            "page_problem": self.problem,
+        }
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
         """Return the newest picture, drawn, if it is newer than `number`. None if none came for a
@@ -167,11 +151,6 @@ class LivePage:
                     return None
                 self._jpeg = (newest, jpeg.tobytes())
             return self._jpeg
-
-    def pause(self, seconds: float) -> bool:
-        """Wait, less when the page closes; return True when it has."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self.closed, seconds)
 
     def may_stop(self, token: str) -> bool:
         given, own = token.encode("utf-8", "replace"), self.token.encode()
@@ -275,9 +254,8 @@ class _Handler(BaseHTTPRequestHandler):
             case "/":
                 self._send_page()
             case "/state":
-                state = self.server.page.state()
-                self._send(200, "application/json", json.dumps(state).encode())
-                self.server.page.was_read(state)
+                state = json.dumps(self.server.page.state())
+                self._send(200, "application/json", state.encode())
             case "/stream":
                 self._send_stream()
             case _:
@@ -329,7 +307,7 @@ class _Handler(BaseHTTPRequestHandler):
             head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             # The next boundary goes out with the picture, or a browser shows it one late.
             self.wfile.write(head.encode() + jpeg + f"\r\n--{_BOUNDARY}\r\n".encode())
-            page.pause(LEAST_PERIOD_S)
+            time.sleep(LEAST_PERIOD_S)
 
     def _refuse(self, status: int, why: str) -> None:
         self._send(status, "text/plain; charset=utf-8", f"{why}\n".encode())
@@ -396,40 +374,25 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, large_side_m: float) 
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
-    """Return the picture in colour (blue, green, red), (h, w, 3) uint8."""
+    """Return the picture in colour (blue, green, red), (h, w, 3) uint8. A line that leaves the
+    picture by far, and axes with a tip behind the camera, are left out."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:
-        if not np.isfinite(corners).all() or np.abs(corners).max() > _FAR_PX:
-            continue
-        colour = _OUTLINE.get(name, _OTHER)
-        cv2.polylines(
-            picture, [_fixed(corners)], True, colour, 1, cv2.LINE_AA, shift=_SUBPIXEL_BITS
-        )
-        # The first corner, so that the marker's turn can be read.
-        x, y = (int(v) for v in _fixed(corners[:1])[0])
-        cv2.circle(picture, (x, y), 3 << _SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        _draw_line(picture, np.vstack([corners, corners[:1]]), _OUTLINE.get(name, _OTHER), 1)
     if sketch.pose is not None:
-        _draw_axes(picture, *sketch.pose, camera)
+        rvec, tvec, length_m = sketch.pose
+        ends = np.vstack([np.zeros(3), np.eye(3) * length_m])
+        depth = (ends @ np.asarray(cv2.Rodrigues(rvec)[0]).T + tvec)[:, 2]
+        if (depth > 1e-3).all():
+            points = project(ends, rvec, tvec, camera)
+            for tip, colour in zip(points[1:], _AXES, strict=True):
+                _draw_line(picture, np.vstack([points[0], tip]), colour, 2)
     return picture
 
 
-def _draw_axes(
-    picture: NDArray[np.uint8], rvec: Array, tvec: Array, length_m: float, camera: CameraModel
+def _draw_line(
+    picture: NDArray[np.uint8], points_px: Array, colour: tuple[int, int, int], width: int
 ) -> None:
-    ends = np.vstack([np.zeros(3), np.eye(3) * length_m])
-    depth = (ends @ np.asarray(cv2.Rodrigues(rvec)[0]).T + tvec)[:, 2]
-    if not (depth > 1e-3).all():
-        return  # a tip behind the camera has no place in the picture
-    points = project(ends, rvec, tvec, camera)
-    if not np.isfinite(points).all() or np.abs(points).max() > _FAR_PX:
-        return
-    fixed = _fixed(points)
-    start = (int(fixed[0, 0]), int(fixed[0, 1]))
-    for end, colour in zip(fixed[1:], _AXES, strict=True):
-        tip = (int(end[0]), int(end[1]))
-        cv2.line(picture, start, tip, colour, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _fixed(points_px: Array) -> NDArray[np.int32]:
-    """Return pixels as OpenCV's drawing takes them with `shift`."""
-    return np.rint(points_px * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+    if np.abs(points_px).max() < _FAR_PX:  # and so no number is missing
+        fixed = np.rint(points_px * (1 << _SUBPIXEL_BITS)).astype(np.int32)
+        cv2.polylines(picture, [fixed], False, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -49,7 +49,7 @@ class FlightPage:
             frame = self._frame
             if frame is not None:
                 self._frame = None
-                self.page.show(frame.index, sketch_of(frame, tick.output, self._side_m))
+                self.page.show(sketch_of(frame, tick.output, self._side_m))
             describe = partial(flight_state, tick, self._drawn)
             self.page.set_state(describe, live=not tick.state.phase.is_over)
         except Exception as error:
@@ -82,7 +82,7 @@ class FlightPage:
     def _seen(self, frame: Frame) -> None:
         self._frame = frame
         if not self._flying:  # no ticks yet that would show it
-            self.page.show(frame.index, Sketch(frame.image))
+            self.page.show(Sketch(frame.image))
 
 
 def flight_state(tick: Tick, drawn: dict[str, float]) -> dict[str, Any]:
@@ -94,13 +94,11 @@ def flight_state(tick: Tick, drawn: dict[str, float]) -> dict[str, Any]:
         (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])
     )
     ground_m = state.ground_m[2] if state.ground_m else 0.0
-    mirrored = tick.output is not None and tick.output.detections.mirrored
-    seen = "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
     return {
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
         "rows": [list(row) for row in status_rows(tick) if row[0] != "phase"],
-        "note": f"held: {state.hold}" if state.hold else seen,
+        "note": f"held: {state.hold}" if state.hold else "",
         "over": state.phase.is_over,
         "steps": STEPS,
         "height_m": tick.telemetry.position_m[2] - ground_m,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import threading
@@ -88,11 +89,6 @@ def event_text(event: Event) -> str:
     return f"{text} (simulated: {event.simulated})" if event.simulated else text
 
 
-def timed_event_text(event: Event, start_s: float) -> str:
-    """Return an event's line with the time since the start."""
-    return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
-
-
 # --- The live display: a panel on a terminal, one plain line an event elsewhere ---
 # The flight loop only leaves its newest tick and its events here; a thread of
 # the display's own draws them. So neither an exception nor a terminal that stands
@@ -109,57 +105,20 @@ panel is drawn a line too low, with a piece of the last one left above it."""
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
 
 
-class PlainSurface:
-    """Draws one line an event, and nothing else. All its methods may raise; the display calls
-    them from its own thread only."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def line(self, text: str) -> None:
-        """Write the line of an event."""
-        self._stream.write(text + "\n")
-        self._stream.flush()
-
-    def show(self, tick: Tick) -> None:
-        """Show the numbers of a tick: not here."""
-
-    def close(self) -> None:
-        """Give the terminal back."""
-
-
-class PanelSurface(PlainSurface):
-    """Draws a panel that stays at the bottom of the terminal; events scroll above it."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        # stdout is for data and is left alone; what others write on stderr goes above the panel.
-        self._live = Live(
-            console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True
-        )
-        self._live.start()
-
-    def line(self, text: str) -> None:
-        self._console.print(Text(text), soft_wrap=True)
-
-    def show(self, tick: Tick) -> None:
-        self._live.update(panel(tick), refresh=True)
-
-    def close(self) -> None:
-        self._live.stop()
-
-
 class FlightPanel:
-    """The display, as a watcher of the flight loop. No method raises or waits, but `close`
-    (bounded). A display that fails is no reason to land: `problem` is always None, `failure`
-    says why it fell silent.
+    """The display, as a watcher of the flight loop: on a terminal a panel below the events'
+    lines, elsewhere the lines alone. No method raises or waits, but `close` (bounded). A display
+    that fails is no reason to land: `problem` is always None, `failure` says why it fell silent.
     """
 
     problem: str | None = None
 
-    def __init__(self, surface: PlainSurface) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self.failure: str | None = None
-        self._surface = surface
+        self._stream = stream
+        self._live: Live | None = None
+        if stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
+            self._live = _new_live(stream)
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._lines: deque[str] = deque(maxlen=EVENTS_KEPT)
@@ -167,32 +126,23 @@ class FlightPanel:
         self._drawn: Tick | None = None
         self._start_s: float | None = None
         self._next_s = -math.inf
-        self._phase = self._shown = ""  # as a line has it, and as the panel has it
         self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
         self._thread.start()
 
     def tick(self, tick: Tick) -> None:
         """Show this tick of the loop: at once if the phase is a new one, or 0.1 s after the last
         one that was shown, or as the last one of all."""
-        if self.failure is not None:
-            return
-        self._tick, phase = tick, tick.state.phase.value
-        if phase != self._phase:  # a change without an event
-            self._line(tick.t_s, f"{phase}: {tick.state.reason}")
-            self._phase = phase
-        elif phase == self._shown and tick.t_s < self._next_s:
-            return
-        self._shown = phase
-        self._next_s = tick.t_s + PERIOD_S
-        self._wake.set()
+        is_new = self._tick is None or self._tick.state.phase is not tick.state.phase
+        self._tick = tick
+        if is_new or tick.t_s >= self._next_s:
+            self._next_s = tick.t_s + PERIOD_S
+            self._wake.set()
 
     def event(self, event: Event) -> None:
         """Write the line of an event, at once."""
-        if self.failure is not None:
-            return
-        if event.kind is EventKind.PHASE and event.phase is not None:
-            self._phase = event.phase.value
-        self._line(event.t_s, event_text(event))
+        if self._start_s is None:
+            self._start_s = event.t_s
+        self._lines.append(f"[{event.t_s - self._start_s:7.2f} s] {event_text(event)}")
         self._wake.set()
 
     def close(self) -> None:
@@ -201,43 +151,34 @@ class FlightPanel:
         self._wake.set()
         self._thread.join(CLOSE_TIMEOUT_S)
 
-    def _line(self, t_s: float, text: str) -> None:
-        if self._start_s is None:
-            self._start_s = t_s
-        self._lines.append(f"[{t_s - self._start_s:7.2f} s] {text}")
-
     def _draw(self) -> None:
         try:
-            while True:
-                self._wake.wait()
-                self._wake.clear()
-                closing = self._closing.is_set()  # before the last look, so that it is the last
+            with self._live or contextlib.nullcontext():
+                while not self._closing.is_set():
+                    self._wake.wait()
+                    self._wake.clear()
+                    self._draw_once()
+                    self._closing.wait(PERIOD_S)  # in lockstep the loop's time runs faster
                 self._draw_once()
-                if closing:
-                    break
-                self._closing.wait(PERIOD_S)  # in lockstep the loop's time runs faster
-            self._surface.close()
         except Exception as error:
             self.failure = f"the display fell silent: {error.__class__.__name__}: {error}"
-            try:
-                self._surface.close()
-            except Exception:
-                return
 
     def _draw_once(self) -> None:
         while self._lines:
-            self._surface.line(self._lines.popleft())
+            line = self._lines.popleft()
+            if self._live is not None:
+                self._live.console.print(Text(line), soft_wrap=True)
+            else:
+                self._stream.write(line + "\n")
+                self._stream.flush()
         tick = self._tick
-        if tick is not None and tick is not self._drawn:
+        if self._live is not None and tick is not None and tick is not self._drawn:
             self._drawn = tick
-            self._surface.show(tick)
+            self._live.update(panel(tick), refresh=True)
 
 
-def open_panel(stream: TextIO) -> FlightPanel:
-    """Start the display: a panel if the stream is a terminal, plain lines if not. NO_COLOR takes
-    the colours away."""
-    if not stream.isatty() or os.environ.get("TERM") in ("dumb", "unknown"):
-        return FlightPanel(PlainSurface(stream))
+def _new_live(stream: TextIO) -> Live:
+    """Return a panel that stays at the bottom of the terminal. NO_COLOR takes the colours away."""
     console = Console(
         file=stream,
         force_terminal=True,
@@ -245,7 +186,8 @@ def open_panel(stream: TextIO) -> FlightPanel:
         markup=False,
         emoji=False,
     )
-    return FlightPanel(PanelSurface(console))
+    # stdout is for data and is left alone; what others write on stderr goes above the panel.
+    return Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True)
 
 
 def panel(tick: Tick) -> Panel:

@@ -155,7 +155,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
         raise InvalidValue(
             f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
             f"({mm_text(magnet_m)} mm), so the gear could touch where no magnet is: at most "
-            f"--small {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g}mm, or a larger --magnet"
+            f"{math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g} mm, or a larger --magnet"
         )
     for kind, marker in (("large", large), ("small", small)):
         if _cells_apart(marker, marker, turns=(1, 2, 3)) == 0:
@@ -173,8 +173,8 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
     for name in MARKERS:
         if name not in seen:
             raise InvalidValue(
-                f"the {name} marker cannot be read from this drawing: take a smaller --small, or "
-                f"a --large-id that is white in the middle, such as 997 of DICT_4X4_1000"
+                f"the {name} marker cannot be read from this drawing: take a smaller small one, or "
+                f"an id of the large one that is white in the middle, as 997 of DICT_4X4_1000"
             )
 
 

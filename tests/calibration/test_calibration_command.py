@@ -142,7 +142,6 @@ def test_pictures_that_will_not_do_are_refused(
         ([], 2),
         (["images:/nowhere"], 20),
         (["images:.", "-b", "chess:9x6"], 30),
-        (["images:.", "--model", "cubic"], 2),
         (["images:.", "--view"], 2),
         (["images:.", "--size", "640x480"], 2),
         (["check", "no.yaml", "images:."], 20),
@@ -174,19 +173,16 @@ def test_convert(tmp_path: Path) -> None:
     assert camera.model == "fisheye"
     assert camera.dist.tolist() == [0.01, 0.02, -0.01, 0.002]
     refused(calibrate("convert", kalibr, "-o", output), 30, "--force")
-    same = calibrate("convert", output, "-o", output, "--force")
-    refused(same, 2, "is the file to convert")
 
 
 def test_a_mask(tmp_path: Path) -> None:
     write_turned_about(tmp_path / "turned")
     words = ("mask", f"images:{tmp_path / 'turned'}", "-o", tmp_path / "gear.png")
-    result = calibrate(*words, "--json")
+    result = calibrate(*words)
     assert result.exit_code == 0, result.output
     image = cv2.imread(str(tmp_path / "gear.png"), cv2.IMREAD_UNCHANGED)
     assert image is not None
     assert set(np.unique(image)) == {0, 255}
     assert image.shape == SIZE_PX[::-1]
-    told = json.loads(result.stdout)
-    assert told["covered"] == pytest.approx(float((image > 0).mean()), abs=1e-3)
+    assert f"covers {100 * (image > 0).mean():.1f} %" in result.stderr
     refused(calibrate(*words), 30, "--force")

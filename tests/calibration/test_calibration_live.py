@@ -142,7 +142,7 @@ def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
     output.parent.mkdir()
     output.write_text("mine")
     with contextlib.closing(LivePage(draw_camera(np.random.default_rng(0)), "camera")) as page:
-        page.show(0, Sketch(np.zeros((48, 64), np.uint8)))
+        page.show(Sketch(np.zeros((48, 64), np.uint8)))
         url = page.url.replace("/?", "/stream?")
         sentence = refused(calibrate(url), 30)
         assert "camera_64x48.yaml exists already; add --force" in sentence

@@ -87,8 +87,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["-p", "mine.yaml", "--from", "no.jsonl"], 20, ["no.jsonl"]),
         (["-p", "mine.yaml", "--from", "mine.yaml"], 30, ["mine.yaml", "line 1"]),
         (["-p", "mine.yaml", "--from", "."], 30, ["."]),
-        (["-p", "mine.yaml", "--from", "x.jsonl", "-u", "usb://0"], 2, ["--uri"]),
-        (["-p", "mine.yaml", "--from", "x.jsonl", "--view"], 2, ["--view"]),
         (["-p", "crazyflie", "--write"], 30, ["shipped", "cp ", "-p my_"]),
         (["-p", "mine.yaml", "--board", "chessboard:9x6:25mm"], 2, ["--board"]),
     ],
@@ -177,6 +175,28 @@ def test_the_pivot_alone_leaves_the_turn_open(place: Path, logs: dict[str, Path]
     assert list(record["profile_values"]) == ["vehicle.gear_body_m"]
 
 
+@pytest.mark.parametrize("changed", ["camera: {latency_s: measured}", None])
+def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
+    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, changed: str | None
+) -> None:
+    """A gear by the old turn beside a new one would be a gear in another place. The numbers are
+    printed all the same, also where the profile (None) is gone."""
+    mine, text = Path("mine.yaml"), f"extends: crazyflie\n{changed}\n"
+    mine.write_text("extends: crazyflie\n", encoding="utf-8")
+    solved = calibrate_mount.solve_mounting
+
+    def long_work(*given: Any) -> Any:
+        mine.unlink() if changed is None else mine.write_text(text, encoding="utf-8")
+        return solved(*given)
+
+    monkeypatch.setattr(calibrate_mount, "solve_mounting", long_work)
+    result = mount("-p", "mine.yaml", "--from", str(logs["pivot"]), "--write")
+    assert result.exit_code == (20 if changed is None else 30), result.stderr
+    assert result.stdout.startswith("vehicle.gear_body_m: [")
+    if changed is not None:
+        assert mine.read_text(encoding="utf-8") == text
+
+
 def test_numbers_that_cannot_be_written_are_still_reported(
     place: Path, logs: dict[str, Path]
 ) -> None:
@@ -188,28 +208,6 @@ def test_numbers_that_cannot_be_written_are_still_reported(
     assert "write them yourself: vehicle.gear_body_m: [" in result.stderr
     assert result.stdout.startswith("vehicle.gear_body_m: [")
     assert Path("odd.yaml").read_text(encoding="utf-8") == odd
-
-
-def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
-    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A gear by the old turn beside a new one would be a gear in another place. The numbers are
-    printed all the same."""
-    mine, text = Path("mine.yaml"), "extends: crazyflie\ncamera: {mount: {rpy_deg: [0, 0, 90]}}\n"
-    solved = calibrate_mount.solve_mounting
-
-    def long_work(*given: Any) -> MountingReport:
-        mine.write_text(text, encoding="utf-8")
-        return solved(*given)
-
-    monkeypatch.setattr(calibrate_mount, "solve_mounting", long_work)
-    words = ["-p", "mine.yaml", "--from", str(logs["both"]), "--part", "pivot", "--write"]
-    result = mount(*words)
-    assert result.exit_code == 30, result.stderr
-    assert result.stdout.startswith("vehicle.gear_body_m: [")
-    assert not Path("mine.yaml.bak").exists()
-    assert mine.read_text(encoding="utf-8") == text
-    assert "changed meanwhile, and nothing is written" in result.stderr
 
 
 def test_the_carry_alone_says_what_was_written() -> None:

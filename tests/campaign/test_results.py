@@ -111,9 +111,7 @@ def test_progress_is_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("COLUMNS", "80")
     terminal = Terminal()
     earlier = [LANDED] * 12 + [ABORTED] * 3 + [PERCHED] * 900
-    now_s = [0.0]
-    with progress_bar(1000, terminal, earlier, lambda: now_s[0]) as advance:
-        now_s[0] = 60.0
+    with progress_bar(1000, earlier, terminal) as advance:
         for _ in range(10):
             advance(PERCHED)
     lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue()))

@@ -17,7 +17,15 @@ def stops() -> list[str]:
 
 
 @pytest.fixture
-def page(stops: list[str]) -> Iterator[LivePage]:
-    served = LivePage(camera(), "perchctl test", on_stop=lambda: stops.append("STOP"))
+def clock() -> list[float]:
+    """The page's time, s."""
+    return [50.0]
+
+
+@pytest.fixture
+def page(stops: list[str], clock: list[float]) -> Iterator[LivePage]:
+    served = LivePage(
+        camera(), "perchctl test", on_stop=lambda: stops.append("STOP"), clock=lambda: clock[0]
+    )
     yield served
     served.close()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.live import TOKEN_HEADER, is_loopback
+from perchctl.display.live import TOKEN_HEADER, draw_sketch, is_loopback
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.recording import camera
 
@@ -36,7 +36,7 @@ def test_the_state_is_the_newest(page: LivePage) -> None:
     assert state["note"] == "mirrored"
     assert state["title"] == "perchctl test"
     assert state["stop"] == "ready"
-    assert state["rate_hz"] == 0.0
+    assert state["fresh"] is False
 
 
 @contextmanager
@@ -62,7 +62,7 @@ def read_part(stream: http.client.HTTPResponse) -> np.ndarray[Any, Any]:
 def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
     grey = np.full((480, 640), 90, np.uint8)
     pose = (np.array([np.pi, 0.0, 0.0]), np.array([0.0, 0.0, 0.5]), 0.075)
-    page.show(0, Sketch(grey, (("large", CORNERS),), pose))
+    page.show(Sketch(grey, (("large", CORNERS),), pose))
     with streaming(page) as answer:
         assert answer.getheader("Content-Type", "").startswith("multipart/x-mixed-replace")
         drawn = read_part(answer).astype(int)
@@ -70,11 +70,18 @@ def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
         assert np.abs(drawn[150, 250:350] - 90).max() > 50  # the outline's upper side
         assert np.abs(drawn[100, 250:350] - 90).max() < 10
         assert grey.min() == grey.max() == 90  # the loop's picture is left alone
-        page.show(1, Sketch(np.full((480, 640), 200, np.uint8)))
+        page.show(Sketch(np.full((480, 640), 200, np.uint8)))
         assert read_part(answer).mean() == pytest.approx(200.0, abs=2.0)
         page.close()  # ends a stream that waits
         while answer.read1(4096):
             pass
+
+
+def test_an_axis_behind_the_camera_and_a_wild_corner_are_left_out() -> None:
+    image = np.full((480, 640), 110, np.uint8)
+    pose = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.2]), 0.075)
+    wild = (("large", np.full((4, 2), 1e9)), ("small", np.full((4, 2), np.nan)))
+    assert (draw_sketch(Sketch(image, wild, pose), camera()) == 110).all()
 
 
 def test_without_stop_there_is_none() -> None:
@@ -86,23 +93,13 @@ def test_without_stop_there_is_none() -> None:
         page.close()
 
 
-def test_the_page_looks_by_itself_at_the_age_of_what_it_shows(page: LivePage) -> None:
-    """Whatever hangs, its script is the browser's: a timer, answers that are not waited for
-    without end, and a STOP that is ready again at a program that was gone."""
-    script = page._server.html.partition("<script")[2]
-    for part in ("setInterval(watch", "AbortSignal.timeout ?", "known = stop;"):
-        assert part in script
-    assert script.count("...within(") == 2
-    assert 'showStop(silent ? known : "gone")' in script
-
-
 def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
     def broken() -> dict[str, Any]:
         raise RuntimeError("no words")
 
     page.set_state(broken)
     assert json.loads(ask(page.url, "/state")[1])["page_problem"] == "RuntimeError: no words"
-    page.show(0, Sketch(np.zeros((2, 2, 2), np.uint8)))  # cannot be drawn
+    page.show(Sketch(np.zeros((2, 2, 2), np.uint8)))  # cannot be drawn
     assert b"image/jpeg" not in ask(page.url, "/stream")[1]
     assert page.problem is not None
     assert ask(page.url)[0] == 200

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,23 +31,9 @@ from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.live_page import CORNERS, ask, stop, tick
 from tests.helpers.mission import entered, note
-from tests.helpers.recording import camera
 
 START_S = 100.0
 OVER = [Phase.PERCHED, Phase.LANDED, Phase.ABORTED]
-
-
-@pytest.fixture
-def clock() -> list[float]:
-    """The page's time, s."""
-    return [50.0]
-
-
-@pytest.fixture
-def page(clock: list[float]) -> Iterator[LivePage]:
-    served = LivePage(camera(), "perchctl test", on_stop=lambda: None, clock=lambda: clock[0])
-    yield served
-    served.close()
 
 
 def state_of(page: LivePage) -> dict[str, Any]:
@@ -66,13 +51,11 @@ def seen_in(frame: Frame) -> PipelineOutput:
 
 
 def one_frame(frame: Frame) -> Any:
-    """A live source that gives this frame and is then silent."""
+    """A source that gives this frame and is then silent."""
     left = [frame]
     return SimpleNamespace(
-        live=True, finished=False, size_px=(640, 480), close=left.clear,
-        poll=lambda now_s: left.pop() if left else None, problem=lambda now_s: "silent",
-        describe=lambda: "one frame",
-    )  # fmt: skip
+        poll=lambda now_s: left.pop() if left else None, problem=lambda now_s: "silent"
+    )
 
 
 # --- what it shows ---------------------------------------------------------------------------
@@ -205,18 +188,15 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     assert "report" in dict(rows)
 
 
-def test_nobody_is_waited_for_where_nobody_looks(page: LivePage) -> None:
-    page.end({"outcome": "LANDED"})  # returns at once: no reader would ever wake it
+def test_only_who_looks_is_waited_for(page: LivePage) -> None:
+    page.end({"outcome": "LANDED"})  # returns at once
     state = state_of(page)
     assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
-
-
-def test_who_looks_gets_the_card_before_the_page_goes(page: LivePage) -> None:
-    state_of(page)
-    thread = threading.Thread(target=page.end, args=({"outcome": "LANDED"},))
+    thread = threading.Thread(target=page.end, args=({"outcome": "ABORTED"},))
     thread.start()
-    while state_of(page)["card"] is None:
+    while state_of(page)["card"] != {"outcome": "ABORTED"}:
         pass
+    assert thread.is_alive()
     thread.join(5.0)
     assert not thread.is_alive()
 

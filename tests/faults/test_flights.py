@@ -333,21 +333,6 @@ def simulate(*arguments: str) -> Any:
     return CliRunner().invoke(app, ["simulate", "-p", SHORT, *arguments])
 
 
-LOW = ("--faults", "low-bare-ceiling,hang-up")
-
-
-@pytest.mark.long
-def test_one_seed_is_told_with_its_fault_log_and_plot(tmp_path: Path) -> None:
-    done = simulate(*LOW, "--only", str(SEED), "--json", "--log-dir", str(tmp_path))
-    assert done.exit_code == 0
-    said = json.loads(done.stdout)
-    assert (said["seed"], said["fault"]) == (SEED, "low-bare-ceiling")
-    assert said["way"][0] == "APPROACH"
-    for key, suffix in (("log", ".jsonl"), ("plot", ".png")):
-        assert said[key] == str(tmp_path / f"flight_seed{SEED}{suffix}")
-        assert Path(said[key]).exists()
-
-
 def test_the_command_lists_and_refuses() -> None:
     listed = simulate("--faults", "list")
     assert listed.exit_code == 0

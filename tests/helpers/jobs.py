@@ -34,7 +34,7 @@ def campaign(
         fly_all(fly, range(flights), executor, noted)
 
     with signals_to(stop_handler()):
-        return fly_each(flown, report, flights, executor_of(jobs, cluster, []))
+        return fly_each(flown, report, flights, executor_of(jobs, cluster, [], flights))
 
 
 if __name__ == "__main__":

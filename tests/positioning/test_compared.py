@@ -198,10 +198,10 @@ def test_fly_refuses_before_it_asks_connects_or_logs(
     assert "perchctl check --lift" in last
     assert "connecting" not in done.stderr
     assert not (tmp_path / "logs").exists()
-    plan = " ".join(fly(tmp_path, "--dry-run").stdout.split())
+    plan = fly(tmp_path, "--dry-run", "--json").stdout
     assert "fly refuses" in plan
     assert words in plan
     was_compared(CONFIG, URI, ago_s=3600.0)
-    plan = " ".join(fly(tmp_path, "--dry-run").stdout.split())
+    plan = fly(tmp_path, "--dry-run", "--json").stdout
     assert "compared by hand on" in plan
     assert "fly refuses" not in plan

@@ -23,11 +23,11 @@ from tests.target.rig import target_of
 
 REFUSED = {
     "magnet too small": (target_of(small=("DICT_ARUCO_ORIGINAL", 5, 36.0)), 0.05,
-                         "at most --small 35.3mm"),
+                         "at most 35.3 mm"),
     "magnet too large": (target_of(), 0.16, "does not fit behind the large marker"),
     "small too large": (target_of(small=("DICT_ARUCO_ORIGINAL", 5, 35.0)), 0.05,
                         "the large marker cannot be read from this drawing: take a smaller "
-                        "--small"),
+                        "small one"),
     "black centre": (target_of(("DICT_4X4_50", 1, 150.0), ("DICT_ARUCO_ORIGINAL", 5, 30.0)), 0.05,
                      "cannot be read .*white in the middle"),
     "centre too fine": (target_of(("DICT_6X6_250", 19, 120.0), ("DICT_5X5_50", 7, 20.0)), 0.05,

@@ -246,12 +246,7 @@ def test_a_design_writes_nothing() -> None:
 
 
 REFUSALS = [
-    (["--large", "150"], 30, "has no unit; write 150mm"),
-    (["--large", "1mm"], 30, "outside of 4 mm"),
-    (["--small", "80mm"], 30, "less than half"),
-    (["--large-id", "5000"], 30, "--large-id, --large-dict: id 5000 is outside"),
-    (["--large-dict", "DICT_4X4_50"], 2, "needs --large-id"),
-    (["--small", "36mm"], 30, "diagonal"),
+    (["--magnet", "20"], 30, "has no unit; write 20mm"),
     (["--magnet", "20mm"], 30, "not inside the magnet"),
     (["--page", "150x150mm"], 30, "--page a4 holds it"),
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
@@ -266,7 +261,7 @@ REFUSALS = [
     (["design", "--blur", "-1"], 2, "--blur"),
     (["design", "--ceiling", "nan"], 2, "--ceiling"),
     (["measured", "-p", "m.yaml"], 2, "nothing was measured"),
-    (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 2, "-p my_vehicle.yaml"),
+    (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 30, "is shipped with perchctl"),
     (["measured", "--measured-large", "149.6", "-p", "m.yaml"], 20, "m.yaml does not exist"),
 ]  # fmt: skip
 
@@ -293,16 +288,12 @@ PROFILES = {
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> None:
+def test_a_profile_is_changed_in_place_and_its_old_text_kept(name: str) -> None:
     path = Path("mine.yaml")
     path.write_text(PROFILES[name])
     before = load_profile("./mine.yaml")
     words = ("measured", "-p", "mine.yaml", *MEASURED)
-    _, err = call(*words, code=30)
-    assert "--force" in err
-    assert path.read_text() == PROFILES[name]
-    out, err = call(*words, "--force")
-    assert "mine.yaml.bak" in out + err
+    assert "mine.yaml.bak" in call(*words)[0]
     after = load_profile("./mine.yaml")
     assert (after.target.large.side_m, after.target.small.side_m) == (0.1496, 0.0249)
     assert after.target.size_sigma == 0.001
@@ -311,20 +302,18 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     assert "keep" in path.read_text()
     assert files() == {"mine.yaml", "mine.yaml.bak"}
     assert Path("mine.yaml.bak").read_text() == PROFILES[name]
-    call(*words, "--force")
-    assert files() == {"mine.yaml", "mine.yaml.bak"}, "nothing changed, and nothing is kept twice"
 
 
 def test_a_scaled_page_and_a_marker_that_was_not_measured_are_noticed() -> None:
     Path("m.yaml").write_text("extends: crazyflie\n")
     for size, said in (("0.1496", "measure what is black, in mm"), ("150in", "unit 'in'")):
-        _, err = call("measured", "--measured-large", size, "-p", "m.yaml", "--force", code=30)
+        _, err = call("measured", "--measured-large", size, "-p", "m.yaml", code=30)
         assert said in err
         assert Path("m.yaml").read_text() == "extends: crazyflie\n"
-    out, _ = call("measured", "-p", "m.yaml", "--measured-small", "25.1", "--force")
+    out, _ = call("measured", "-p", "m.yaml", "--measured-small", "25.1")
     assert "measure both markers" in out
     assert load_profile("./m.yaml").target.size_sigma == 0.005
-    words = ("--measured-large", "145.5", "--measured-small", "24.25", "--force")
+    words = ("--measured-large", "145.5", "--measured-small", "24.25")
     out, _ = call("measured", "-p", "m.yaml", *words)
     assert "was the page scaled" in out
     assert "small against large: " in out
