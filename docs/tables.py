@@ -24,7 +24,6 @@ if str(ROOT) not in sys.path:
 from perchctl.camera import FrameSource  # noqa: E402
 from perchctl.errors import EXIT_CODES  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
-from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.lander import DESCENTS  # noqa: E402
@@ -201,11 +200,6 @@ def expected_outcomes() -> str:
     return "\n".join([*head, *rows])
 
 
-def promises() -> str:
-    rows = [f"| {promise.what} | {promise.happens} |" for promise in PROMISES.values()]
-    return "\n".join(["| what | what happens |", "|---|---|", *rows])
-
-
 def manoeuvres() -> str:
     """A row for each evidence."""
     rows = [f"| {e.value} | {free.value} | {held.value} |" for e, (free, held) in DESCENTS.items()]
@@ -282,7 +276,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "log-fields": log_fields,
     "exit-codes": exit_codes,
     "expected-outcomes": expected_outcomes,
-    "promises": promises,
 }
 
 

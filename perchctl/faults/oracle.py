@@ -401,7 +401,6 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
 }
 """The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
-HELD_ELSEWHERE = "held-elsewhere"
 """The transitions of flights whose end the program does not know: whether the vehicle hangs or
 stands, and whether it came down at all."""
 RESCUE_CLAIMS: dict[Finding, Claims] = {
