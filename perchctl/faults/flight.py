@@ -20,7 +20,7 @@ from perchctl.faults.edges import (
     PlantedError,
     ProgramKilled,
 )
-from perchctl.faults.expected_outcomes import unexpected
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES, unexpected
 from perchctl.faults.oracle import (
     REFUSAL_CLAIMS,
     Oracle,
@@ -29,7 +29,7 @@ from perchctl.faults.oracle import (
     claims_of_rescue,
     last_row,
 )
-from perchctl.faults.results import End, FaultResult
+from perchctl.faults.results import FaultResult
 from perchctl.faults.truth import (
     DescentBound,
     FactsRecorder,
@@ -55,7 +55,7 @@ from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
 LONGEST_FLIGHT_S = 240.0
-END_OF: dict[Phase, End] = {
+END_OF = {
     Phase.PERCHED: "perched",
     Phase.LANDED: "landed",
     Phase.ABORTED: "aborted",
@@ -145,7 +145,7 @@ class FaultyFlight:
         """Give the claims of a rescue's note to the oracle."""
         self._oracle.claims(claims_of_rescue(event), event.t_s)
 
-    def _mission(self) -> tuple[End, str, FlightReport | None]:
+    def _mission(self) -> tuple[str, str, FlightReport | None]:
         """Run the program under test. Returns its end, what it said, and its report."""
         try:
             report = fly(self._parts)
@@ -215,11 +215,10 @@ class FaultyFlight:
         return delay_s is not None and delay_s <= self._profile.safety.proof_age_s
 
     def _result(
-        self, end: End, reason: str, report: FlightReport | None, end_s: float
+        self, end: str, reason: str, report: FlightReport | None, end_s: float
     ) -> FaultResult:
         case, oracle, facts = self._case, self._oracle, self._recorder.facts
         facts.killed_s, facts.stop_s = self._clock.killed_s, oracle.stop_s
-        listed = case.fault.expected
         hanging = oracle.newest is not None and oracle.newest.hanging
         perched = report is not None and report.phase is Phase.PERCHED and hanging
         result = FaultResult(
@@ -232,13 +231,13 @@ class FaultyFlight:
             outcome=end,
             reason=reason,
             flags=oracle.flags,
-            counted=unexpected(oracle.flags, listed, facts),
+            counted=unexpected(oracle.flags, facts),
             time_s=end_s,
             miss_m=self._vehicle.world.gear_miss_m() if perched else None,
             drop_m=oracle.drop_m,
             way=() if report is None else tuple(x.phase.value for x in report.history if x.phase),
             row="" if report is None else last_row(report),
-            expected=tuple(each.name for each in listed if each.cause(facts) is not None),
+            expected=tuple(x.name for x in EXPECTED_OUTCOMES if x.cause(facts) is not None),
             astray_m=oracle.astray_m,
         )
         if self._log is not None:

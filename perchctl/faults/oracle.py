@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
 
@@ -31,19 +31,20 @@ Claim = Literal[
 ]
 """A claim of hanging or standing includes that the motors are off. `not seen down` claims that
 no telemetry has shown the vehicle at rest with its motors off."""
-Flag = Literal[
-    "crashed",
-    "fell",
-    "slid",
-    "flies_on",
-    "endless",
-    "stop_not_obeyed",
-    "pressed",
-    "strayed",
-    "lied",
-    "locked_needlessly",
-]
-FLAGS: tuple[Flag, ...] = get_args(Flag)
+Flag = str
+FLAGS: dict[Flag, str] = {
+    "crashed": "perchctl ended by an exception that no fault planted",
+    "fell": "fell, touched down above 0.8 m/s, or slipped too deep",
+    "slid": "touched down above 0.5 m/s sideways",
+    "flies_on": "motors on in the air where it should have come down",
+    "endless": "no end within 240 s",
+    "stop_not_obeyed": "motors on 0.5 s after the second Ctrl-C",
+    "pressed": "pushed against ceiling or floor for more than 4 s",
+    "strayed": "more than 1 m from where it should be, or too high",
+    "lied": "perchctl said at the end what is not true",
+    "locked_needlessly": "locked, and had not crashed, tumbled or tilted",
+}
+"""What can go wrong, the gravest first, and what it means."""
 
 LOW_M = 0.1
 """Below this height nothing counts as a fall."""
