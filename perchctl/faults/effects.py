@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from perchctl.faults.edges import CameraFault, Edges
+from perchctl.faults.edges import CameraFault, Edges, PlantedError
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
 from perchctl.mission import Event, Phase, Tick
@@ -55,7 +55,7 @@ def radio_loss(
 
 
 def packet_lost(edges: Edges, t_s: float, order: str, count: int) -> None:
-    """Lose the next `count` packets of an order (`ORDERS` of `perchctl.faults.edges`)."""
+    """Lose the next `count` packets of an order (`order_of` of `perchctl.faults.edges`)."""
     edges.radio.lost[order] = count
 
 
@@ -210,7 +210,11 @@ def slow(edges: Edges, t_s: float, tick_s: float, for_s: float) -> None:
 
 def raises(edges: Edges, t_s: float) -> None:
     """Raise an exception that the program does not foresee in the loop's thread."""
-    edges.clock.pending = edges.clock.fail
+
+    def fail() -> None:
+        raise PlantedError("an exception that the fault raised")
+
+    edges.clock.pending = fail
 
 
 def disk_full(edges: Edges, t_s: float, for_s: float) -> None:

@@ -115,7 +115,7 @@ class FaultyFlight:
         by_target = profile.positioning.by == "target"
         self._drift = UnfeltDrift(case.effects, scenario, by_target=by_target)
         self._descent_bound = DescentBound(case.effects, profile)
-        self._recorder = FactsRecorder(vehicle, profile, case.effects)
+        self._facts = FactsRecorder(vehicle, profile, case.effects)
         self._touched = False  # the ceiling, since the fault began
         self._crashed = False  # by an exception that no fault planted
 
@@ -169,10 +169,10 @@ class FaultyFlight:
         for injector in self._injectors:
             injector.each(t_s)
         self._edges.pass_time(t_s)
-        self._recorder.facts.begin_s = self._injector.begin_s
+        self._facts.begin_s = self._injector.begin_s
         sample = self._sample(t_s)
         self._oracle.see(sample)
-        self._recorder.see(sample)
+        self._facts.see(sample)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.floor and not sample.motors_on:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
@@ -199,7 +199,7 @@ class FaultyFlight:
             uplink=uplink,
             lands=self._vehicle.firmware.planner.active,
         )
-        wrong = begin_s is not None and self._recorder.facts.does(e.log_reads)
+        wrong = begin_s is not None and self._facts.does(e.log_reads)
         heard = not wrong and all(self._is_heard(block, t_s) for block in MockLink.FAST_BLOCKS)
         return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
 
@@ -217,7 +217,7 @@ class FaultyFlight:
     def _result(
         self, end: str, reason: str, report: FlightReport | None, end_s: float
     ) -> FaultResult:
-        case, oracle, facts = self._case, self._oracle, self._recorder.facts
+        case, oracle, facts = self._case, self._oracle, self._facts
         facts.killed_s, facts.stop_s = self._clock.killed_s, oracle.stop_s
         hanging = oracle.newest is not None and oracle.newest.hanging
         perched = report is not None and report.phase is Phase.PERCHED and hanging

@@ -18,7 +18,6 @@ from perchctl.camera.health import content
 from perchctl.faults import effects as e
 from perchctl.faults.edges import (
     LONGEST_S,
-    ORDERS,
     CameraFault,
     Edges,
     FaultyCamera,
@@ -160,7 +159,7 @@ def test_orders_are_told_by_their_packets() -> None:
     assert orders[:5] == [
         ["setpoint"], ["raw"], ["stop", "notify"], ["emergency-stop"], ["raw", "notify"],
     ]  # fmt: skip
-    assert {order for each in orders for order in each} == set(ORDERS)
+    assert orders[5][0] == "land"
 
 
 @pytest.mark.parametrize(

@@ -103,15 +103,14 @@ class Recorded:
             firmware=SimpleNamespace(planner=self.planner, supervisor=self.supervisor),
             scenario=SimpleNamespace(mass_kg=0.04),
         )
-        self.recorder = FactsRecorder(vehicle, PROFILE, effects)
-        self.facts = self.recorder.facts
+        self.facts = FactsRecorder(vehicle, PROFILE, effects)
         self.t_s = 0.0
 
     def show(self, sample: Sample, for_s: float, *, begun: bool = True, **changes: Any) -> Recorded:
         for _ in range(round(for_s / DT_S)):
             if begun and self.facts.begin_s is None:
                 self.facts.begin_s = self.t_s
-            self.recorder.see(sample._replace(t_s=self.t_s, **changes))
+            self.facts.see(sample._replace(t_s=self.t_s, **changes))
             self.t_s += DT_S
         return self
 
