@@ -264,28 +264,18 @@ def fly_with_fault(
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
 
-def fly_fault_seed(
-    profile: Profile,
-    seed: int,
-    faults: tuple[str, ...],
-    log: Path | None = None,
-    record: bool = False,
+def fly_fault_in_folder(
+    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
-    """Fly the seed's scenario with the seed's fault, drawn from those named."""
+    """Fly the seed's scenario with the seed's fault, drawn from those named, with its log in a
+    folder if one is given."""
+    log = None if log_dir is None else seed_log_path(seed, log_dir)
 
     def fly_drawn(scenario: Scenario) -> FaultResult:
         case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
         return fly_with_fault(profile, case, scenario, log, record)
 
     return fly_measured(profile, seed, fly_drawn)
-
-
-def fly_fault_in_folder(
-    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
-) -> FaultResult:
-    """Fly a seed as `fly_fault_seed` does, with its log in a folder if one is given."""
-    log = None if log_dir is None else seed_log_path(seed, log_dir)
-    return fly_fault_seed(profile, seed, faults, log, record)
 
 
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
