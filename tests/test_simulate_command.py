@@ -47,7 +47,6 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
     assert said["worst_seeds"] == []
     assert said["rates"]["perched"] == {"rate": 1.0, "interval": [0.158114, 1.0]}
-    assert 50 < said["peak_memory_mb"] < 1000
     assert campaign.complaint == f"the flights' logs are in {logs}"
     assert "\x1b" not in campaign.stdout + campaign.stderr  # a pipe gets no colour
 

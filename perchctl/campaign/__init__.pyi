@@ -16,7 +16,6 @@ from .results import align_columns as align_columns
 from .results import campaign_summary as campaign_summary
 from .results import campaign_table as campaign_table
 from .results import none_took_off as none_took_off
-from .results import peak_mb as peak_mb
 from .results import rate_record as rate_record
 from .results import rate_text as rate_text
 from .results_file import campaign_results as campaign_results

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
+from perchctl.campaign.results import FlightEnd, FlightResult
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Phase
@@ -39,14 +39,14 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
     """Call `fly` with the seed's scenario on one core, and return its result (a dataclass) with
-    the CPU time, the peak memory and the scenario filled in. The flight's memory is freed."""
+    the CPU time and the scenario filled in. The flight's memory is freed."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     cpu_began_s = time.process_time()
     scenario = draw_scenario(profile, seed)
     result: Any = fly(scenario)
     cpu_s = time.process_time() - cpu_began_s
     _give_back_memory()
-    flown: R = replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
+    flown: R = replace(result, cpu_s=cpu_s, scenario=scenario)
     return flown
 
 

@@ -112,7 +112,7 @@ def flown_record(result: Any) -> dict[str, Any]:
     return {name: value for name, value in record.items() if name not in OF_THE_COMPUTER}
 
 
-OF_THE_COMPUTER = ("cpu_s", "peak_memory_mb", "log", "log_problem")
+OF_THE_COMPUTER = ("cpu_s", "log", "log_problem")
 """The fields that differ between computers, or from hour to hour."""
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from perchctl.campaign import CampaignFlight, align_columns, peak_mb, rate_record, rate_text
+from perchctl.campaign import CampaignFlight, align_columns, rate_record, rate_text
 from perchctl.faults.catalogue import AIR, FAULTS
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED, Flag
@@ -95,7 +95,6 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
         "unavoidable": sum(r.is_excused for r in results),
         "expected_outcomes": dict(Counter(name for r in results for name in r.expected)),
         **{name: rate_record(count, len(results)) for name, count in _counts(results).items()},
-        "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 

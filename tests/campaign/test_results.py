@@ -65,7 +65,6 @@ def test_a_campaign_of_three() -> None:
         "locked": 1,
         "fell": 1,
         "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
-        "peak_memory_mb": 5e6,
         "worst_seeds": [3, 2],
     }
 

@@ -29,7 +29,7 @@ SIM = load_profile("sim")
 SCENARIO = draw_scenario(SIM, 17)
 FLOWN = FlightResult(
     0, "perched", "hanging still", 0.1 / 3, 20.0, 1, False, False,
-    log=Path("logs/a.jsonl"), cpu_s=4.0, peak_memory_mb=200.0, scenario=SCENARIO,
+    log=Path("logs/a.jsonl"), cpu_s=4.0, scenario=SCENARIO,
 )  # fmt: skip
 
 
@@ -153,7 +153,7 @@ def test_logs_of_good_flights_go_with_their_recordings(
 
 
 def test_what_a_computer_measured_is_not_the_flight() -> None:
-    elsewhere = replace(FLOWN, cpu_s=1.0, peak_memory_mb=9.0, log=None)
+    elsewhere = replace(FLOWN, cpu_s=1.0, log=None)
     assert flown_record(elsewhere) == flown_record(FLOWN)
     assert flown_record(replace(FLOWN, miss_m=0.1)) != flown_record(FLOWN)
     moved = replace(SCENARIO, mass_kg=0.05)
