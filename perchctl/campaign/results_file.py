@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
@@ -25,7 +25,6 @@ from perchctl.record import (
     camera_record,
     from_exact,
     json_line,
-    path_beside,
     to_exact,
 )
 
@@ -41,21 +40,16 @@ class CampaignResults(Generic[R]):
         seeds: Sequence[int],
         earlier: dict[int, R],
         file: BinaryIO | None = None,
-        failed_logs_only: bool = False,
     ) -> None:
         self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
         self.left = [seed for seed in seeds if seed not in earlier]
-        self._file, self._failed_logs_only = file, failed_logs_only
+        self._file = file
 
     def note(self, result: R) -> None:
-        """Write the result of a flight, which is on the disk when this returns, and keep or remove
-        its log and recording. Errors: InvalidValue."""
+        """Write the result of a flight, which is on the disk when this returns. Errors:
+        InvalidValue."""
         if self._file is not None:
             _write(self._file, {"kind": "flight", **to_exact(result)})
-        if self._failed_logs_only and result.log is not None and not result.is_bad:
-            for path in (result.log, path_beside(result.log, ".mcap")):
-                with suppress(OSError):
-                    path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -69,18 +63,17 @@ def campaign_results(
     resume: bool = False,
     force: bool = False,
     log_dir: Path | None = None,
-    failed_logs_only: bool = False,
 ) -> Iterator[CampaignResults[R]]:
     """Yield the results of a campaign, which are appended to the file `out`.
 
     An existing file is refused, with `force` replaced, and with `resume` gone on with: it must
-    have been flown with the same program, profile and faults. `failed_logs_only`: of the logs in
-    `log_dir` only those of bad flights stay. Errors: InvalidValue.
+    have been flown with the same program, profile and faults. Errors: InvalidValue, also for a
+    `log_dir` that cannot be written to.
     """
     if log_dir is not None:
         check_place(log_dir / "flight.jsonl", force=True)
     if out is None:
-        yield CampaignResults(seeds, {}, None, failed_logs_only)
+        yield CampaignResults(seeds, {})
         return
     if out.is_file() and not (force or resume):
         raise InvalidValue(
@@ -102,7 +95,7 @@ def campaign_results(
             raise cannot_be_written(out, error) from None
         if not good:
             _write(file, header)
-        yield CampaignResults(seeds, earlier, file, failed_logs_only)
+        yield CampaignResults(seeds, earlier, file)
 
 
 def flown_record(result: Any) -> dict[str, Any]:
