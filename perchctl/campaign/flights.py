@@ -145,8 +145,8 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         raise
     except lost as error:
         raise PerchError(
-            f"the process that flew seed {seed} was ended from outside, and so were those that "
-            f"flew it again (where memory is short, fly fewer at a time: --jobs)"
+            f"a process that flew seed {seed} or another was ended from outside: where memory is "
+            f"short, fly fewer at a time (--jobs), and go on with --out by --resume"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(
