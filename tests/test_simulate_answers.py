@@ -114,5 +114,5 @@ def test_sixty_pairs_find_an_integral_that_is_off_and_nothing_between_a_profile_
     assert record["profile"] == {KEY: {"a": 0.4, "b": 0.0}}
     assert record["success"]["better"] == record["time_s"]["better"] == "A"
     said = run(*flown, "copy.yaml").stdout
-    assert "identical in all 60 flights\nthe profiles do not differ\n" in said
+    assert "\nthe profiles do not differ\n" in said
     assert "better" not in said

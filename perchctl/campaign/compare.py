@@ -85,7 +85,7 @@ Comparison = dict[str, Any]
 """What is known of two flights a seed, A's and B's, ready for JSON, in SI; `better` is "A", "B", or
 None where nothing is proven:
 
-- `flights`, and how many of them ended the same in all that a result tells, `identical`;
+- `flights`;
 - `success` (perched, neither locked nor fallen): the rates of `A` and `B`; the seeds of which only
   one succeeded, `only_a` and `only_b`; the chance `p` that they split so unevenly, times the
   questions that were asked; `better`;
@@ -122,14 +122,9 @@ def compare_pairs(
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
         "flights": len(pairs),
-        "identical": sum(_ending(a) == _ending(b) for a, b in pairs),
         "success": _success(pairs, questions),
         **{key: _difference(key, pairs, level) for key in figures},
     }
-
-
-def _ending(r: FlightResult) -> tuple[Any, ...]:
-    return r.outcome, r.reason, r.miss_m, r.time_s, r.attempts, r.locked, r.fell
 
 
 def _success(pairs: Sequence[Pair], questions: int) -> dict[str, Any]:
@@ -172,7 +167,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     """Return the comparison as a table, followed by what is proven."""
-    flights, identical, success = found["flights"], found["identical"], found["success"]
+    flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
     only = f"only A {success['only_a']}, only B {success['only_b']}"
@@ -180,8 +175,6 @@ def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     rows.append(("success", *rates, only, f"{verdict} (p = {success['p']:.2g})"))
     rows += [_figure_row(key, found[key]) for key in FIGURES if key in found]
     lines = [*align_columns(rows), ""]
-    if 0 < identical == flights:
-        return "\n".join([*lines, f"identical in all {flights} flights"])
     together = (
         f"the {len(rows) - 1} answers hold together at {100 * LEVEL:.0f} %: intervals of "
         f"differences and p are widened for it"

@@ -72,7 +72,6 @@ def test_a_difference_below_the_spread_of_the_seeds_is_found_by_pairs() -> None:
 def test_a_profile_and_its_copy_are_identical() -> None:
     found = compare_pairs([(a, replace(a, cpu_s=3.0)) for a, _ in spread(60)])
     assert better(found) == set()
-    assert text(found).endswith("\nidentical in all 60 flights")
     assert text(found).count("no difference proven") == 4
 
 
@@ -137,7 +136,6 @@ def test_turning_both_round_turns_what_is_said(pairs: Pairs) -> None:
     assert json.loads(json.dumps(one)) == one
     assert one["success"]["p"] == other["success"]["p"]
     assert one["success"]["only_a"] == other["success"]["only_b"]
-    assert one["identical"] == other["identical"]
     for key in FIGURES:
         assert one[key]["a"] == other[key]["b"]
         assert {one[key]["better"], other[key]["better"]} in ({None}, {"A", "B"})
