@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 import os
 import time
@@ -52,14 +50,12 @@ def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R
 
 def _give_back_memory() -> None:
     """Free the memory of a flight. Its objects refer to each other, so Python would free them
-    many flights later; and the C library keeps small pieces that it gets back."""
+    many flights later."""
     gc.collect()
     if not gc.get_freeze_count():
         # What is left are the program's own modules and what it keeps for all flights: nothing
         # to look through again and again, which takes as long as 30 pictures.
         gc.freeze()
-    with contextlib.suppress(AttributeError, OSError):  # glibc has it, others do not
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def fly_seed(
