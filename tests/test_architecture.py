@@ -87,7 +87,7 @@ MOST_NAMES = {
     "analysis": 10,
     "calibration": 17,
     "camera": 17,
-    "campaign": 21,
+    "campaign": 20,
     "check": 8,
     "commands": 2,
     "display": 7,

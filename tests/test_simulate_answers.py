@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.campaign import FlightResult, VariantResult
+from perchctl.campaign import FlightResult
 from perchctl.profile import Profile, load_profile
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import ROOT
@@ -42,7 +43,7 @@ def no_flights(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     ) -> None:
         for seed in seeds:
             for number, profile in enumerate(profiles):
-                note(VariantResult(number, fly(profile, seed)))
+                note(replace(fly(profile, seed), variant=number))
 
     monkeypatch.setattr(FLY_VARIANTS, variants)
 
@@ -71,7 +72,7 @@ def test_a_difference_is_told_with_the_keys_that_differ() -> None:
 def test_ctrl_c_leaves_the_seeds_that_both_have_flown(monkeypatch: pytest.MonkeyPatch) -> None:
     def variants(_profiles: object, _seeds: object, _executor: object, note: Note) -> None:
         for seed, number in ((0, 0), (0, 1), (1, 0)):
-            note(VariantResult(number, perched(seed)))
+            note(replace(perched(seed), variant=number))
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(FLY_VARIANTS, variants)

@@ -1,5 +1,4 @@
 from .cluster import cluster_pool as cluster_pool
-from .compare import VariantResult as VariantResult
 from .compare import compare_variants as compare_variants
 from .compare import comparison_text as comparison_text
 from .compare import fly_variants as fly_variants

@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -33,43 +33,27 @@ from perchctl.plain_yaml import clip_text, split_values
 from perchctl.profile import Profile, changed_profile, profile_value, scalar_text
 
 
-@dataclass(frozen=True)
-class VariantResult:
-    """The result of one seed, flown by the profile of that `number`."""
-
-    number: int
-    result: FlightResult
-
-    @property
-    def seed(self) -> int:
-        return self.result.seed
-
-    @property
-    def outcome(self) -> str:
-        return self.result.outcome
-
-
 def fly_variants(
     profiles: Sequence[Profile],
     seeds: Iterable[int],
     executor: Executor | None = None,
-    on_result: Callable[[VariantResult], None] = lambda result: None,
-) -> list[VariantResult]:
+    on_result: Callable[[FlightResult], None] = lambda result: None,
+) -> list[FlightResult]:
     """Fly each seed by all profiles before the next seed; arguments and errors as of `fly_all`."""
     variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
 
-def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> VariantResult:
+def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> FlightResult:
     seed, number = variant
-    return VariantResult(number, fly_seed(profiles[number], seed))
+    return replace(fly_seed(profiles[number], seed), variant=number)
 
 
-def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[FlightResult, ...]]:
+def whole_seeds(results: Iterable[FlightResult], profiles: int) -> list[tuple[FlightResult, ...]]:
     """Return, in the order of the seeds, the results of each seed that all profiles have flown."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
-        by_seed.setdefault(each.seed, {})[each.number] = each.result
+        by_seed.setdefault(each.seed, {})[each.variant] = each
     return [
         tuple(flown[number] for number in range(profiles))
         for _, flown in sorted(by_seed.items())
@@ -108,7 +92,7 @@ name, its unit, and the number of units in one of SI."""
 MISS = ("miss_m",)
 
 
-def compare_variants(results: Iterable[VariantResult]) -> Comparison:
+def compare_variants(results: Iterable[FlightResult]) -> Comparison:
     """Return the comparison of two profiles by the seeds that both have flown."""
     return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
 
@@ -210,7 +194,7 @@ class Sweep:
     key: str
     profiles: tuple[Profile, ...]
 
-    def record(self, results: Sequence[VariantResult]) -> dict[str, Any]:
+    def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
         """Return the figures of each value (a cell), by the seeds that were flown with every
         value, for JSON. `best`: the value with the most successes, of these the one with the
         smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,

@@ -56,6 +56,7 @@ class FlightResult(CampaignFlight):
         attempts: perching attempts, the successful one included.
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
+        variant: the number of the profile that flew it, where several are compared.
     """
 
     outcome: FlightEnd
@@ -65,6 +66,7 @@ class FlightResult(CampaignFlight):
     attempts: int
     locked: bool
     fell: bool
+    variant: int = 0
 
     @property
     def is_bad(self) -> bool:

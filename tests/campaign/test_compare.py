@@ -16,7 +16,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import (
     FlightResult,
-    VariantResult,
     comparison_text,
     make_sweep,
 )
@@ -143,11 +142,11 @@ def test_turning_both_round_turns_what_is_said(pairs: Pairs) -> None:
 
 def test_seeds_count_that_every_profile_has_flown() -> None:
     results = [
-        VariantResult(number, replace(perched(seed), attempts=number))
+        replace(perched(seed), attempts=number, variant=number)
         for seed in (4, 3)
         for number in (1, 0)
     ]
-    seeds = whole_seeds([*results, VariantResult(0, perched(5))], 2)
+    seeds = whole_seeds([*results, perched(5)], 2)
     assert [(row[0].seed, row[0].attempts, row[1].attempts) for row in seeds] == [
         (3, 0, 1), (4, 0, 1),
     ]  # fmt: skip
@@ -185,10 +184,10 @@ def test_what_cannot_be_swept_is_refused(text: str, error: type[Exception], word
         make_sweep(SIM, text)
 
 
-def flown(seeds: int, *misses_m: float | None) -> list[VariantResult]:
+def flown(seeds: int, *misses_m: float | None) -> list[FlightResult]:
     """One a cell; None does not perch. Seeds differ."""
     return [
-        VariantResult(cell, landed(k) if m is None else perched(k, m + 1e-4 * (k % 7)))
+        replace(landed(k) if m is None else perched(k, m + 1e-4 * (k % 7)), variant=cell)
         for k in range(seeds)
         for cell, m in enumerate(misses_m)
     ]
@@ -215,7 +214,7 @@ def test_chance_among_many_cells_is_no_proof() -> None:
     other that would be proven."""
     asked = sweep(",".join(f"{0.01 * k:.2f}" for k in range(5, 17)))
     results = [
-        VariantResult(cell, landed(k) if cell == 12 and k < 8 else perched(k))
+        replace(landed(k) if cell == 12 and k < 8 else perched(k), variant=cell)
         for k in range(10)
         for cell in range(13)
     ]
