@@ -171,36 +171,24 @@ def _read(path: Path, header: dict[str, Any], kind: type[R], earlier: dict[int, 
     lines. Errors: InvalidValue if it is no file of results, or of another campaign."""
     data = path.read_bytes()
     good = data[: data.rfind(b"\n") + 1]
-    number = 1
+    if not good and json_line(header).startswith(data):
+        return 0
     try:
-        for number, line in enumerate(good.splitlines(), start=1):
-            record = json.loads(line)
-            if not isinstance(record, dict):
-                raise ValueError("no object")
-            if number == 1:
-                _check_header(path, record, header)
-            elif record.pop("kind", None) != "flight":
-                raise ValueError("no flight")
-            else:
-                result = from_exact(kind, record)
-                earlier.setdefault(result.seed, result)
-        if not good and not json_line(header).startswith(data):
-            raise ValueError("no whole line")
-    except ValueError as error:
+        found, *flights = map(json.loads, good.splitlines())
+        if any(found.get(key) != value for key, value in _FORM.items()):
+            raise ValueError(f"no header of version {VERSION}")
+        results = [from_exact(kind, flight) for flight in flights if flight.pop("kind") == "flight"]
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(
-            f"{path}: line {number}: no line of a campaign's results ({error}): take the original, "
-            f"or name a new file"
+            f"{path}: not the lines of a campaign's results ({error}): take the original, or name "
+            f"a new file"
         ) from None
-    return len(good)
-
-
-def _check_header(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raise ValueError if it is no header, and InvalidValue if it is of another campaign."""
-    if any(found.get(key) != value for key, value in _FORM.items()):
-        raise ValueError(f"no header of version {VERSION}")
-    others = [name for key, name in _MUST_AGREE.items() if found.get(key) != wanted[key]]
+    others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header[key]]
     if others:
         raise InvalidValue(
             f"{path} was flown with another {' and another '.join(others)}: take the same, or name "
             f"another file"
         )
+    for result in results:
+        earlier.setdefault(result.seed, result)
+    return len(good)

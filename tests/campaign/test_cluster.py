@@ -89,7 +89,6 @@ def flown_by(required: WorkerRequirements, patch: pytest.MonkeyPatch, threads: i
 
 def test_a_worker_like_this_computer_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     found = worker_requirements([load_profile("sim"), load_profile("rough")])
-    assert len(found.profiles) == 1  # both name the same files
     assert flown_by(found, monkeypatch).seed == 1
     assert len(pickle.dumps(found)) < 20_000  # it goes with each flight
 
@@ -123,7 +122,7 @@ def test_another_calibration_or_none_is_seen(
     assert flown_by(found, monkeypatch)
     file.write_text(file.read_text().replace("1", "2"))
     for _ in range(2):
-        with pytest.raises(InvalidValue, match=f"has {file} .* instead of"):
+        with pytest.raises(InvalidValue, match="has calibration or mask"):
             flown_by(found, monkeypatch)
         file.unlink(missing_ok=True)
 

@@ -96,7 +96,7 @@ def test_what_is_no_such_file_is_left_alone(
     lines[line - 1] = lines[line - 1].replace(old, new, 1)
     for content in (b"".join(lines), b"my notes"):
         path.write_bytes(content)
-        with pytest.raises(InvalidValue, match="no line of a campaign's results"):
+        with pytest.raises(InvalidValue, match="not the lines of a campaign's results"):
             written(path, resume=True)
         assert path.read_bytes() == content
 
