@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import Row, Verdict
 from perchctl.check.row import ask_all
-from perchctl.check.vehicle import VEHICLE, Vehicle, look, moved_m
+from perchctl.check.vehicle import VEHICLE, Vehicle, look
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
@@ -93,7 +93,6 @@ FAULTS = [
     ("positioning", "bad", "fail", "no positioning deck, and no position comes"),
     ("ground", "bad", "fail", "places the vehicle at 0."),
     ("level", "bad", "fail", "pitch 20"),
-    ("parameters", "bad", "warn", "stabilizer.estimator 1, profile 2"),
     ("battery", "bad", "fail", "rests at 3.5"),
     ("firmware", "old", "fail", "protocol 11"),
     ("telemetry", "old", "fail", "none comes"),
@@ -163,7 +162,6 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("firmware", "fail", {"protocol": 11}),
     ("firmware", "fail", {"protocol": -1}),
     ("firmware", "fail", {"missing": ("stateEstimate.x",)}),
-    ("firmware", "warn", {"lacking": ("battery",)}),
     ("firmware", "fail", {"parameters": parameters(system__selftestPassed=0)}),
     ("firmware", "pass", {"parameters": parameters(system__selftestPassed=None)}),
     *(
@@ -185,8 +183,6 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("level", "fail", {"telemetry": said(pitch_rad=math.radians(-20.0))}),
     ("level", "fail", {"telemetry": said(pitch_rad=math.nan)}),
     ("level", "fail", {"telemetry": said(acc_z_g=0.7)}),
-    ("parameters", "warn", {"parameters": parameters(stabilizer__estimator=1)}),
-    ("parameters", "fail", {"parameters": parameters(stabilizer__estimator=None)}),
     ("battery", "fail", {"telemetry": said(battery_v=3.5)}),
     ("battery", "warn", {"telemetry": said(battery_v=3.85)}),
     ("battery", "fail", {"telemetry": said(battery_state=LOW_POWER)}),
@@ -218,27 +214,6 @@ def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
     before = rows_of(vehicle)["positioning"]
     assert before.verdict is Verdict.FAIL
     assert "positioning.decks" in before.advice
-
-
-def test_what_positions_from_outside_need_is_set_by_fly_and_not_warned_of() -> None:
-    """Over the user's own, also where a deck gives the vehicle a position by itself."""
-    own = {"stabilizer.estimator": 1, "locSrv.extPosStdDev": 0.05}
-    vehicle = replace(GOOD, parameters=parameters(locSrv__extPosStdDev=0.01))
-    for by, verdict in (("target", Verdict.PASS), ("deck", Verdict.WARN)):
-        profile = PROFILE.model_copy(
-            update={
-                "link": LinkConfig(parameters=own),
-                "positioning": PROFILE.positioning.model_copy(update={"by": by}),
-            }
-        )
-        rows = rows_of(vehicle, profile)
-        assert (rows["parameters"].verdict, rows["estimator"].verdict) == (verdict, verdict)
-
-
-def test_a_position_that_slides_at_rest_is_seen() -> None:
-    slid = [said(t_s=0.01 * k, position_m=(0.001 * k, 0.0, 0.0)) for k in range(200)]
-    assert moved_m(slid) == pytest.approx(0.18, abs=0.001)
-    assert moved_m([]) == 0.0
 
 
 def test_an_old_profile_s_limit_is_the_flight_s() -> None:
