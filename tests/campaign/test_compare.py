@@ -25,7 +25,6 @@ from perchctl.campaign.compare import (
     Comparison,
     Sweep,
     compare_pairs,
-    mean_interval,
     whole_seeds,
 )
 from perchctl.errors import InvalidValue, UsageError
@@ -114,15 +113,6 @@ def test_few_flights_prove_nothing() -> None:
     none = compare_pairs([(LANDED, LANDED)])
     assert none["miss_m"]["difference"] is None
     assert "-" in text(none)
-
-
-def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
-    rng = np.random.default_rng(4)
-    held = 0
-    for _ in range(60):
-        low, high = mean_interval(rng.normal(1.0, 2.0, 40))
-        held += low <= 1.0 <= high
-    assert 52 <= held < 60
 
 
 ends = st.sampled_from([PERCHED, LANDED, replace(PERCHED, fell=True), replace(PERCHED, attempts=3)])

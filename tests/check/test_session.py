@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import socket
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +11,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Verdict, camera, check, session
+from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link import find_vehicles
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
@@ -102,37 +98,9 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
     assert rows["packets"].verdict is Verdict.FAIL
 
 
-def answerer() -> tuple[socket.socket, str]:
-    """Something that answers a scan on one of the ports that cflib asks, and its address."""
-    answering = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-
-    def answer() -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                datagram, address = answering.recvfrom(64)
-                answering.sendto(datagram, address)
-
-    for port in range(19859, 19849, -1):
-        with contextlib.suppress(OSError):
-            answering.bind(("127.0.0.1", port))
-            threading.Thread(target=answer, daemon=True).start()
-            return answering, f"udp://127.0.0.1:{port}"
-    pytest.skip("all ports of the scan are taken")
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_scan_names_what_answers() -> None:
-    """cflib leaves the sockets of its scan open."""
-    answering, uri = answerer()
-    try:
-        uris, radio_problem = find_vehicles("radio://0/80/2M/E7E7E7E701")
-        rows = {row.found: row for row in session.scan_rows(None)}
-    finally:
-        answering.close()
-    assert uri in uris
-    assert rows[f"{uri} answers"].verdict is Verdict.PASS
-    radio = next(row for row in rows.values() if row.name == "radio")
-    if radio_problem:  # where there is none, it is said
-        assert radio.verdict is Verdict.SKIPPED
-        assert "Crazyradio" in radio.found
-        assert "udev" in radio.advice
+def test_a_scan_names_what_answers_and_why_no_radio_was_asked() -> None:
+    radio, found = vehicle.answering_rows([NOWHERE], "no Crazyradio is plugged in\nudev rules")
+    assert (radio.verdict, radio.advice) == (Verdict.SKIPPED, "udev rules")
+    assert (found.verdict, found.found) == (Verdict.PASS, f"{NOWHERE} answers")
+    radio, nobody = vehicle.answering_rows([], "")
+    assert (radio.verdict, nobody.verdict) == (Verdict.PASS, Verdict.FAIL)
