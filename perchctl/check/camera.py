@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from perchctl.camera import VERDICT_TEXTS, mirrored_note
+from perchctl.camera import VERDICT_TEXTS
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
@@ -30,7 +30,6 @@ from perchctl.check.row import (
 from perchctl.errors import PerchError
 from perchctl.flight import GroundCriteria, out_of_view
 from perchctl.geometry import Place
-from perchctl.perception import MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import overhead_text
 from perchctl.vision import CameraModel
@@ -63,15 +62,12 @@ def refused_rows(error: PerchError, profile: Profile) -> list[Row]:
 
 
 def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) -> Finding:
-    if size_px is None:
-        return skipped("no picture comes")
-    found = "{}x{} px".format(*size_px)
+    """Judge the size of the pictures, which `FrameSource` knows from the first one on."""
+    found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, wanted_px))
     if size_px == wanted_px:
-        return passed(f"{found}, as calibrated")
-    return failed(
-        f"{found}, calibrated at {{}}x{{}} px".format(*wanted_px),
-        "set the camera to that size, or calibrate it at this one",
-    )
+        return passed(f"{found} px, as calibrated")
+    advice = "set the camera to that size, or calibrate it at this one"
+    return failed(f"{found} px, calibrated at {wanted} px", advice)
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
@@ -128,7 +124,7 @@ def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     """Judge the pictures that a flight takes for no measurement: frozen, snow, uniform, dark,
-    late."""
+    mirrored, late."""
     late = sum(t < t0 for (_, t0), (_, t) in pairwise(rehearsal.arrivals))
     if late:
         found = f"{late} of {rehearsal.pictures} came after newer ones"
@@ -150,15 +146,6 @@ def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
         return skipped(why, "put the camera under the target")
     advice = "turn the lens until perchctl track --view shows the target sharp"
     return by_limits(blur_px, 1.6, 2.5, f"blur sigma {blur_px:.1f} px", advice)
-
-
-def _mirrored(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    if rehearsal.mirrored >= MIRRORED_FRAMES:
-        found, _, advice = mirrored_note(profile.camera).partition(": ")
-        return failed(found, advice)
-    if not rehearsal.found:
-        return skipped("no target was seen to tell by")
-    return passed("no")
 
 
 def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -192,7 +179,6 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
     "picture age": _age,
     "pictures": _pictures,
     "focus": _focus,
-    "mirrored": _mirrored,
     "target": _target_in_view,
     "print": _print,
 }

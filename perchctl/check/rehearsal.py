@@ -38,7 +38,7 @@ class Rehearsal:
         work_s: of the turns that looked at a picture; late_s: of all turns.
         ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
         problems: why pictures were no good, or were remarkable, with their number.
-        looked: the newest few; found: of how many pictures there was a target, and mirrored ones.
+        looked: the newest few; found: of how many pictures there was a target.
         silent_s: since the last picture, at the end.
         target: where it was at the end; None where it was not seen then.
         blur_px: sigma of the edges of the target's markers; None where it could not be measured.
@@ -55,7 +55,6 @@ class Rehearsal:
     pictures: int = 0
     repeats: int = 0
     found: int = 0
-    mirrored: int = 0
     silent_s: float = 0.0
     target: TargetEstimate | None = None
     print_verdict: tuple[bool, str] | None = None
@@ -165,7 +164,6 @@ def _note(
         done.ages_s.append(now_s - frame.t_s + work_s)
     seen = output.detections
     done.found += seen.large is not None or seen.small is not None
-    done.mirrored += seen.mirrored
     prints.add(output)
     done.looked = [*done.looked[1 - KEPT_FRAMES :], (frame, output)]
 

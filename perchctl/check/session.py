@@ -72,7 +72,8 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         scope.tell(f"opening the camera {shown}")
         rehearsal: Rehearsal | None = None
         try:
-            source = _open_camera(spec, options)
+            size_px, asked = calibrated.size_px, options.profile.camera
+            source = open_camera(spec, time.monotonic, asked, size_px=size_px)
         except PerchError as error:
             yield from camera.refused_rows(error, options.profile)
         else:
@@ -182,12 +183,6 @@ class VehicleSession:
         take = self.probe.telemetry
         seen = capture.listen(take, room, time.monotonic, time.sleep, within_s)
         return capture.hand_finding(capture.paired(seen.telemetry, seen.places(config)), config)
-
-
-def _open_camera(spec: str, options: FlyOptions) -> FrameSource:
-    config = options.profile.camera
-    size_px = profile_camera(config).size_px
-    return open_camera(spec, time.monotonic, config, size_px=size_px)
 
 
 def _camera_rows(
