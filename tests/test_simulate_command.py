@@ -16,10 +16,10 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import FlightResult
-from perchctl.campaign.results_file import flown_record
 from perchctl.record import from_exact, read_log
 from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SEED, SHORT
+from tests.helpers.results import flown_record
 
 pytestmark = pytest.mark.long
 

@@ -98,17 +98,6 @@ def campaign_results(
         yield CampaignResults(seeds, earlier, file)
 
 
-def flown_record(result: Any) -> dict[str, Any]:
-    """Return a result as a record of JSON types with exact floats, without log and timings:
-    what equal flights share on all computers."""
-    record: dict[str, Any] = to_exact(result)
-    return {name: value for name, value in record.items() if name not in OF_THE_COMPUTER}
-
-
-OF_THE_COMPUTER = ("cpu_s", "log", "log_problem")
-"""The fields that differ between computers, or from hour to hour."""
-
-
 # --- The header -------------------------------------------------------
 
 

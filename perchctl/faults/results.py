@@ -1,5 +1,5 @@
 """How flights with faults ended: one flight's result, and a campaign's figures for JSON and as a
-table of faults and phases."""
+table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.campaign import CampaignFlight, align_columns, rate_record, rate_text
-from perchctl.faults.catalogue import AIR, FAULTS
+from perchctl.faults.catalogue import FAULTS
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED, Flag
 
@@ -77,8 +77,6 @@ SHARES = {
     "unconfirmed": "perchctl says: no landing was seen",
 }
 """The counts that are given as shares of all flights, and what they mean."""
-HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land")
-"""The column heads of the phases."""
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
@@ -115,17 +113,16 @@ def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """Return the figures, a table of faults by phases, and the worst flights as plain text."""
-    figures = fault_summary(results)
-    cells: dict[tuple[str, str], list[FaultResult]] = {}
-    for r in results:
-        cells.setdefault((r.fault, r.phase), []).append(r)
-    flown = [fault.name for fault in FAULTS if any(r.fault == fault.name for r in results)]
+    """Return the flights of each fault, the figures, and the worst flights as plain text."""
+    figures, flown = fault_summary(results), Counter(r.fault for r in results)
+    wrong = Counter(r.fault for r in results if r.is_bad)
+    excused = Counter(r.fault for r in results if r.is_excused)
+    rows = [(f.name, flown[f.name], wrong[f.name], excused[f.name]) for f in FAULTS]
     lines = align_columns(
-        [("fault", *HEADS)]
-        + [(name, *(_cell(cells.get((name, p.value), ())) for p in AIR)) for name in flown]
+        [("fault", "flights", "wrong", "unavoidable")]
+        + [(name, *map(str, counts)) for name, *counts in rows if counts[0]]
     )
-    lines += ["", "a cell: flights, !k of them wrong, u: unavoidable among them", ""]
+    lines.append("")
     for name, count in _counts(results).items():
         lines.append(f"{rate_text(count, len(results)):<29}{_explained(name, SHARES[name])}")
     meanings = {
@@ -147,14 +144,6 @@ def fault_table(results: Sequence[FaultResult]) -> str:
 
 def _explained(name: str, meaning: str) -> str:
     return f"{name.replace('_', ' ')}: {meaning}"
-
-
-def _cell(flights: Sequence[FaultResult]) -> str:
-    if not flights:
-        return "."
-    wrong = sum(r.is_bad for r in flights)
-    unavoidable = "u" if any(r.is_excused for r in flights) else ""
-    return f"{len(flights)}{f'!{wrong}' if wrong else ''}{unavoidable}"
 
 
 def _line(r: FaultResult) -> tuple[str, ...]:

@@ -24,7 +24,6 @@ pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 from perchctl.campaign import FlightResult, cluster, cluster_pool, flight_processes, fly_all
 from perchctl.campaign.cluster import WorkerRequirements, fly_verified, worker_requirements
 from perchctl.campaign.flights import fly_seed
-from perchctl.campaign.results_file import flown_record
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.places import data_file
 from perchctl.profile import load_profile
@@ -32,6 +31,7 @@ from tests.helpers.cluster import dies_in_flight, scheduler, worker
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.ended import ended
 from tests.helpers.flights import ROOT, SEED, SHORT
+from tests.helpers.results import flown_record
 from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later
 
 # --- the address, and what it goes together with ------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import FlightResult, campaign_results, results_file
-from perchctl.campaign.results_file import flown_record, profile_sha256, source_sha256
+from perchctl.campaign.results_file import profile_sha256, source_sha256
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import draw_scenario
@@ -126,11 +126,3 @@ def test_a_result_is_on_the_disk_before_the_next_flight(
     monkeypatch.setattr(os, "fsync", lambda fd: on_disk.append(os.fstat(fd).st_size))
     written(path, 0)
     assert on_disk[-1] == path.stat().st_size
-
-
-def test_what_a_computer_measured_is_not_the_flight() -> None:
-    elsewhere = replace(FLOWN, cpu_s=1.0, log=None)
-    assert flown_record(elsewhere) == flown_record(FLOWN)
-    assert flown_record(replace(FLOWN, miss_m=0.1)) != flown_record(FLOWN)
-    moved = replace(SCENARIO, mass_kg=0.05)
-    assert flown_record(replace(FLOWN, scenario=moved)) != flown_record(FLOWN)
