@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from perchctl.camera import VERDICT_TEXTS
+from perchctl.camera import VERDICT_TEXTS, mirrored_note
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
@@ -133,6 +133,9 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
         again = rehearsal.repeats
         repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
         return passed(f"{rehearsal.pictures} good ones{repeated}")
+    if (note := mirrored_note(profile.camera)) in rehearsal.problems:
+        found, _, advice = note.partition(": ")
+        return failed(found, advice)
     text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
