@@ -65,30 +65,30 @@ def fly_seed(
     process or machine. `record` writes the pictures beside the log. A flight that is refused
     before take-off is a result, too, and leaves no log. Errors: NotFound, InvalidValue
     (calibration, log)."""
-    return fly_measured(profile, seed, lambda _: _fly(profile, seed, log_path, record))
 
+    def fly(_scenario: Scenario) -> FlightResult:
+        log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
+        try:
+            flight = fly_lockstep(profile, seed, log)
+        except (SafetyAbort, TimedOut) as error:
+            if log is not None:
+                log.abandon(str(error))
+            return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
+        summary = None if log is None else flight.conclude(log)
+        return FlightResult(
+            seed=seed,
+            outcome=OUTCOMES[flight.end],
+            reason=flight.report.reason,
+            miss_m=flight.perched_miss_m,
+            time_s=flight.report.duration_s,
+            attempts=flight.report.attempts,
+            locked=flight.locked,
+            fell=flight.fell,
+            log=log_path,
+            log_problem=None if summary is None else summary.log_problem,
+        )
 
-def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> FlightResult:
-    log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
-    try:
-        flight = fly_lockstep(profile, seed, log)
-    except (SafetyAbort, TimedOut) as error:
-        if log is not None:
-            log.abandon(str(error))
-        return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
-    summary = None if log is None else flight.conclude(log)
-    return FlightResult(
-        seed=seed,
-        outcome=OUTCOMES[flight.end],
-        reason=flight.report.reason,
-        miss_m=flight.perched_miss_m,
-        time_s=flight.report.duration_s,
-        attempts=flight.report.attempts,
-        locked=flight.locked,
-        fell=flight.fell,
-        log=None if log is None else log.path,
-        log_problem=None if summary is None else summary.log_problem,
-    )
+    return fly_measured(profile, seed, fly)
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:

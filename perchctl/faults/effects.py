@@ -16,7 +16,7 @@ from typing import Any
 from perchctl.faults.edges import CameraFault, Edges, PlantedError
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
-from perchctl.mission import Event, Phase, Tick
+from perchctl.mission import Phase, Tick
 from perchctl.profile import Profile
 from perchctl.sim import CaptureFault, Scenario
 
@@ -275,11 +275,9 @@ def sooner_s(effect: Effect) -> float:
 
 
 class Injector:
-    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. It follows the phases
-    as a watcher of the loop; `each` is called every `SAMPLE_S` of simulated time. `begin_s` is
-    None until they begin, `flown` is the phase of the newest tick."""
-
-    problem: str | None = None
+    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. `tick` is called with
+    each of the loop, `each` every `SAMPLE_S` of simulated time. `begin_s` is None until they
+    begin, `flown` is the phase of the newest tick."""
 
     def __init__(
         self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
@@ -298,10 +296,8 @@ class Injector:
                     partial(_measure, edges, random.Random(edges.vehicle.scenario.seed))
                 )
 
-    def event(self, event: Event) -> None:
-        return None
-
     def tick(self, tick: Tick) -> None:
+        """Note the phase, and when the effects are due."""
         if self.flown is None and self._shakes_mps2:
             self._edges.vehicle.firmware.estimator.shift_accelerometer(self._shakes_mps2)
         self.flown = tick.state.phase

@@ -92,10 +92,10 @@ class FaultyFlight:
         if case.landed_from is not None:
             lands = (partial(e.operator, presses_s=(0.0,), hang_up=True),)
             self._injectors.append(e.Injector(edges, lands, case.landed_from, case.landed_after_s))
-        watchers: tuple[Watcher, ...] = (*self._injectors, self)
+        watchers: tuple[Watcher, ...] = (self,)
         if log is not None:
             log.truth = self._for_log
-            watchers = (*watchers, log)
+            watchers = (self, log)
         pipeline = make_pipeline(profile, camera)
         seen = source if log is None else log.watched(source)
         self._parts = FlightParts(
@@ -139,7 +139,9 @@ class FaultyFlight:
         return self._result(end, reason, report, end_s)
 
     def tick(self, tick: Tick) -> None:
-        return None
+        """Show the tick to the injectors."""
+        for injector in self._injectors:
+            injector.tick(tick)
 
     def event(self, event: Event) -> None:
         """Give the claims of a rescue's note to the oracle."""
