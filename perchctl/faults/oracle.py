@@ -13,24 +13,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
 
-Claim = Literal[
-    "hangs on the target",
-    "held off the target",
-    "hangs",
-    "stands",
-    "hangs or stands",
-    "motors off",
-    "locked",
-    "ended by the supervisor",
-    "tilted",
-    "not seen down",
-]
-"""A claim of hanging or standing includes that the motors are off. `not seen down` claims that
-no telemetry has shown the vehicle at rest with its motors off."""
+Claim = str
+"""One that `Oracle._is_true` knows. A claim of hanging or standing includes that the motors are
+off. `not seen down` claims that no telemetry has shown the vehicle at rest with its motors off."""
 Flag = str
 FLAGS: dict[Flag, str] = {
     "crashed": "perchctl ended by an exception that no fault planted",
@@ -322,29 +311,22 @@ class Oracle:
 
     def _is_true(self, claim: Claim, s: Sample) -> bool:
         hangs = s.hanging and not s.motors_on
+        off_m = math.hypot(s.miss_m, s.below_m)
         # What lies on its side or its back does not stand.
         stands = not s.motors_on and not _airborne(s) and s.up_z > self._tilted_up_z
-        match claim:
-            case "hangs on the target":
-                return hangs and s.miss_m <= self._magnet_radius_m
-            case "held off the target":
-                return hangs and math.hypot(s.miss_m, s.below_m) > self._magnet_radius_m
-            case "hangs":
-                return hangs
-            case "stands":
-                return stands
-            case "hangs or stands":
-                return hangs or stands
-            case "motors off":
-                return not s.motors_on
-            case "locked":
-                return s.locked
-            case "ended by the supervisor":
-                return self._ended_by_vehicle
-            case "tilted":
-                return self._least_up_z < self._tilt_up_z
-            case "not seen down":
-                return not self._seen_down.holds(s.t_s)
+        truths = {
+            "hangs on the target": hangs and s.miss_m <= self._magnet_radius_m,
+            "held off the target": hangs and off_m > self._magnet_radius_m,
+            "hangs": hangs,
+            "stands": stands,
+            "hangs or stands": hangs or stands,
+            "motors off": not s.motors_on,
+            "locked": s.locked,
+            "ended by the supervisor": self._ended_by_vehicle,
+            "tilted": self._least_up_z < self._tilt_up_z,
+            "not seen down": not self._seen_down.holds(s.t_s),
+        }
+        return truths[claim]
 
     def _watch_stop(self, s: Sample) -> None:
         """Judge obedience to the emergency stop, but only while packets arrive. Motors that are
@@ -424,7 +406,7 @@ def last_row(report: FlightReport) -> str:
 def claims_of(report: FlightReport) -> Claims:
     """Return all claims that a report makes about the vehicle."""
     claims = ROW_CLAIMS.get(last_row(report), set()) | PHASE_CLAIMS.get(report.phase, set())
-    locked: Claims = {"locked"} if report.locked else set()
+    locked = {"locked"} if report.locked else set()
     return claims | OUTCOME_CLAIMS[report.outcome] | locked
 
 
