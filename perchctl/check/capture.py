@@ -1,19 +1,17 @@
 """The motion capture that gives a vehicle its position: answers, body, rate, noise, axes.
 
 `listen` hears vehicle and capture for a while; `mocap_rows_at_rest` judges that at rest, and
-`hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure, and nothing is sent.
+`hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure.
 
-The vehicle's own attitude knows how it is turned, and which way is up; the capture says the same
-in its own axes. With R_own and R_seen the attitudes that both have of it, and A the capture's
-world, B the rigid body's axes, where they should be none:
+With R_own and R_seen the attitudes that vehicle and capture have of it, and A the capture's world,
+B the rigid body's axes, where they should be none:
 
     R_seen = A R_own B
 
-A turn between two moments, as a vector, is ``A w`` in the capture's world where the vehicle has
-``w``, and ``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors,
-each solved by least squares (`Rotation.align_vectors`). A's turn about the
-vertical is the capture's own affair, since the vehicle's heading is set by it; its tilt is
-another axis up. B is a body whose axes were not defined along the vehicle's.
+A turn between two moments is ``A w`` in the capture's world where the vehicle has ``w``, and
+``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors. A's turn
+about the vertical is the capture's own affair, its tilt is another axis up; B is a body whose axes
+were not defined along the vehicle's.
 """
 
 from __future__ import annotations

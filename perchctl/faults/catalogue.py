@@ -25,7 +25,7 @@ from perchctl.sim import Neighbour, Scenario
 P = Phase
 STREAM = 510
 LONGEST_S, EVER_SHARE = 30.0, 0.25
-"""Most losses last for up to `LONGEST_S`, a part of them for ever."""
+"""A loss lasts for 0.1 s to `LONGEST_S`, and a part of them for ever."""
 
 
 # --- Draws ------------------------------------------------------------
@@ -260,9 +260,9 @@ class Fault:
 
 FAULTS: tuple[Fault, ...] = (
     # The link.
-    Fault("downlink-silent", "no telemetry for 0.1 s to ever", radio(down="all")),
-    Fault("uplink-silent", "no command arrives for 0.1 s to ever", NO_UPLINK),
-    Fault("link-silent", "both ways silent for 0.1 s to ever", radio(up=True, down="all")),
+    Fault("downlink-silent", "no telemetry", radio(down="all")),
+    Fault("uplink-silent", "no command arrives", NO_UPLINK),
+    Fault("link-silent", "both ways silent", radio(up=True, down="all")),
     Fault(
         "landing-lost",
         "the operator lands, but 1 or 2 landing orders are lost",
@@ -284,7 +284,7 @@ FAULTS: tuple[Fault, ...] = (
         (lost("emergency-stop"), drawn(e.operator, presses_s=(0.0, 0.8))),
     ),
     Fault("packet-twice", "a packet arrives twice", _packet_twice),
-    Fault("state-block-dead", "no position and velocity for 0.1 s to ever", radio(down="state")),
+    Fault("state-block-dead", "no position and velocity", radio(down="state")),
     Fault("attitude-block-dead", "no attitude, thrust, supervisor", radio(down="attitude")),
     Fault("battery-block-dead", "no battery voltage", radio(down="battery")),
     Fault("variance-block-dead", "no variance", radio(down="variance")),
@@ -294,7 +294,7 @@ FAULTS: tuple[Fault, ...] = (
         drawn(e.radio_loss, down="all", delay_s=log_between(0.05, 2.0), for_s=lasting(0.5)),
     ),
     # The camera.
-    Fault("camera-silent", "no picture for 0.1 s to ever", camera("silent")),
+    Fault("camera-silent", "no picture", camera("silent")),
     Fault("camera-frozen", "the same picture again and again", camera("frozen")),
     Fault("camera-snow", "a receiver's snow", camera("snow")),
     Fault("camera-dark", "a nearly black picture", camera("dark")),
@@ -345,7 +345,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "external-occluded",
-        "the body is hidden for 0.3 s to ever",
+        "the body is hidden",
         drawn(e.external_positions, how="occluded", for_s=either(0.5, 0.3, lasting(0.5))),
     ),
     Fault("external-swapped", "another body takes its name", wrong_positions("swapped")),
@@ -425,7 +425,7 @@ FAULTS: tuple[Fault, ...] = (
     # The program.
     Fault("killed", "killed at once", drawn(e.killed)),
     Fault("suspended", "suspended for 0.3 to 5 s", drawn(e.suspended, for_s=log_between(0.3, 5.0))),
-    Fault("hung", "the loop is stuck for 0.3 s to ever", HUNG),
+    Fault("hung", "the loop is stuck", HUNG),
     Fault(
         "slow",
         "turns take 0.1 to 0.4 s",
@@ -481,7 +481,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("brown-out", "the vehicle starts again", drawn(e.reboots, boots_s=between(0.5, 1.5))),
     Fault(
         "deck-silent",
-        "the deck's positions end for 0.3 s to ever",
+        "the deck's positions end",
         drawn(e.deck_silent, for_s=lasting(0.3), acc_z_mps2=signed(between(0.03, 0.08))),
     ),
 )
