@@ -1,8 +1,7 @@
 """The workers of a dask cluster as an executor of flights, by dask's own executor.
 
 A flight elsewhere is the flight here only by the same program, libraries and data. Each worker
-compares its own state with this computer's before its first flight. The program is known by its
-source, not by a version that two states of a checkout share.
+compares its own state with this computer's before its first flight.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The same seeds flown by several profiles: what differs, and whether it is proven.
 
-Each seed is its own pair, so what differs from seed to seed takes no part. A figure's difference
-is the mean over the pairs, with Student's interval; success is compared by the pairs in which only
-one of both succeeded (McNemar's test, the exact one). All questions that are asked together err
-together in one comparison of twenty at most: each gets its part of the 5 %.
+A figure's difference is the mean over the pairs of flights of one seed, with Student's interval;
+success is compared by the pairs in which only one of both succeeded (McNemar's exact test). All
+questions together err in one comparison of twenty at most: each gets its part of the 5 %.
 """
 
 from __future__ import annotations
@@ -77,8 +76,7 @@ None where nothing is proven:
   A's) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
 """
 FEWEST_PAIRS = 20
-"""Fewer pairs get no interval: differences are not normally distributed, and only the mean of
-many nearly is."""
+"""Fewer pairs get no interval, since only the mean of many is nearly normal."""
 _SAME = 1e-9
 """Values whose relative difference is below this differ by rounding only."""
 NOT_PROVEN = "no difference proven"

@@ -53,8 +53,7 @@ def _give_back_memory() -> None:
     many flights later."""
     gc.collect()
     if not gc.get_freeze_count():
-        # What is left are the program's own modules and what it keeps for all flights: nothing
-        # to look through again and again, which takes as long as 30 pictures.
+        # What is left is kept for all flights; to look through it takes as long as 30 pictures.
         gc.freeze()
 
 

@@ -1,7 +1,6 @@
 """The camera and the target in it: rows from a rehearsal on its pictures. Pure.
 
-Where the target is the positioning system, two more rows say from how far it is seen, and whether
-it is in view.
+Where the target is the positioning system, one more row says whether it is in view.
 """
 
 from __future__ import annotations
@@ -111,8 +110,7 @@ def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Judge how old pictures are when they have been searched; only the profile knows the way from
-    the sensor."""
+    """Judge how old pictures are when they have been searched."""
     if not rehearsal.live or not rehearsal.ages_s:
         return skipped("none was looked at" if rehearsal.live else "a recording")
     age_s, limit_s = float(np.quantile(rehearsal.ages_s, 0.95)), profile.safety.max_frame_age_s
@@ -219,8 +217,7 @@ def names_of(profile: Profile) -> tuple[str, ...]:
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Judge the loop by a rehearsal: the time for a picture against that between two, and the turns
-    that begin later than half a period."""
+    """Judge the loop by the time for a picture, and by the turns that begin late."""
     if rehearsal is None or len(rehearsal.work_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:

@@ -128,11 +128,7 @@ def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
 
 
 def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Judge how often the body is seen, and how well, at rest.
-
-    Between two frames at 20 Hz a vehicle falls by 12 mm. The noise is that of the worst axis, about
-    the middle: a few wild ones do not make it.
-    """
+    """Judge how often the body is seen, and how well, at rest; the noise is of the worst axis."""
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
@@ -192,8 +188,7 @@ LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 STILL_RAD, STILL_M = math.radians(4.0), 0.03
 MANY_SHARE = 0.9
-"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`. A
-spread over all of them would say so of who turns far and tilts little, or lets it stand long."""
+"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`."""
 UPRIGHT_DEG, BODY_WARN_DEG, BODY_FAIL_DEG = 25.0, 5.0, 15.0
 LIFTED_M = 0.12
 REACH_M = 5.0
@@ -314,9 +309,7 @@ def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Findi
         turned_deg = math.degrees(own_rad)
         return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
     if turns.unexplained > STRANGER:
-        advice = (
-            "it is another body's, or its markers are too few or too symmetric to tell its turns"
-        )
+        advice = "it is another body's, or its markers are too few or too symmetric"
         return failed(f"the {body} does not turn as the vehicle does", advice)
     return _world_finding(turns, moved) or _body_finding(turns, moved, config)
 
@@ -362,8 +355,7 @@ def _body_finding(turns: Turns, moved: PairedMotion, config: PositioningConfig) 
         verdict = failed if off_deg > BODY_FAIL_DEG else warned
         return verdict(
             f"the rigid body's axes are turned by {off_deg:.0f} deg against the vehicle's",
-            f"set positioning.body_rpy_deg: [{wanted}], or define the body anew with the vehicle "
-            f"along x",
+            f"set positioning.body_rpy_deg: [{wanted}], or define the body anew",
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
     risen_m = float(_risen_m(turns, moved) @ turns.up)

@@ -1,7 +1,6 @@
 """What a profile shows about a flight before anything is opened: the check's rows of it.
 
-What no flight could end well with is refused when the profile is read; here is what is allowed,
-and was hardly meant. `fly` asks the same, with the computer's disk, before it connects.
+Here is what is allowed, and was hardly meant. `fly` asks the same before it connects.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import without_password
 from perchctl.check.row import (
     Finding,
     Row,
@@ -101,9 +99,8 @@ def _calibration(plan: _Plan) -> Finding:
         return failed(str(error), "make one with perchctl calibrate")
     if not plan.source.startswith("sim:") and is_shipped_example(path):
         return warned(
-            f"{path.name} is the shipped example, and {without_password(plan.source)} a camera of "
-            f"your own",
-            "calibrate it (perchctl calibrate), and name the file in camera.calibration",
+            f"{path.name} is the shipped example",
+            "calibrate your camera (perchctl calibrate), and name the file in camera.calibration",
         )
     return passed(path.name)
 
@@ -163,8 +160,7 @@ def _latency(plan: _Plan) -> Finding:
     if isinstance(latency_s, str):
         return passed("measured by each flight")
     return warned(
-        f"camera.latency_s is {1e3 * latency_s:g} ms, and the position is by the pictures: one "
-        f"that is 30 ms wrong makes the vehicle swing under the target",
+        f"camera.latency_s is {1e3 * latency_s:g} ms; 30 ms wrong makes the vehicle swing",
         "set camera.latency_s: measured",
     )
 

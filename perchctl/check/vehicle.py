@@ -96,8 +96,7 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
 
 
 def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
-    """Judge the link by its echoes. From 10 % on one lost notify has locked a vehicle that hung
-    well."""
+    """Judge the link by its echoes, and a radio's by its quality, too."""
     sent, quality = len(vehicle.echoes), vehicle.quality
     back_s = sorted(filter(math.isfinite, vehicle.echoes))
     if not back_s:
@@ -106,10 +105,7 @@ def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
     found = f"{100.0 * lost:.1f} % of {sent} lost, 95 % back in {1e3 * p95_s:.1f} ms"
     if quality is not None:
         found += f", link quality {quality:.0f} %"
-    advice = (
-        "bring the radio nearer, choose a channel away from Wi-Fi (above 80), close other programs "
-        "that use the radio or the processor"
-    )
+    advice = "bring the radio nearer, choose a channel above 80, close other programs"
     limit_s = profile.safety.proof_age_s
     return worst(
         by_limits(lost, 0.01, 0.05, found, advice),

@@ -1,8 +1,7 @@
 """Where physics or the firmware leave no better end, and what is then expected.
 
-An expected outcome takes away the flags it names, and no other, where they were raised after its
-cause began and within a stated time of it. Its cause is what was true in the flight (`Facts`), not
-what was drawn, and not what the program reported.
+Its cause is what was true in the flight (`Facts`), not what was drawn, and not what the program
+reported.
 """
 
 from __future__ import annotations

@@ -2,9 +2,7 @@
 
 The oracle is given samples of the true vehicle (`Sample`) while the flight and the time
 after it pass. It is told when the operator pressed Ctrl-C, when the program ended, and what it
-claimed, and raises flags, the gravest first (docs/campaigns.md, "Faults"). A vehicle that the
-magnet lets go of with its motors still is judged by how deep it falls until it is caught
-(`drop_limit_m`); the floor is too deep.
+claimed, and raises flags (docs/campaigns.md, "Faults").
 """
 
 from __future__ import annotations
@@ -50,8 +48,7 @@ PRESSED_S, RELEASED_S = 4.0, 0.2
 ASTRAY_M, TOO_HIGH_M = 1.0, 0.3
 ALONE_S = 5.0
 TILT_WITHIN_DEG = 10.0
-"""A claim of excess tilt is accepted from this much below the limit, since the program knows
-only an estimate."""
+"""A claim of excess tilt is accepted from this much below the limit."""
 CLAIM_S = 0.5
 """A claim must become true within this time (motors are cut 25 ms after the order)."""
 SAY_OFF: frozenset[Claim] = frozenset(
@@ -103,8 +100,7 @@ def drop_limit_m(hold_ratio: float) -> float:
 
 
 def second_press_s(presses_s: Sequence[float]) -> float | None:
-    """Return when the operator's presses amounted to an emergency stop; None if never. The
-    oracle applies the rule itself rather than trust the program's switch."""
+    """Return when the operator's presses amounted to an emergency stop; None if never."""
     run_s = presses_s[0] if presses_s else 0.0
     for before_s, press_s in pairwise(presses_s):
         if press_s - before_s >= SILENCE_S:
@@ -353,8 +349,6 @@ def _airborne(s: Sample) -> bool:
 
 
 # --- What the program says at its end, as claims that are true or false of a vehicle ---
-# A flight ends by a row of the mission's table, in a phase, with an outcome; each of the three
-# becomes a sentence or an exit code that somebody acts on.
 
 
 Claims = set[Claim]

@@ -220,8 +220,6 @@ class FactsRecorder(Facts):
 
 
 # --- What a flight is held to -----------------------------------------
-# Where it should be in each phase, and by when it should be on its way down. Neither goes by the
-# program's estimate: that may be what is wrong.
 
 
 Place = tuple[float, float]
@@ -254,7 +252,7 @@ class PlaceBound:
     estimate, alignment and recovery; under a target in ascent, press and completion; and from the
     landing on where it should have been when the landing began.
 
-    Each target that looks like the own one counts: nothing on board can tell them apart.
+    Each target that looks like the own one counts.
     """
 
     def __init__(self, scenario: Scenario, profile: Profile) -> None:
