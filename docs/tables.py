@@ -24,7 +24,6 @@ if str(ROOT) not in sys.path:
 from perchctl.camera import FrameSource  # noqa: E402
 from perchctl.errors import EXIT_CODES  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
-from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
@@ -184,10 +183,6 @@ def expected_outcomes() -> str:
     )
 
 
-def promises() -> str:
-    return "\n".join(f"- **{p.what}**: {p.happens}" for p in PROMISES.values())
-
-
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (table.AIR, "in the air"),
     (FLYING_PHASES, "before landing"),
@@ -255,7 +250,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "log-fields": log_fields,
     "exit-codes": exit_codes,
     "expected-outcomes": expected_outcomes,
-    "promises": promises,
 }
 
 

@@ -87,7 +87,7 @@ MOST_NAMES = {
     "analysis": 10,
     "calibration": 16,
     "camera": 17,
-    "campaign": 22,
+    "campaign": 20,
     "check": 8,
     "commands": 2,
     "display": 6,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.campaign import FlightResult, VariantResult
+from perchctl.campaign import FlightResult
 from perchctl.profile import Profile, load_profile
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import ROOT
@@ -41,7 +42,7 @@ def no_flights(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     ) -> None:
         for seed in seeds:
             for number, profile in enumerate(profiles):
-                note(VariantResult(number, fly(profile, seed)))
+                note(replace(fly(profile, seed), variant=number))
 
     monkeypatch.setattr(FLY_VARIANTS, variants)
 
@@ -99,5 +100,5 @@ def test_sixty_pairs_find_an_integral_that_is_off_and_nothing_between_a_profile_
     assert record["profile"] == {KEY: {"a": 0.4, "b": 0.0}}
     assert record["success"]["better"] == record["time_s"]["better"] == "A"
     said = run(*flown, "copy.yaml").stdout
-    assert "identical in all 60 flights\nthe profiles do not differ\n" in said
+    assert "\nthe profiles do not differ\n" in said
     assert "better" not in said

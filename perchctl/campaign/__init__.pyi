@@ -1,5 +1,4 @@
 from .cluster import cluster_pool as cluster_pool
-from .compare import VariantResult as VariantResult
 from .compare import compare_variants as compare_variants
 from .compare import comparison_text as comparison_text
 from .compare import fly_variants as fly_variants
@@ -16,7 +15,6 @@ from .results import align_columns as align_columns
 from .results import campaign_summary as campaign_summary
 from .results import campaign_table as campaign_table
 from .results import none_took_off as none_took_off
-from .results import peak_mb as peak_mb
 from .results import rate_record as rate_record
 from .results import rate_text as rate_text
 from .results_file import campaign_results as campaign_results

@@ -1,8 +1,7 @@
 """The workers of a dask cluster as an executor of flights, by dask's own executor.
 
 A flight elsewhere is the flight here only by the same program, libraries and data. Each worker
-compares its own state with this computer's before its first flight. The program is known by its
-source, not by a version that two states of a checkout share.
+compares its own state with this computer's before its first flight.
 """
 
 from __future__ import annotations
@@ -42,48 +41,38 @@ _QUIET = ("distributed", "tornado", "asyncio")
 _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
 """The libraries that compute a flight's figures or carry them between computers; OpenCV has
 several package names and is compared apart."""
-_SHORT = 8
 
 
 # --- What each worker must have ---------------------------------------
 
 
-State = dict[str, str]
-"""What decides a flight in a process, by name."""
-
-
 @dataclass(frozen=True)
 class WorkerRequirements:
     """What each worker of a campaign must have; sent with each flight. `campaign` is a name of its
-    own, `state` that of this computer."""
+    own, `state` what decides a flight on this computer, by name."""
 
     campaign: str
     profiles: tuple[Profile, ...]
-    state: State
+    state: dict[str, str]
 
 
-def process_state(profiles: Sequence[Profile], threads: int) -> State:
-    """Return the program, its libraries, the files of the `profiles`, and how many flights this
-    process flies at a time."""
-    state = {
-        "perchctl": f"{perchctl.__version__} ({source_sha256()[:_SHORT]})",
+def process_state(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
+    """Return the program, its libraries, the `profiles` with their files, and how many flights
+    this process flies at a time."""
+    return {
+        "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
         "python": ".".join(platform.python_version_tuple()[:2]),
         "opencv": cv2.__version__,
         **{name: version(name) for name in _LIBRARIES},
         "--nthreads": str(threads),
+        "calibration or mask": " ".join(profile_sha256(profile)[:8] for profile in profiles),
     }
-    for profile in profiles:
-        files = filter(None, (profile.camera.calibration, profile.camera.mask))
-        state[" and ".join(map(str, files)) or profile.name] = profile_sha256(profile)[:_SHORT]
-    return state
 
 
 def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
     """Return the requirements of a campaign that begins now."""
-    # Their values are sent with each flight; of those that name the same files one is compared.
-    different = tuple({(p.camera.calibration, p.camera.mask): p for p in profiles}.values())
-    state = process_state(different, threads=1)
-    return WorkerRequirements(secrets.token_hex(16), different, state)
+    state = process_state(profiles, threads=1)
+    return WorkerRequirements(secrets.token_hex(16), tuple(profiles), state)
 
 
 _differences: dict[str, str] = {}

@@ -1,9 +1,8 @@
 """The same seeds flown by several profiles: what differs, and whether it is proven.
 
-Each seed is its own pair, so what differs from seed to seed takes no part. A figure's difference
-is the mean over the pairs, with Student's interval; success is compared by the pairs in which only
-one of both succeeded (McNemar's test, the exact one). All questions that are asked together err
-together in one comparison of twenty at most: each gets its part of the 5 %.
+A figure's difference is the mean over the pairs of flights of one seed, with Student's interval;
+success is compared by the pairs in which only one of both succeeded (McNemar's exact test). All
+questions together err in one comparison of twenty at most: each gets its part of the 5 %.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -33,43 +32,27 @@ from perchctl.plain_yaml import clip_text, split_values
 from perchctl.profile import Profile, changed_profile, profile_value, scalar_text
 
 
-@dataclass(frozen=True)
-class VariantResult:
-    """The result of one seed, flown by the profile of that `number`."""
-
-    number: int
-    result: FlightResult
-
-    @property
-    def seed(self) -> int:
-        return self.result.seed
-
-    @property
-    def outcome(self) -> str:
-        return self.result.outcome
-
-
 def fly_variants(
     profiles: Sequence[Profile],
     seeds: Iterable[int],
     executor: Executor | None = None,
-    on_result: Callable[[VariantResult], None] = lambda result: None,
-) -> list[VariantResult]:
+    on_result: Callable[[FlightResult], None] = lambda result: None,
+) -> list[FlightResult]:
     """Fly each seed by all profiles before the next seed; arguments and errors as of `fly_all`."""
     variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
 
-def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> VariantResult:
+def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> FlightResult:
     seed, number = variant
-    return VariantResult(number, fly_seed(profiles[number], seed))
+    return replace(fly_seed(profiles[number], seed), variant=number)
 
 
-def whole_seeds(results: Iterable[VariantResult], profiles: int) -> list[tuple[FlightResult, ...]]:
+def whole_seeds(results: Iterable[FlightResult], profiles: int) -> list[tuple[FlightResult, ...]]:
     """Return, in the order of the seeds, the results of each seed that all profiles have flown."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
-        by_seed.setdefault(each.seed, {})[each.number] = each.result
+        by_seed.setdefault(each.seed, {})[each.variant] = each
     return [
         tuple(flown[number] for number in range(profiles))
         for _, flown in sorted(by_seed.items())
@@ -85,7 +68,7 @@ Comparison = dict[str, Any]
 """What is known of two flights a seed, A's and B's, ready for JSON, in SI; `better` is "A", "B", or
 None where nothing is proven:
 
-- `flights`, and how many of them ended the same in all that a result tells, `identical`;
+- `flights`;
 - `success` (perched, neither locked nor fallen): the rates of `A` and `B`; the seeds of which only
   one succeeded, `only_a` and `only_b`; the chance `p` that they split so unevenly, times the
   questions that were asked; `better`;
@@ -93,8 +76,7 @@ None where nothing is proven:
   A's) with its `interval` (None for fewer than `FEWEST_PAIRS`), and `better`.
 """
 FEWEST_PAIRS = 20
-"""Fewer pairs get no interval: differences are not normally distributed, and only the mean of
-many nearly is."""
+"""Fewer pairs get no interval, since only the mean of many is nearly normal."""
 _SAME = 1e-9
 """Values whose relative difference is below this differ by rounding only."""
 NOT_PROVEN = "no difference proven"
@@ -108,7 +90,7 @@ name, its unit, and the number of units in one of SI."""
 MISS = ("miss_m",)
 
 
-def compare_variants(results: Iterable[VariantResult]) -> Comparison:
+def compare_variants(results: Iterable[FlightResult]) -> Comparison:
     """Return the comparison of two profiles by the seeds that both have flown."""
     return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
 
@@ -122,14 +104,9 @@ def compare_pairs(
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
         "flights": len(pairs),
-        "identical": sum(_ending(a) == _ending(b) for a, b in pairs),
         "success": _success(pairs, questions),
         **{key: _difference(key, pairs, level) for key in figures},
     }
-
-
-def _ending(r: FlightResult) -> tuple[Any, ...]:
-    return r.outcome, r.reason, r.miss_m, r.time_s, r.attempts, r.locked, r.fell
 
 
 def _success(pairs: Sequence[Pair], questions: int) -> dict[str, Any]:
@@ -172,7 +149,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     """Return the comparison as a table, followed by what is proven."""
-    flights, identical, success = found["flights"], found["identical"], found["success"]
+    flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
     only = f"only A {success['only_a']}, only B {success['only_b']}"
@@ -180,8 +157,6 @@ def comparison_text(names: tuple[str, str], found: Comparison) -> str:
     rows.append(("success", *rates, only, f"{verdict} (p = {success['p']:.2g})"))
     rows += [_figure_row(key, found[key]) for key in FIGURES if key in found]
     lines = [*align_columns(rows), ""]
-    if 0 < identical == flights:
-        return "\n".join([*lines, f"identical in all {flights} flights"])
     together = (
         f"the {len(rows) - 1} answers hold together at {100 * LEVEL:.0f} %: intervals of "
         f"differences and p are widened for it"
@@ -217,7 +192,7 @@ class Sweep:
     key: str
     profiles: tuple[Profile, ...]
 
-    def record(self, results: Sequence[VariantResult]) -> dict[str, Any]:
+    def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
         """Return the figures of each value (a cell), by the seeds that were flown with every
         value, for JSON. `best`: the value with the most successes, of these the one with the
         smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 import os
 import time
@@ -15,7 +13,7 @@ from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.campaign.results import FlightEnd, FlightResult, peak_memory_mb
+from perchctl.campaign.results import FlightEnd, FlightResult
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Phase
@@ -39,27 +37,24 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
     """Call `fly` with the seed's scenario on one core, and return its result (a dataclass) with
-    the CPU time, the peak memory and the scenario filled in. The flight's memory is freed."""
+    the CPU time and the scenario filled in. The flight's memory is freed."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     cpu_began_s = time.process_time()
     scenario = draw_scenario(profile, seed)
     result: Any = fly(scenario)
     cpu_s = time.process_time() - cpu_began_s
     _give_back_memory()
-    flown: R = replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
+    flown: R = replace(result, cpu_s=cpu_s, scenario=scenario)
     return flown
 
 
 def _give_back_memory() -> None:
     """Free the memory of a flight. Its objects refer to each other, so Python would free them
-    many flights later; and the C library keeps small pieces that it gets back."""
+    many flights later."""
     gc.collect()
     if not gc.get_freeze_count():
-        # What is left are the program's own modules and what it keeps for all flights: nothing
-        # to look through again and again, which takes as long as 30 pictures.
+        # What is left is kept for all flights; to look through it takes as long as 30 pictures.
         gc.freeze()
-    with contextlib.suppress(AttributeError, OSError):  # glibc has it, others do not
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def fly_seed(
@@ -69,30 +64,30 @@ def fly_seed(
     process or machine. `record` writes the pictures beside the log. A flight that is refused
     before take-off is a result, too, and leaves no log. Errors: NotFound, InvalidValue
     (calibration, log)."""
-    return fly_measured(profile, seed, lambda _: _fly(profile, seed, log_path, record))
 
+    def fly(_scenario: Scenario) -> FlightResult:
+        log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
+        try:
+            flight = fly_lockstep(profile, seed, log)
+        except (SafetyAbort, TimedOut) as error:
+            if log is not None:
+                log.abandon(str(error))
+            return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
+        summary = None if log is None else flight.conclude(log)
+        return FlightResult(
+            seed=seed,
+            outcome=OUTCOMES[flight.end],
+            reason=flight.report.reason,
+            miss_m=flight.perched_miss_m,
+            time_s=flight.report.duration_s,
+            attempts=flight.report.attempts,
+            locked=flight.locked,
+            fell=flight.fell,
+            log=log_path,
+            log_problem=None if summary is None else summary.log_problem,
+        )
 
-def _fly(profile: Profile, seed: int, log_path: Path | None, record: bool) -> FlightResult:
-    log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
-    try:
-        flight = fly_lockstep(profile, seed, log)
-    except (SafetyAbort, TimedOut) as error:
-        if log is not None:
-            log.abandon(str(error))
-        return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
-    summary = None if log is None else flight.conclude(log)
-    return FlightResult(
-        seed=seed,
-        outcome=OUTCOMES[flight.end],
-        reason=flight.report.reason,
-        miss_m=flight.perched_miss_m,
-        time_s=flight.report.duration_s,
-        attempts=flight.report.attempts,
-        locked=flight.locked,
-        fell=flight.fell,
-        log=None if log is None else log.path,
-        log_problem=None if summary is None else summary.log_problem,
-    )
+    return fly_measured(profile, seed, fly)
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:
@@ -145,8 +140,8 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         raise
     except lost as error:
         raise PerchError(
-            f"the process that flew seed {seed} was ended from outside, and so were those that "
-            f"flew it again (where memory is short, fly fewer at a time: --jobs)"
+            f"a process that flew seed {seed} or another was ended from outside: where memory is "
+            f"short, fly fewer at a time (--jobs), and go on with --out by --resume"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(

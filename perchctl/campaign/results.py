@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -28,8 +27,6 @@ class CampaignFlight:
     Attributes:
         log, log_problem: the flight's log, and what it lacks; None without.
         cpu_s: what it took of a core.
-        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
-            bytes).
         scenario: what the seed drew.
     """
 
@@ -39,7 +36,6 @@ class CampaignFlight:
     log: Path | None = None
     log_problem: str | None = None
     cpu_s: float = 0.0
-    peak_memory_mb: float = 0.0
     scenario: Scenario | None = None
 
     @property
@@ -60,6 +56,7 @@ class FlightResult(CampaignFlight):
         attempts: perching attempts, the successful one included.
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
+        variant: the number of the profile that flew it, where several are compared.
     """
 
     outcome: FlightEnd
@@ -69,6 +66,7 @@ class FlightResult(CampaignFlight):
     attempts: int
     locked: bool
     fell: bool
+    variant: int = 0
 
     @property
     def is_bad(self) -> bool:
@@ -92,7 +90,6 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
         "locked": sum(r.locked for r in results),
         "fell": sum(r.fell for r in results),
         "miss_m": miss_record(misses) | {"max": round(max(misses), 6) if misses else None},
-        "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
@@ -103,24 +100,6 @@ def miss_record(misses_m: Sequence[float]) -> dict[str, float | None]:
         return {"median": None, "p95": None}
     median_m, p95_m = np.percentile(misses_m, (50, 95)).round(6).tolist()
     return {"median": median_m, "p95": p95_m}
-
-
-def peak_mb(results: Iterable[CampaignFlight]) -> float:
-    """Return the largest memory, in 1e6 bytes, that this process or one that flew has held."""
-    peaks = (r.peak_memory_mb for r in results)
-    return round(max([peak_memory_mb(), *peaks]), 1)
-
-
-def peak_memory_mb() -> float:
-    """Return the largest memory, in 1e6 bytes, that this process has held."""
-    status = Path("/proc/self/status")
-    if not status.exists():  # no Linux
-        return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1e-6)
-    # Of getrusage Linux gives a program the peak of the one that started it.
-    for line in status.read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024e-6
-    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024e-6)
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
@@ -186,7 +165,6 @@ def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[t
         attempts = [r.attempts for r in flown]
         rows.append(("flight time [s]", f"median {np.median(times):.1f}, max {max(times):.1f}"))
         rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
-    rows.append(("peak memory [MB]", f"{figures['peak_memory_mb']:.0f}"))
     return rows
 
 

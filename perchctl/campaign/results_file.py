@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
@@ -25,7 +25,6 @@ from perchctl.record import (
     camera_record,
     from_exact,
     json_line,
-    path_beside,
     to_exact,
 )
 
@@ -41,21 +40,16 @@ class CampaignResults(Generic[R]):
         seeds: Sequence[int],
         earlier: dict[int, R],
         file: BinaryIO | None = None,
-        failed_logs_only: bool = False,
     ) -> None:
         self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
         self.left = [seed for seed in seeds if seed not in earlier]
-        self._file, self._failed_logs_only = file, failed_logs_only
+        self._file = file
 
     def note(self, result: R) -> None:
-        """Write the result of a flight, which is on the disk when this returns, and keep or remove
-        its log and recording. Errors: InvalidValue."""
+        """Write the result of a flight, which is on the disk when this returns. Errors:
+        InvalidValue."""
         if self._file is not None:
             _write(self._file, {"kind": "flight", **to_exact(result)})
-        if self._failed_logs_only and result.log is not None and not result.is_bad:
-            for path in (result.log, path_beside(result.log, ".mcap")):
-                with suppress(OSError):
-                    path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -69,18 +63,17 @@ def campaign_results(
     resume: bool = False,
     force: bool = False,
     log_dir: Path | None = None,
-    failed_logs_only: bool = False,
 ) -> Iterator[CampaignResults[R]]:
     """Yield the results of a campaign, which are appended to the file `out`.
 
     An existing file is refused, with `force` replaced, and with `resume` gone on with: it must
-    have been flown with the same program, profile and faults. `failed_logs_only`: of the logs in
-    `log_dir` only those of bad flights stay. Errors: InvalidValue.
+    have been flown with the same program, profile and faults. Errors: InvalidValue, also for a
+    `log_dir` that cannot be written to.
     """
     if log_dir is not None:
         check_place(log_dir / "flight.jsonl", force=True)
     if out is None:
-        yield CampaignResults(seeds, {}, None, failed_logs_only)
+        yield CampaignResults(seeds, {})
         return
     if out.is_file() and not (force or resume):
         raise InvalidValue(
@@ -102,18 +95,7 @@ def campaign_results(
             raise cannot_be_written(out, error) from None
         if not good:
             _write(file, header)
-        yield CampaignResults(seeds, earlier, file, failed_logs_only)
-
-
-def flown_record(result: Any) -> dict[str, Any]:
-    """Return a result as a record of JSON types with exact floats, without log and timings:
-    what equal flights share on all computers."""
-    record: dict[str, Any] = to_exact(result)
-    return {name: value for name, value in record.items() if name not in OF_THE_COMPUTER}
-
-
-OF_THE_COMPUTER = ("cpu_s", "peak_memory_mb", "log", "log_problem")
-"""The fields that differ between computers, or from hour to hour."""
+        yield CampaignResults(seeds, earlier, file)
 
 
 # --- The header -------------------------------------------------------
@@ -178,36 +160,24 @@ def _read(path: Path, header: dict[str, Any], kind: type[R], earlier: dict[int, 
     lines. Errors: InvalidValue if it is no file of results, or of another campaign."""
     data = path.read_bytes()
     good = data[: data.rfind(b"\n") + 1]
-    number = 1
+    if not good and json_line(header).startswith(data):
+        return 0
     try:
-        for number, line in enumerate(good.splitlines(), start=1):
-            record = json.loads(line)
-            if not isinstance(record, dict):
-                raise ValueError("no object")
-            if number == 1:
-                _check_header(path, record, header)
-            elif record.pop("kind", None) != "flight":
-                raise ValueError("no flight")
-            else:
-                result = from_exact(kind, record)
-                earlier.setdefault(result.seed, result)
-        if not good and not json_line(header).startswith(data):
-            raise ValueError("no whole line")
-    except ValueError as error:
+        found, *flights = map(json.loads, good.splitlines())
+        if any(found.get(key) != value for key, value in _FORM.items()):
+            raise ValueError(f"no header of version {VERSION}")
+        results = [from_exact(kind, flight) for flight in flights if flight.pop("kind") == "flight"]
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(
-            f"{path}: line {number}: no line of a campaign's results ({error}): take the original, "
-            f"or name a new file"
+            f"{path}: not the lines of a campaign's results ({error}): take the original, or name "
+            f"a new file"
         ) from None
-    return len(good)
-
-
-def _check_header(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raise ValueError if it is no header, and InvalidValue if it is of another campaign."""
-    if any(found.get(key) != value for key, value in _FORM.items()):
-        raise ValueError(f"no header of version {VERSION}")
-    others = [name for key, name in _MUST_AGREE.items() if found.get(key) != wanted[key]]
+    others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header[key]]
     if others:
         raise InvalidValue(
             f"{path} was flown with another {' and another '.join(others)}: take the same, or name "
             f"another file"
         )
+    for result in results:
+        earlier.setdefault(result.seed, result)
+    return len(good)

@@ -1,19 +1,17 @@
 """The motion capture that gives a vehicle its position: answers, body, rate, noise, axes.
 
 `listen` hears vehicle and capture for a while; `mocap_rows_at_rest` judges that at rest, and
-`hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure, and nothing is sent.
+`hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure.
 
-The vehicle's own attitude knows how it is turned, and which way is up; the capture says the same
-in its own axes. With R_own and R_seen the attitudes that both have of it, and A the capture's
-world, B the rigid body's axes, where they should be none:
+With R_own and R_seen the attitudes that vehicle and capture have of it, and A the capture's world,
+B the rigid body's axes, where they should be none:
 
     R_seen = A R_own B
 
-A turn between two moments, as a vector, is ``A w`` in the capture's world where the vehicle has
-``w``, and ``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors,
-each solved by least squares (`Rotation.align_vectors`). A's turn about the
-vertical is the capture's own affair, since the vehicle's heading is set by it; its tilt is
-another axis up. B is a body whose axes were not defined along the vehicle's.
+A turn between two moments is ``A w`` in the capture's world where the vehicle has ``w``, and
+``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors. A's turn
+about the vertical is the capture's own affair, its tilt is another axis up; B is a body whose axes
+were not defined along the vehicle's.
 """
 
 from __future__ import annotations
@@ -31,7 +29,6 @@ from perchctl.check.row import (
     Finding,
     Row,
     Verdict,
-    ask_all,
     by_limits,
     failed,
     passed,
@@ -86,10 +83,9 @@ def listen(
     clock: Callable[[], float],
     wait: Callable[[float], None],
     for_s: float = CAPTURE_S,
-    is_enough: Callable[[Listened], bool] = lambda so_far: False,
 ) -> Listened:
-    """Hear both for so long, or until it is enough; that is asked every half second."""
-    began_s = asked_s = clock()
+    """Hear both for so long."""
+    began_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[CaptureFrame] = []
     source.poll(began_s)  # what came before is old
@@ -99,10 +95,6 @@ def listen(
         frame = source.poll(now_s)
         if frame is not None:
             frames.append(frame)
-        if now_s - asked_s > 0.5:
-            asked_s = now_s
-            if is_enough(Listened(tuple(telemetry), tuple(frames))):
-                break
         wait(POLL_S)
     return Listened(tuple(telemetry), tuple(frames), source.problem(clock()))
 
@@ -110,11 +102,13 @@ def listen(
 # --- At rest ----------------------------------------------------------
 
 
+BODY_ROWS = ("body", "body place")
+
+
 def refused_rows(why: str, config: PositioningConfig) -> list[Row]:
     """Return the rows of a capture that could not be opened, or sends nothing."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
-    names = ("body", *CAPTURE)
-    return [Row("capture", *failed(why, advice)), *skip_all(names, f"no {config.label}")]
+    return [Row("capture", *failed(why, advice)), *skip_all(BODY_ROWS, f"no {config.label}")]
 
 
 def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
@@ -128,17 +122,13 @@ def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
         others = sorted({name for frame in heard.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
         body = failed(found, "correct positioning.body, or show it to the cameras")
-        return [first, Row("body", *body), *skip_all(CAPTURE, "the rigid body is not seen")]
+        return [first, Row("body", *body), Row("body place", *skipped("the body is not seen"))]
     body = _body(heard, places, profile)
-    return [first, Row("body", *body), *ask_all(CAPTURE, heard, places, profile)]
+    return [first, Row("body", *body), Row("body place", *_place(heard, places, profile))]
 
 
 def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Judge how often the body is seen, and how well, at rest.
-
-    Between two frames at 20 Hz a vehicle falls by 12 mm. The noise is that of the worst axis, about
-    the middle: a few wild ones do not make it.
-    """
+    """Judge how often the body is seen, and how well, at rest; the noise is of the worst axis."""
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
@@ -187,12 +177,6 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
     return passed(f"x {x:.2f}, y {y:.2f}, z {z:.2f} m")
 
 
-CAPTURE: dict[str, Callable[[Listened, list[Placed], Profile], Finding]] = {
-    "body place": _place,
-}
-"""The rows of a body that is seen, in their order."""
-
-
 # --- In a hand --------------------------------------------------------
 
 HOW_TO_TURN = (
@@ -204,8 +188,7 @@ LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 STILL_RAD, STILL_M = math.radians(4.0), 0.03
 MANY_SHARE = 0.9
-"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`. A
-spread over all of them would say so of who turns far and tilts little, or lets it stand long."""
+"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`."""
 UPRIGHT_DEG, BODY_WARN_DEG, BODY_FAIL_DEG = 25.0, 5.0, 15.0
 LIFTED_M = 0.12
 REACH_M = 5.0
@@ -299,15 +282,6 @@ def _has_many_axes(turns: Array) -> bool:
     return bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
 
 
-def is_enough(moved: PairedMotion | None) -> bool:
-    """Return whether it was lifted, turned, tilted and put back: more would tell no more."""
-    if moved is None or turns_of(moved) is None:
-        return False
-    far_m = np.linalg.norm(moved.ways_m, axis=1)
-    is_back = far_m[-1] < STILL_M and _turned_rad(moved.own)[-1] < MOVED_RAD
-    return bool(is_back) and float(far_m.max()) > 2.0 * LIFTED_M
-
-
 def _turned_rad(attitudes: Rotation) -> Array:
     """Return each attitude's turn from the first, (n,)."""
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
@@ -321,13 +295,12 @@ def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Findi
     way_m = float(np.linalg.norm(moved.ways_m, axis=1).max())
     body = f"rigid body {config.body!r}"
     others = "it is another body's: correct positioning.body"
-    moves = own_rad > MOVED_RAD or moved.moved_g > MOVED_G
-    if moves and seen_rad <= STILL_RAD and way_m <= STILL_M:
-        return failed(f"the vehicle moves, and the {body} stands still", others)
-    if not moves and (way_m > MOVED_M or seen_rad > MOVED_RAD):
-        return failed(f"the {body} moves, and the vehicle stands still", others)
-    if not moves:
+    if own_rad <= MOVED_RAD and moved.moved_g <= MOVED_G:
+        if way_m > MOVED_M or seen_rad > MOVED_RAD:
+            return failed(f"the {body} moves, and the vehicle stands still", others)
         return skipped("it was not moved", HOW_TO_TURN)
+    if seen_rad <= STILL_RAD and way_m <= STILL_M:
+        return failed(f"the vehicle moves, and the {body} stands still", others)
     if way_m > REACH_M:
         found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
         return failed(found, "set the unit of the capture's stream to metres")
@@ -336,9 +309,7 @@ def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Findi
         turned_deg = math.degrees(own_rad)
         return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
     if turns.unexplained > STRANGER:
-        advice = (
-            "it is another body's, or its markers are too few or too symmetric to tell its turns"
-        )
+        advice = "it is another body's, or its markers are too few or too symmetric"
         return failed(f"the {body} does not turn as the vehicle does", advice)
     return _world_finding(turns, moved) or _body_finding(turns, moved, config)
 
@@ -357,32 +328,20 @@ def _world_finding(turns: Turns, moved: PairedMotion) -> Finding | None:
     """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.up[2])))))
-    axis = nearest_axis(turns.up)
-    if off_deg > UPRIGHT_DEG and axis is None:
-        found = f"the capture's world is tilted by {off_deg:.0f} deg"
-        return failed(found, "calibrate its volume anew, with z up")
     if off_deg > UPRIGHT_DEG:
+        found, axis = f"the capture's world is tilted by {off_deg:.0f} deg", nearest_axis(turns.up)
+        if axis is not None:
+            found = f"swapped axes: up is {axis} in the motion capture"
         advice = "set its world to z up, and define the rigid body anew with the vehicle level"
-        return failed(f"swapped axes: up is {axis} in the motion capture", advice)
-    if float(_risen_m(turns, moved) @ turns.up) < -LIFTED_M:
-        advice = "its axes are left-handed: calibrate its volume anew, with z up"
-        return failed("mirrored: lifted, the body goes down in the capture", advice)
-    return _sideways(_risen_m(turns, moved))
-
-
-def _sideways(risen_m: Array) -> Finding | None:
-    """Return the finding on a body that rose by (3,) along another axis than z, None of one that
-    rose along z or hardly moved."""
+        return failed(found, advice)
+    risen_m = _risen_m(turns, moved)
     way_m = float(np.linalg.norm(risen_m))
-    if way_m < LIFTED_M:
+    if way_m < LIFTED_M or nearest_axis(risen_m / way_m) == "z":
         return None
-    axis = nearest_axis(risen_m / way_m)
-    if axis == "z":
-        return None
-    along = f"along its {axis}" if axis else f"by x {risen_m[0]:.2f}, y {risen_m[1]:.2f} m"
+    x, y, z = risen_m
     return failed(
-        f"swapped axes: lifted, the body goes {along} in the motion capture",
-        "set its world to z up; if you carried it aside, once more, straight up",
+        f"swapped or mirrored axes: lifted, the body goes by x {x:.2f}, y {y:.2f}, z {z:.2f} m",
+        "set its world to z up, right-handed; if you carried it aside, once more, straight up",
     )
 
 
@@ -396,8 +355,7 @@ def _body_finding(turns: Turns, moved: PairedMotion, config: PositioningConfig) 
         verdict = failed if off_deg > BODY_FAIL_DEG else warned
         return verdict(
             f"the rigid body's axes are turned by {off_deg:.0f} deg against the vehicle's",
-            f"set positioning.body_rpy_deg: [{wanted}], or define the body anew with the vehicle "
-            f"along x",
+            f"set positioning.body_rpy_deg: [{wanted}], or define the body anew",
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
     risen_m = float(_risen_m(turns, moved) @ turns.up)

@@ -1,20 +1,17 @@
 """What a profile shows about a flight before anything is opened: the check's rows of it.
 
-What no flight could end well with is refused when the profile is read; here is what is allowed,
-and was hardly meant. `fly` asks the same, with the computer's disk, before it connects.
+Here is what is allowed, and was hardly meant. `fly` asks the same before it connects.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import without_password
 from perchctl.check.row import (
     Finding,
     Row,
@@ -36,8 +33,6 @@ from perchctl.profile import DOUBTFUL, Profile, find_calibration
 from perchctl.target import mm_text, sees_small_marker
 from perchctl.vision import CameraModel
 
-APART_M = 0.003
-"""A camera is not where the gear is."""
 LOOKS_UP = math.cos(math.radians(45.0))
 """Of the view's upward part: with less the camera does not look at the ceiling."""
 
@@ -51,7 +46,6 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
     plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = ask_all(JUDGES, plan)
     rows += [ask(name, _limits, name, profile) for name in DOUBTFUL]
-    rows.append(ask("way", _way, plan))
     if profile.positioning.by == "target":
         rows.append(ask("latency", _latency, plan))
     return rows
@@ -105,22 +99,10 @@ def _calibration(plan: _Plan) -> Finding:
         return failed(str(error), "make one with perchctl calibrate")
     if not plan.source.startswith("sim:") and is_shipped_example(path):
         return warned(
-            f"{path.name} is the shipped example, and {without_password(plan.source)} a camera of "
-            f"your own",
-            "calibrate it (perchctl calibrate), and name the file in camera.calibration",
+            f"{path.name} is the shipped example",
+            "calibrate your camera (perchctl calibrate), and name the file in camera.calibration",
         )
     return passed(path.name)
-
-
-def _camera_place(plan: _Plan) -> Finding:
-    """Judge the camera's place: no camera is where the gear's tip is. (The profile refuses what
-    lies off the vehicle.)"""
-    place_m = plan.profile.camera.mount.position_m
-    found = f"{' '.join(mm_text(part) for part in place_m)} mm (forward, left, up)"
-    if math.dist(place_m, plan.profile.vehicle.gear_body_m) < APART_M:
-        advice = "measure both: camera.mount.position_m, vehicle.gear_body_m"
-        return warned(f"{found}, where the gear's tip is", advice)
-    return passed(found)
 
 
 def _camera_turn(plan: _Plan) -> Finding:
@@ -150,7 +132,6 @@ def _standoff(plan: _Plan) -> Finding:
 
 JUDGES: dict[str, Callable[[_Plan], Finding]] = {
     "calibration file": _calibration,
-    "camera place": _camera_place,
     "camera turn": _camera_turn,
     "stand-off": _standoff,
 }
@@ -169,19 +150,6 @@ def _limits(name: str, profile: Profile) -> Finding:
     return warned(sentences, f"change {' or '.join(keys)}")
 
 
-def _way(plan: _Plan) -> Finding:
-    """Judge whether the fence leaves room for the way to the target."""
-    profile, safety = plan.profile, plan.profile.safety
-    found = f"fence {safety.fence_radius_m:g} m"
-    away_m = math.hypot(*(profile.planner.approach_xy_m or (0.0, 0.0)))
-    if away_m >= safety.fence_radius_m:
-        return warned(
-            f"{found}: planner.approach_xy_m is {away_m:.2f} m from the estimate's zero",
-            "raise safety.fence_radius_m unless it takes off near that place",
-        )
-    return passed(found)
-
-
 # --- Where the target is the positioning system -----------------------
 
 
@@ -192,8 +160,7 @@ def _latency(plan: _Plan) -> Finding:
     if isinstance(latency_s, str):
         return passed("measured by each flight")
     return warned(
-        f"camera.latency_s is {1e3 * latency_s:g} ms, and the position is by the pictures: one "
-        f"that is 30 ms wrong makes the vehicle swing under the target",
+        f"camera.latency_s is {1e3 * latency_s:g} ms; 30 ms wrong makes the vehicle swing",
         "set camera.latency_s: measured",
     )
 
@@ -203,26 +170,17 @@ def _latency(plan: _Plan) -> Finding:
 
 def log_finding(folder: Path) -> Finding:
     """Judge whether logs can be written to the folder, without making it, and the free space."""
-    there = _existing(folder)
-    advice = "name another with --log-dir, or set log.directory"
-    if not os.path.isdir(there):
-        return failed(f"{there} is a file", advice)
-    if not os.access(there, os.W_OK | os.X_OK):
-        return failed(f"no right to write in {there}", advice)
+    whole = folder.absolute()
     try:
-        usage = shutil.disk_usage(there)
+        check_place(folder / "flight.jsonl", force=True)
+        usage = shutil.disk_usage(next(p for p in (whole, *whole.parents) if p.exists()))
+    except PerchError as error:
+        return failed(str(error), "name another with --log-dir, or set log.directory")
     except OSError as error:
         return skipped(f"free space not known ({error.strerror or error})")
     if not usage.total:
-        return skipped(f"{there} is on no disk")
-    free = usage.free
-    shown = f"{free / 1e9:.1f} GB free" if free >= 1e9 else f"{free / 1e6:.0f} MB free"
-    found = f"{folder}{'' if there == folder else ' (new)'}, {shown}"
-    advice = "free some space: a flight's log has some 5 MB a minute"
-    return by_limits(-free, -500e6, -50e6, found, advice)
-
-
-def _existing(folder: Path) -> Path:
-    """Return the folder, or the nearest above it that exists."""
-    whole = folder.absolute()
-    return folder if folder.exists() else next(p for p in whole.parents if p.exists())
+        return skipped(f"{folder} is on no disk")
+    found = f"{folder}, {usage.free / 1e6:,.0f} MB free"
+    return by_limits(
+        -usage.free, -500e6, -50e6, found, "free some space: a flight's log has some 5 MB a minute"
+    )

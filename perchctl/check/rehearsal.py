@@ -28,22 +28,6 @@ TakeTelemetry = Callable[[], list[Telemetry]]
 """Gives what came since the last time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Looked:
-    """One picture with what was found in it."""
-
-    frame: Frame
-    output: PipelineOutput
-
-
-@dataclass(frozen=True)
-class Blur:
-    """Sigma of the edges of the target's markers, px: of the sharpest and the softest side."""
-
-    least_px: float
-    most_px: float
-
-
 @dataclass(eq=False)
 class Rehearsal:
     """Result of a rehearsal.
@@ -54,10 +38,10 @@ class Rehearsal:
         work_s: of the turns that looked at a picture; late_s: of all turns.
         ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
         problems: why pictures were no good, or were remarkable, with their number.
-        looked: the newest few; found: of how many pictures there was a target, and mirrored ones.
+        looked: the newest few; found: of how many pictures there was a target.
         silent_s: since the last picture, at the end.
         target: where it was at the end; None where it was not seen then.
-        blur: None where it could not be measured.
+        blur_px: sigma of the edges of the target's markers; None where it could not be measured.
     """
 
     live: bool
@@ -67,15 +51,14 @@ class Rehearsal:
     late_s: list[float] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
-    looked: list[Looked] = field(default_factory=list)
+    looked: list[tuple[Frame, PipelineOutput]] = field(default_factory=list)
     pictures: int = 0
     repeats: int = 0
     found: int = 0
-    mirrored: int = 0
     silent_s: float = 0.0
     target: TargetEstimate | None = None
     print_verdict: tuple[bool, str] | None = None
-    blur: Blur | None = None
+    blur_px: float | None = None
 
     @property
     def frame_period_s(self) -> float | None:
@@ -154,7 +137,7 @@ def rehearse(
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
     done.print_verdict = prints.verdict() if prints.judged else None
-    done.blur = _blur(done.looked, pipeline)
+    done.blur_px = _blur_px(done.looked, pipeline)
     return done
 
 
@@ -181,24 +164,22 @@ def _note(
         done.ages_s.append(now_s - frame.t_s + work_s)
     seen = output.detections
     done.found += seen.large is not None or seen.small is not None
-    done.mirrored += seen.mirrored
     prints.add(output)
-    done.looked = [*done.looked[1 - KEPT_FRAMES :], Looked(frame, output)]
+    done.looked = [*done.looked[1 - KEPT_FRAMES :], (frame, output)]
 
 
-def _blur(looked: Sequence[Looked], pipeline: Pipeline) -> Blur | None:
+def _blur_px(looked: Sequence[tuple[Frame, PipelineOutput]], pipeline: Pipeline) -> float | None:
     """Measure the blur by the target's own edges; None where it was not seen."""
-    least, most = [], []
-    for each in looked:
+    found_px = []
+    for frame, output in looked:
         for name in MARKERS:
-            seen = each.output.detections.get(name)
+            seen = output.detections.get(name)
             if seen is None:
                 continue
             rim = pipeline.detector.patterns[name].rim
             corners = seen.corners_px.reshape(1, 4, 2)
-            (refined,) = refine_lines(each.frame.image, corners, [rim], pipeline.camera)
+            (refined,) = refine_lines(frame.image, corners, [rim], pipeline.camera)
             if refined is not None:
-                least.append(refined.least_blur_px)
-                most.append(refined.blur_px)
+                found_px.append(refined.least_blur_px)
                 break  # the large one, where there is one
-    return Blur(float(np.median(least)), float(np.median(most))) if least else None
+    return float(np.median(found_px)) if found_px else None

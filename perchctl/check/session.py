@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, find_cameras, open_camera, without_password
+from perchctl.camera import FrameSource, open_camera, without_password
 from perchctl.check import camera, capture, vehicle
 from perchctl.check.profile import quick_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
@@ -26,8 +26,7 @@ from perchctl.vision import Pipeline, make_pipeline
 class CheckScope:
     """What is looked at beyond what can be seen at rest, and for how long, s.
 
-    `tell` says what goes on. `other_vehicles` looks for those that answer, `open_capture` opens a
-    motion capture.
+    `tell` says what goes on; `open_capture` opens a motion capture.
     """
 
     lift: bool = False
@@ -37,7 +36,6 @@ class CheckScope:
     tell: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
     capture_s: float = capture.CAPTURE_S
-    other_vehicles: Callable[[str], tuple[list[str], str]] = find_vehicles
 
 
 def scan_rows(uri: str | None) -> list[Row]:
@@ -74,12 +72,13 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         scope.tell(f"opening the camera {shown}")
         rehearsal: Rehearsal | None = None
         try:
-            source = _open_camera(spec, options)
+            size_px, asked = calibrated.size_px, options.profile.camera
+            source = open_camera(spec, time.monotonic, asked, size_px=size_px)
         except PerchError as error:
-            yield from camera.refused_rows(error, list(map(str, find_cameras())), options.profile)
+            yield from camera.refused_rows(error, options.profile)
         else:
             stack.callback(source.close)
-            yield Row("camera", *camera.opened_finding(shown, list(map(str, find_cameras()))))
+            yield Row("camera", *passed(f"{shown} gives pictures"))
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
     yield ask("loop", camera.loop_finding, rehearsal, options.profile)
     yield from quick_rows(options)
@@ -121,40 +120,21 @@ class VehicleSession:
         try:
             self.probe.connect()
         except ConnectionFailed as error:
-            yield from self._silent_rows(error)
+            found, _, advice = str(error).partition("\n")
+            advice = advice or "switch it on; perchctl check --scan shows what answers"
+            yield Row("address", *failed(found, advice))
+            yield from skip_all([*vehicle.VEHICLE, vehicle.LIFTED], "the vehicle does not answer")
+            yield from self._room_rows(list)
+            yield from self._compared_rows()
             return list
         yield Row("address", *passed(f"{self.uri} answers"))
-        yield from self.answering_rows()
-        return self.probe.telemetry
-
-    def _silent_rows(self, error: ConnectionFailed) -> Iterator[Row]:
-        found, _, advice = str(error).partition("\n")
-        if not advice:
-            self.scope.tell("nothing answers there: looking who else does")
-            advice = vehicle.advice_for_silent(self.uri, self.scope.other_vehicles(self.uri)[0])
-        yield Row("address", *failed(found, advice))
-        yield from _not_answering([*vehicle.VEHICLE, vehicle.LIFTED])
-        yield from self._room_rows(list)
-        yield from self._compared_rows()
-
-    def answering_rows(self) -> Iterator[Row]:
-        """Yield the rows of a connected vehicle."""
         self.scope.tell(f"listening to the vehicle for {self.scope.listen_s:g} s")
         seen = vehicle.look(self.probe, self.uri, self.scope.listen_s)
-        if lost := self.probe.lost():
-            first, *rest = vehicle.VEHICLE
-            advice = "see address; restart the vehicle"
-            yield Row(first, *failed(f"the link was lost: {lost}", advice))
-            yield from _not_answering([*rest, vehicle.LIFTED])
-            yield from self._compared_rows()
-            return
         for name, judge in vehicle.VEHICLE.items():
             yield ask(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
         yield from self._lift_rows()
-        if why := vehicle.gone(self.probe):  # the rows above may be of before
-            advice = "look at its battery and plug, restart it"
-            yield Row("link", *failed(f"the vehicle is gone: {why}", advice))
+        return self.probe.telemetry
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
         """Return the rows of the motion capture; none with decks."""
@@ -200,29 +180,9 @@ class VehicleSession:
         if isinstance(room, str):
             return skipped(f"no {config.label}")
         self.scope.tell(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
-
-        def moved(so_far: capture.Listened) -> capture.PairedMotion | None:
-            return capture.paired(so_far.telemetry, so_far.places(config))
-
-        seen = capture.listen(
-            self.probe.telemetry,
-            room,
-            time.monotonic,
-            time.sleep,
-            within_s,
-            lambda so_far: capture.is_enough(moved(so_far)),
-        )
-        return capture.hand_finding(moved(seen), config)
-
-
-def _not_answering(names: list[str]) -> list[Row]:
-    return skip_all(names, "the vehicle does not answer")
-
-
-def _open_camera(spec: str, options: FlyOptions) -> FrameSource:
-    config = options.profile.camera
-    size_px = profile_camera(config).size_px
-    return open_camera(spec, time.monotonic, config, size_px=size_px)
+        take = self.probe.telemetry
+        seen = capture.listen(take, room, time.monotonic, time.sleep, within_s)
+        return capture.hand_finding(capture.paired(seen.telemetry, seen.places(config)), config)
 
 
 def _camera_rows(

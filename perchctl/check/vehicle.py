@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -33,8 +32,6 @@ MOVED_WARN_M = 0.05
 """At rest, while it is listened to: a flight's estimate drifts by a fifth of it."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
-OPTIONAL = {"pm.vbat": "battery", "kalman.varPX": "estimator's variance"}
-"""A flight does without these log variables, and is blind to what they say."""
 BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 """By a motion capture, or by the target."""
 
@@ -52,7 +49,6 @@ class Vehicle:
     uri: str
     protocol: int = ProbeLink.NEEDED_PROTOCOL
     missing: tuple[str, ...] = ()
-    lacking: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
     echoes: Sequence[float] = ()
     quality: float | None = None
@@ -74,22 +70,6 @@ class Vehicle:
         return tuple(deck for deck in self.decks if deck in known)
 
 
-GONE_S = 1.0
-"""A vehicle that has sent telemetry, and none for this long, is switched off or restarting."""
-
-
-def gone(link: ProbeLink) -> str:
-    """Return why the vehicle is not there any more, or an empty text.
-
-    Silence counts, too: a radio keeps its link to a vehicle that is off, and cflib keeps it to one
-    that restarts.
-    """
-    if lost := link.lost():
-        return f"the link was lost: {lost}"
-    age_s = link.age_s()
-    return f"no telemetry came for {age_s:.1f} s" if GONE_S < age_s < math.inf else ""
-
-
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
     link.telemetry()
@@ -101,37 +81,22 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
         uri=uri,
         protocol=link.protocol(),
         missing=link.missing,
-        lacking=tuple(what for name, what in OPTIONAL.items() if not link.has_variable(name)),
         parameters=link.parameters(),
         echoes=echoes,
         quality=link.quality,
         telemetry=later[-1] if later else None,
         age_s=link.age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
-        moved_m=moved_m(samples),
+        moved_m=math.dist(samples[0].position_m, later[-1].position_m) if samples else 0.0,
         decks=link.decks(),
     )
-
-
-def moved_m(samples: Sequence[Telemetry]) -> float:
-    """Return the way from the middle of the first tenth to that of the last; NaN for what is no
-    number."""
-    if not samples:
-        return 0.0
-    tenth = max(1, len(samples) // 10)
-    ends = [
-        [statistics.fmean(t.position_m[axis] for t in part) for axis in range(3)]
-        for part in (samples[:tenth], samples[-tenth:])
-    ]
-    return math.dist(*ends)
 
 
 # --- Its rows ---------------------------------------------------------
 
 
 def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
-    """Judge the link by its echoes. From 10 % on one lost notify has locked a vehicle that hung
-    well."""
+    """Judge the link by its echoes, and a radio's by its quality, too."""
     sent, quality = len(vehicle.echoes), vehicle.quality
     back_s = sorted(filter(math.isfinite, vehicle.echoes))
     if not back_s:
@@ -140,10 +105,7 @@ def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
     found = f"{100.0 * lost:.1f} % of {sent} lost, 95 % back in {1e3 * p95_s:.1f} ms"
     if quality is not None:
         found += f", link quality {quality:.0f} %"
-    advice = (
-        "bring the radio nearer, choose a channel away from Wi-Fi (above 80), close other programs "
-        "that use the radio or the processor"
-    )
+    advice = "bring the radio nearer, choose a channel above 80, close other programs"
     limit_s = profile.safety.proof_age_s
     return worst(
         by_limits(lost, 0.01, 0.05, found, advice),
@@ -177,9 +139,6 @@ def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
     if vehicle.parameters.get(SELF_TEST) == 0:
         found = f"{found}, its self-test failed at boot"
         return failed(found, "restart it level and at rest; read its console")
-    if vehicle.lacking:
-        found = f"{found}, not logged: {', '.join(vehicle.lacking)}"
-        return warned(found, "it flies without, but blind to it")
     return passed(found)
 
 
@@ -242,26 +201,6 @@ def _level(vehicle: Vehicle, profile: Profile) -> Finding:
     )
 
 
-def _parameters(vehicle: Vehicle, profile: Profile) -> Finding:
-    """Judge the firmware's parameters: `fly` sets those that differ, and refuses those that the
-    firmware lacks. What positions from outside need it sets over the user's own."""
-    laid_over = ProbeLink.estimator_parameters(profile.positioning)
-    wanted = {n: v for n, v in profile.link.parameters.items() if n not in laid_over}
-    present = vehicle.parameters
-    unknown = [name for name in wanted if name not in present]
-    if unknown:
-        found = f"the firmware has no {', '.join(unknown)}"
-        return failed(found, "correct link.parameters in the profile")
-    differing = [
-        f"{name} {present[name]:g}, profile {value:g}"
-        for name, value in wanted.items()
-        if not math.isclose(present[name], value, rel_tol=1e-5, abs_tol=1e-9)
-    ]
-    if differing:
-        return warned("; ".join(differing), "fly sets them before each flight")
-    return passed(f"{len(wanted)} as the profile has them")
-
-
 def _battery(vehicle: Vehicle, profile: Profile) -> Finding:
     t = vehicle.at_rest
     if not t.battery_v >= NO_BATTERY_READING_V:
@@ -285,7 +224,6 @@ VEHICLE: dict[str, Callable[[Vehicle, Profile], Finding]] = {
     "estimator": _estimator,
     "ground": _ground,
     "level": _level,
-    "parameters": _parameters,
     "battery": _battery,
 }
 """The rows of a vehicle that answers, in their order."""
@@ -302,28 +240,20 @@ MOVED_G = 0.05
 
 
 def watch_lift(link: ProbeLink, wait: Wait, within_s: float = LIFT_S) -> list[Telemetry]:
-    """Return what the vehicle reports until it was lifted and is back, or for so long."""
+    """Return what the vehicle reports for so long."""
     seen: list[Telemetry] = []
     for _ in range(max(1, round(within_s / 0.1))):
         wait(0.1)
         seen.extend(link.telemetry())
-        rise_m, back_m = _rise_m(seen)
-        if rise_m > LIFTED_M and abs(back_m) < BACK_M / 2.0:
-            break
     return seen
-
-
-def _rise_m(seen: Sequence[Telemetry]) -> tuple[float, float]:
-    """Return how high the position rose, and where it is at the end, both from where it was."""
-    heights_m = [t.position_m[2] for t in seen] or [0.0]
-    return max(heights_m) - heights_m[0], heights_m[-1] - heights_m[0]
 
 
 def lift_finding(seen: Sequence[Telemetry]) -> Finding:
     """Judge whether the position followed the hand."""
     if not seen:
         return skipped("no telemetry")
-    rise_m, back_m = _rise_m(seen)
+    heights_m = [t.position_m[2] for t in seen]
+    rise_m, back_m = max(heights_m) - heights_m[0], heights_m[-1] - heights_m[0]
     moved_g = max(abs(t.acc_z_g - 1.0) for t in seen)
     found = f"rose by {rise_m:.2f} m, then {back_m:+.2f} m"
     if rise_m < FOLLOWED_M and moved_g < MOVED_G:
@@ -354,11 +284,3 @@ def answering_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
         "switch the vehicle on; a radio's address other than E7E7E7E7E7 goes with -u",
     )
     return [Row("radio", *radio), *(Row("address", *each) for each in found or [nobody])]
-
-
-def advice_for_silent(uri: str, answering: Sequence[str]) -> str:
-    """Say what to do about a vehicle that does not answer, given those that do."""
-    there = [each for each in answering if each != uri]
-    if there:
-        return f"these answer: {', '.join(there)}; give one with -u, or set link.uri"
-    return "switch it on, look at its address; perchctl check --scan shows what answers"

@@ -213,7 +213,7 @@ def compare(
     keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
     keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
 
-    def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
+    def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:
         found = campaigns.compare_variants(results)
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
@@ -252,7 +252,7 @@ def sweep(
     _require_simulator()
     asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
 
-    def report(results: list[campaigns.VariantResult], problem: PerchError | None) -> None:
+    def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:
         record = asked.record(results)
         print_result(with_problem(record, problem) if as_json else asked.text(record))
 
@@ -264,7 +264,7 @@ def _fly_by_each(
     seeds: Sequence[int],
     jobs: int | None,
     cluster: str | None,
-    report: Callable[[list[campaigns.VariantResult], PerchError | None], None],
+    report: Callable[[list[campaigns.FlightResult], PerchError | None], None],
 ) -> int:
     with signals_to(stop_handler()):
         return fly_each(

@@ -8,14 +8,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 
-from perchctl.camera import FrameSource
+from perchctl.camera import FrameSource, WrappedSource
 from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.sim import SimulatedVehicle
 from perchctl.vision import Frame
@@ -23,12 +23,8 @@ from perchctl.vision import Frame
 # --- The radio: what arrives, what does not, and what comes late ------
 
 
-ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
-"""The kinds of packets that a fault can name."""
-
-
 def order_of(packet: Packet) -> str:
-    """Return the kind of a packet, one of `ORDERS`, or the empty string."""
+    """Return the kind of a packet, by which a fault names it, or the empty string."""
     kind = packet.data[0] if packet.data else None
     match packet.port, packet.channel, kind:
         case Port.COMMANDER, 0, _:
@@ -115,13 +111,11 @@ class CameraFault:
     late_s: float = 0.0
 
 
-class FaultyCamera:
+class FaultyCamera(WrappedSource):
     """A frame source that passes on the simulated camera's frames, spoilt while a fault lasts."""
 
-    finished = False
-
     def __init__(self, inner: FrameSource, seed: int) -> None:
-        self._inner = inner
+        super().__init__(inner)
         self._rng = np.random.default_rng([seed, SNOW_STREAM])
         self._fault: CameraFault | None = None
         self._begin_s = 0.0
@@ -135,16 +129,8 @@ class FaultyCamera:
         self.late_s = 0.0
         self._queue.clear()
 
-    @property
-    def live(self) -> bool:
-        return self._inner.live
-
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        return self._inner.size_px
-
     def poll(self, now_s: float) -> Frame | None:
-        frame = self._inner.poll(now_s)
+        frame = super().poll(now_s)
         if self.late_s:
             frame = self._late(frame, self.late_s, now_s)
         fault = self._fault
@@ -152,15 +138,6 @@ class FaultyCamera:
             self._last = frame or self._last
             return frame
         return self._spoilt(fault, frame, now_s)
-
-    def problem(self, now_s: float) -> str | None:
-        return self._inner.problem(now_s)
-
-    def describe(self) -> str:
-        return self._inner.describe()
-
-    def close(self) -> None:
-        self._inner.close()
 
     def _spoilt(self, fault: CameraFault, frame: Frame | None, now_s: float) -> Frame | None:
         if fault.kind == "late":
@@ -286,34 +263,26 @@ class FaultyClock:
         if for_s > LONGEST_S:
             self.kill()
 
-    def fail(self) -> None:
-        """Raise in the loop's thread."""
-        raise PlantedError("an exception that the fault raised")
-
 
 # --- All of them ------------------------------------------------------
 
 
+@dataclass
 class Edges:
     """The parts of a flight that faults act on: its vehicle, radio, camera and clock, the
     operator's Ctrl-C (`press`) and closed terminal (`hang_up`), and `disk`, whose `problem` is
-    that of the log's disk."""
+    that of the log's disk. `each` is called every `SAMPLE_S`."""
 
-    def __init__(
-        self,
-        vehicle: SimulatedVehicle,
-        radio: FaultyRadio,
-        camera: FaultyCamera,
-        clock: FaultyClock,
-        press: Callable[[], None],
-        hang_up: Callable[[], None],
-        disk: Any,
-    ) -> None:
-        self.vehicle, self.radio, self.camera, self.clock = vehicle, radio, camera, clock
-        self.press, self.hang_up, self.disk = press, hang_up, disk
-        self.deck_silent = False
-        self.each: list[Callable[[float], None]] = []
-        self._later: list[tuple[float, Callable[[], None]]] = []
+    vehicle: SimulatedVehicle
+    radio: FaultyRadio
+    camera: FaultyCamera
+    clock: FaultyClock
+    press: Callable[[], None]
+    hang_up: Callable[[], None]
+    disk: Any
+    deck_silent: bool = False
+    each: list[Callable[[float], None]] = field(default_factory=list)
+    _later: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
 
     def at(self, t_s: float, act: Callable[[], None]) -> None:
         """Call a function at that time."""

@@ -1,8 +1,7 @@
 """What a fault does, as functions that act on a flight's edges when the fault begins, at `t_s`.
 
 An effect is such a function with its parameters: a `functools.partial`, which the catalogue draws
-and the injector calls. The planner and the loop know nothing of it. Durations are counted from the
-fault's beginning; `FOR_EVER` outlasts every flight.
+and the injector calls. Durations are counted from the fault's beginning.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from perchctl.faults.edges import CameraFault, Edges
+from perchctl.faults.edges import CameraFault, Edges, PlantedError
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
-from perchctl.mission import Event, Phase, Tick
+from perchctl.mission import Phase, Tick
 from perchctl.profile import Profile
 from perchctl.sim import CaptureFault, Scenario
 
@@ -55,7 +54,7 @@ def radio_loss(
 
 
 def packet_lost(edges: Edges, t_s: float, order: str, count: int) -> None:
-    """Lose the next `count` packets of an order (`ORDERS` of `perchctl.faults.edges`)."""
+    """Lose the next `count` packets of an order (`order_of` of `perchctl.faults.edges`)."""
     edges.radio.lost[order] = count
 
 
@@ -210,7 +209,11 @@ def slow(edges: Edges, t_s: float, tick_s: float, for_s: float) -> None:
 
 def raises(edges: Edges, t_s: float) -> None:
     """Raise an exception that the program does not foresee in the loop's thread."""
-    edges.clock.pending = edges.clock.fail
+
+    def fail() -> None:
+        raise PlantedError("an exception that the fault raised")
+
+    edges.clock.pending = fail
 
 
 def disk_full(edges: Edges, t_s: float, for_s: float) -> None:
@@ -271,11 +274,9 @@ def sooner_s(effect: Effect) -> float:
 
 
 class Injector:
-    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. It follows the phases
-    as a watcher of the loop; `each` is called every `SAMPLE_S` of simulated time. `begin_s` is
-    None until they begin, `flown` is the phase of the newest tick."""
-
-    problem: str | None = None
+    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. `tick` is called with
+    each of the loop, `each` every `SAMPLE_S` of simulated time. `begin_s` is None until they
+    begin, `flown` is the phase of the newest tick."""
 
     def __init__(
         self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
@@ -294,10 +295,8 @@ class Injector:
                     partial(_measure, edges, random.Random(edges.vehicle.scenario.seed))
                 )
 
-    def event(self, event: Event) -> None:
-        return None
-
     def tick(self, tick: Tick) -> None:
+        """Note the phase, and when the effects are due."""
         if self.flown is None and self._shakes_mps2:
             self._edges.vehicle.firmware.estimator.shift_accelerometer(self._shakes_mps2)
         self.flown = tick.state.phase

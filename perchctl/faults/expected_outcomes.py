@@ -1,16 +1,15 @@
 """Where physics or the firmware leave no better end, and what is then expected.
 
-An expected outcome takes away the flags it names, and no other, where they were raised after its
-cause began and within a stated time of it. Its cause is what was true in the flight (`Facts`), not
-what was drawn, and not what the program reported.
+Its cause is what was true in the flight (`Facts`), not what was drawn, and not what the program
+reported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from perchctl.faults.effects import killed, push
+from perchctl.faults.effects import killed, push, thrust_changed
 from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
 
@@ -21,17 +20,20 @@ PUSHED_OFF_S = 0.2
 """A blow of 0.04 s has torn it off by then, or not at all."""
 
 
+FALL: tuple[Flag, ...] = ("fell", "slid")
+CUT_DOWN: tuple[Flag, ...] = (*FALL, "strayed", "locked_needlessly")
+
+
 @dataclass(frozen=True)
 class ExpectedOutcome:
     """An outcome that no program could avoid: `flags` raised from the time of `cause` (None: it
-    never came) until `within_s` later do not count. `chosen`: the user, the firmware or the
-    battery decides it, so that no program could make it rare."""
+    never came) until `within_s` later do not count. `reason` fits into a line of the table."""
 
     name: str
-    cause: Callable[[Facts], float | None]
-    within_s: float
-    flags: tuple[Flag, ...]
     reason: str
+    cause: Callable[[Facts], float | None]
+    flags: tuple[Flag, ...] = FALL
+    within_s: float = 4.0
 
     def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
         """Return True if a flag raised at `t_s` is a consequence of the cause."""
@@ -39,34 +41,27 @@ class ExpectedOutcome:
         return cause_s is not None and flag in self.flags and 0.0 <= t_s - cause_s <= self.within_s
 
 
-def unexpected(
-    flags: Mapping[Flag, float], outcomes: Sequence[ExpectedOutcome], facts: Facts
-) -> tuple[Flag, ...]:
-    """Return the flags that no expected outcome covers: those that count."""
-    return tuple(
-        flag
-        for flag, t_s in flags.items()
-        if not any(outcome.covers(flag, t_s, facts) for outcome in outcomes)
-    )
-
-
-FALL: tuple[Flag, ...] = ("fell", "slid")
-CUT_DOWN: tuple[Flag, ...] = (*FALL, "strayed", "locked_needlessly")
-
-
 def _killed_in_landing(facts: Facts) -> float | None:
     return facts.killed_s if facts.does(killed) and facts.own_landing else None
 
 
+def _let_go_later(facts: Facts) -> float | None:
+    return facts.let_go_s if facts.watched else None
+
+
+def _too_low(facts: Facts) -> float | None:
+    return facts.slipped_s if facts.slipped_m < CATCHABLE_M else None
+
+
 def _knocked_off(facts: Facts) -> float | None:
-    if (
-        not facts.does(push)
-        or facts.begin_s is None
-        or facts.slipped_s is None
-        or not facts.toppled
-    ):
+    slipped_s, begin_s = facts.slipped_s, facts.begin_s
+    if slipped_s is None or begin_s is None or not (facts.toppled and facts.does(push)):
         return None
-    return facts.slipped_s if 0.0 <= facts.slipped_s - facts.begin_s <= PUSHED_OFF_S else None
+    return slipped_s if 0.0 <= slipped_s - begin_s <= PUSHED_OFF_S else None
+
+
+def _too_weak(facts: Facts) -> float | None:
+    return facts.weak_s if facts.does(thrust_changed) else None
 
 
 def _sagged_too_fast(facts: Facts) -> float | None:
@@ -77,82 +72,66 @@ def _sagged_too_fast(facts: Facts) -> float | None:
     return None if in_time else facts.weak_s
 
 
-CUT = ExpectedOutcome(
-    "cut by the firmware",
-    lambda facts: facts.cut_s,
-    4.0,
-    CUT_DOWN,
-    "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
-    "program sends arrives any more",
-)
-LEFT_LANDING = ExpectedOutcome(
-    "lands alone",
-    _killed_in_landing,
-    20.0,
-    ("flies_on",),
-    "the vehicle flies its own landing to the end without the program: it comes down, softly",
-)
-OPERATOR_STOPS = ExpectedOutcome(
-    "the operator's word",
-    lambda facts: facts.stop_s,
-    4.0,
-    CUT_DOWN,
-    "a second Ctrl-C is an emergency stop: it cuts the motors and locks",
-)
-LETS_GO_LATER = ExpectedOutcome(
-    "let go after the flight",
-    lambda facts: facts.let_go_s if facts.watched else None,
-    4.0,
-    FALL,
-    "the whole weight has hung for the time it is watched; the program is no longer there "
-    "when the magnet lets go",
-)
-TOO_LOW = ExpectedOutcome(
-    "too low to catch",
-    lambda facts: facts.slipped_s if facts.slipped_m < CATCHABLE_M else None,
-    4.0,
-    FALL,
-    "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
-)
-KNOCKED_OFF = ExpectedOutcome(
-    "knocked off the magnet",
-    _knocked_off,
-    4.0,
-    FALL,
-    "a blow has torn it off while its motors stood still, and turned it over before they turned",
-)
-NO_LIFT = ExpectedOutcome(
-    "too weak to hover",
-    lambda facts: facts.weak_s,
-    15.0,
-    FALL,
-    "what battery and motors can lift is less than the weight: four times what the weak motor "
-    "gives, for with more of the others it turns over",
-)
-SAGS_TOO_FAST = ExpectedOutcome(
-    "sags too fast",
-    _sagged_too_fast,
-    15.0,
-    FALL,
-    "from the voltage at which it lands to the one that does not lift the weight any more it "
-    "has less time than the way down takes",
-)
-BROWN_OUT = ExpectedOutcome(
-    "started again",
-    lambda facts: facts.rebooted_s,
-    4.0,
-    (*FALL, "strayed"),
-    "a vehicle that starts again in the air stops its motors; nothing that the program sends can "
-    "be flown",
-)
 EXPECTED_OUTCOMES = (
-    BROWN_OUT,
-    CUT,
-    LEFT_LANDING,
-    OPERATOR_STOPS,
-    LETS_GO_LATER,
-    TOO_LOW,
-    KNOCKED_OFF,
-    NO_LIFT,
-    SAGS_TOO_FAST,
+    ExpectedOutcome(
+        "started again",
+        "a vehicle that starts again in the air has no motors",
+        lambda facts: facts.rebooted_s,
+        (*FALL, "strayed"),
+    ),
+    ExpectedOutcome(
+        "cut by the firmware",
+        "2 s after the last setpoint it cuts and locks",
+        lambda facts: facts.cut_s,
+        CUT_DOWN,
+    ),
+    ExpectedOutcome(
+        "lands alone",
+        "its own landing goes on without the program",
+        _killed_in_landing,
+        ("flies_on",),
+        20.0,
+    ),
+    ExpectedOutcome(
+        "the operator's word",
+        "a second Ctrl-C cuts the motors and locks",
+        lambda facts: facts.stop_s,
+        CUT_DOWN,
+    ),
+    ExpectedOutcome(
+        "let go after the flight",
+        "it hung as long as it is watched; nobody catches it",
+        _let_go_later,
+    ),
+    ExpectedOutcome(
+        "too low to catch",
+        "a catch takes up to 0.8 m; it hung lower than 1 m",
+        _too_low,
+    ),
+    ExpectedOutcome(
+        "knocked off the magnet",
+        "a blow turned it over before its motors turned",
+        _knocked_off,
+    ),
+    ExpectedOutcome(
+        "too weak to hover",
+        "four times its weakest motor lifts less than the weight",
+        _too_weak,
+        within_s=15.0,
+    ),
+    ExpectedOutcome(
+        "sags too fast",
+        "its battery lifts it for less time than the way down takes",
+        _sagged_too_fast,
+        within_s=15.0,
+    ),
 )
+
+
+def unexpected(flags: Mapping[Flag, float], facts: Facts) -> tuple[Flag, ...]:
+    """Return the flags that no expected outcome covers: those that count."""
+    return tuple(
+        flag
+        for flag, t_s in flags.items()
+        if not any(outcome.covers(flag, t_s, facts) for outcome in EXPECTED_OUTCOMES)
+    )

@@ -20,7 +20,7 @@ from perchctl.faults.edges import (
     PlantedError,
     ProgramKilled,
 )
-from perchctl.faults.expected_outcomes import unexpected
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES, unexpected
 from perchctl.faults.oracle import (
     REFUSAL_CLAIMS,
     Oracle,
@@ -29,7 +29,7 @@ from perchctl.faults.oracle import (
     claims_of_rescue,
     last_row,
 )
-from perchctl.faults.results import End, FaultResult
+from perchctl.faults.results import FaultResult
 from perchctl.faults.truth import (
     DescentBound,
     FactsRecorder,
@@ -55,7 +55,7 @@ from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
 LONGEST_FLIGHT_S = 240.0
-END_OF: dict[Phase, End] = {
+END_OF = {
     Phase.PERCHED: "perched",
     Phase.LANDED: "landed",
     Phase.ABORTED: "aborted",
@@ -92,10 +92,10 @@ class FaultyFlight:
         if case.landed_from is not None:
             lands = (partial(e.operator, presses_s=(0.0,), hang_up=True),)
             self._injectors.append(e.Injector(edges, lands, case.landed_from, case.landed_after_s))
-        watchers: tuple[Watcher, ...] = (*self._injectors, self)
+        watchers: tuple[Watcher, ...] = (self,)
         if log is not None:
             log.truth = self._for_log
-            watchers = (*watchers, log)
+            watchers = (self, log)
         pipeline = make_pipeline(profile, camera)
         seen = source if log is None else log.watched(source)
         self._parts = FlightParts(
@@ -115,7 +115,7 @@ class FaultyFlight:
         by_target = profile.positioning.by == "target"
         self._drift = UnfeltDrift(case.effects, scenario, by_target=by_target)
         self._descent_bound = DescentBound(case.effects, profile)
-        self._recorder = FactsRecorder(vehicle, profile, case.effects)
+        self._facts = FactsRecorder(vehicle, profile, case.effects)
         self._touched = False  # the ceiling, since the fault began
         self._crashed = False  # by an exception that no fault planted
 
@@ -139,13 +139,15 @@ class FaultyFlight:
         return self._result(end, reason, report, end_s)
 
     def tick(self, tick: Tick) -> None:
-        return None
+        """Show the tick to the injectors."""
+        for injector in self._injectors:
+            injector.tick(tick)
 
     def event(self, event: Event) -> None:
         """Give the claims of a rescue's note to the oracle."""
         self._oracle.claims(claims_of_rescue(event), event.t_s)
 
-    def _mission(self) -> tuple[End, str, FlightReport | None]:
+    def _mission(self) -> tuple[str, str, FlightReport | None]:
         """Run the program under test. Returns its end, what it said, and its report."""
         try:
             report = fly(self._parts)
@@ -169,10 +171,10 @@ class FaultyFlight:
         for injector in self._injectors:
             injector.each(t_s)
         self._edges.pass_time(t_s)
-        self._recorder.facts.begin_s = self._injector.begin_s
+        self._facts.begin_s = self._injector.begin_s
         sample = self._sample(t_s)
         self._oracle.see(sample)
-        self._recorder.see(sample)
+        self._facts.see(sample)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.floor and not sample.motors_on:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
@@ -199,7 +201,7 @@ class FaultyFlight:
             uplink=uplink,
             lands=self._vehicle.firmware.planner.active,
         )
-        wrong = begin_s is not None and self._recorder.facts.does(e.log_reads)
+        wrong = begin_s is not None and self._facts.does(e.log_reads)
         heard = not wrong and all(self._is_heard(block, t_s) for block in MockLink.FAST_BLOCKS)
         return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
 
@@ -215,11 +217,10 @@ class FaultyFlight:
         return delay_s is not None and delay_s <= self._profile.safety.proof_age_s
 
     def _result(
-        self, end: End, reason: str, report: FlightReport | None, end_s: float
+        self, end: str, reason: str, report: FlightReport | None, end_s: float
     ) -> FaultResult:
-        case, oracle, facts = self._case, self._oracle, self._recorder.facts
+        case, oracle, facts = self._case, self._oracle, self._facts
         facts.killed_s, facts.stop_s = self._clock.killed_s, oracle.stop_s
-        listed = case.fault.expected
         hanging = oracle.newest is not None and oracle.newest.hanging
         perched = report is not None and report.phase is Phase.PERCHED and hanging
         result = FaultResult(
@@ -232,13 +233,13 @@ class FaultyFlight:
             outcome=end,
             reason=reason,
             flags=oracle.flags,
-            counted=unexpected(oracle.flags, listed, facts),
+            counted=unexpected(oracle.flags, facts),
             time_s=end_s,
             miss_m=self._vehicle.world.gear_miss_m() if perched else None,
             drop_m=oracle.drop_m,
             way=() if report is None else tuple(x.phase.value for x in report.history if x.phase),
             row="" if report is None else last_row(report),
-            expected=tuple(each.name for each in listed if each.cause(facts) is not None),
+            expected=tuple(x.name for x in EXPECTED_OUTCOMES if x.cause(facts) is not None),
             astray_m=oracle.astray_m,
         )
         if self._log is not None:
@@ -265,28 +266,18 @@ def fly_with_fault(
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
 
-def fly_fault_seed(
-    profile: Profile,
-    seed: int,
-    faults: tuple[str, ...],
-    log: Path | None = None,
-    record: bool = False,
+def fly_fault_in_folder(
+    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
-    """Fly the seed's scenario with the seed's fault, drawn from those named."""
+    """Fly the seed's scenario with the seed's fault, drawn from those named, with its log in a
+    folder if one is given."""
+    log = None if log_dir is None else seed_log_path(seed, log_dir)
 
     def fly_drawn(scenario: Scenario) -> FaultResult:
         case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
         return fly_with_fault(profile, case, scenario, log, record)
 
     return fly_measured(profile, seed, fly_drawn)
-
-
-def fly_fault_in_folder(
-    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
-) -> FaultResult:
-    """Fly a seed as `fly_fault_seed` does, with its log in a folder if one is given."""
-    log = None if log_dir is None else seed_log_path(seed, log_dir)
-    return fly_fault_seed(profile, seed, faults, log, record)
 
 
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:

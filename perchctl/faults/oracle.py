@@ -2,9 +2,7 @@
 
 The oracle is given samples of the true vehicle (`Sample`) while the flight and the time
 after it pass. It is told when the operator pressed Ctrl-C, when the program ended, and what it
-claimed, and raises flags, the gravest first (docs/campaigns.md, "Faults"). A vehicle that the
-magnet lets go of with its motors still is judged by how deep it falls until it is caught
-(`drop_limit_m`); the floor is too deep.
+claimed, and raises flags (docs/campaigns.md, "Faults").
 """
 
 from __future__ import annotations
@@ -13,37 +11,27 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
 
-Claim = Literal[
-    "hangs on the target",
-    "held off the target",
-    "hangs",
-    "stands",
-    "hangs or stands",
-    "motors off",
-    "locked",
-    "ended by the supervisor",
-    "tilted",
-    "not seen down",
-]
-"""A claim of hanging or standing includes that the motors are off. `not seen down` claims that
-no telemetry has shown the vehicle at rest with its motors off."""
-Flag = Literal[
-    "crashed",
-    "fell",
-    "slid",
-    "flies_on",
-    "endless",
-    "stop_not_obeyed",
-    "pressed",
-    "strayed",
-    "lied",
-    "locked_needlessly",
-]
-FLAGS: tuple[Flag, ...] = get_args(Flag)
+Claim = str
+"""One that `Oracle._is_true` knows. A claim of hanging or standing includes that the motors are
+off. `not seen down` claims that no telemetry has shown the vehicle at rest with its motors off."""
+Flag = str
+FLAGS: dict[Flag, str] = {
+    "crashed": "perchctl ended by an exception that no fault planted",
+    "fell": "fell, touched down above 0.8 m/s, or slipped too deep",
+    "slid": "touched down above 0.5 m/s sideways",
+    "flies_on": "motors on in the air where it should have come down",
+    "endless": "no end within 240 s",
+    "stop_not_obeyed": "motors on 0.5 s after the second Ctrl-C",
+    "pressed": "pushed against ceiling or floor for more than 4 s",
+    "strayed": "more than 1 m from where it should be, or too high",
+    "lied": "perchctl said at the end what is not true",
+    "locked_needlessly": "locked, and had not crashed, tumbled or tilted",
+}
+"""What can go wrong, the gravest first, and what it means."""
 
 LOW_M = 0.1
 """Below this height nothing counts as a fall."""
@@ -60,8 +48,7 @@ PRESSED_S, RELEASED_S = 4.0, 0.2
 ASTRAY_M, TOO_HIGH_M = 1.0, 0.3
 ALONE_S = 5.0
 TILT_WITHIN_DEG = 10.0
-"""A claim of excess tilt is accepted from this much below the limit, since the program knows
-only an estimate."""
+"""A claim of excess tilt is accepted from this much below the limit."""
 CLAIM_S = 0.5
 """A claim must become true within this time (motors are cut 25 ms after the order)."""
 SAY_OFF: frozenset[Claim] = frozenset(
@@ -113,8 +100,7 @@ def drop_limit_m(hold_ratio: float) -> float:
 
 
 def second_press_s(presses_s: Sequence[float]) -> float | None:
-    """Return when the operator's presses amounted to an emergency stop; None if never. The
-    oracle applies the rule itself rather than trust the program's switch."""
+    """Return when the operator's presses amounted to an emergency stop; None if never."""
     run_s = presses_s[0] if presses_s else 0.0
     for before_s, press_s in pairwise(presses_s):
         if press_s - before_s >= SILENCE_S:
@@ -321,29 +307,22 @@ class Oracle:
 
     def _is_true(self, claim: Claim, s: Sample) -> bool:
         hangs = s.hanging and not s.motors_on
+        off_m = math.hypot(s.miss_m, s.below_m)
         # What lies on its side or its back does not stand.
         stands = not s.motors_on and not _airborne(s) and s.up_z > self._tilted_up_z
-        match claim:
-            case "hangs on the target":
-                return hangs and s.miss_m <= self._magnet_radius_m
-            case "held off the target":
-                return hangs and math.hypot(s.miss_m, s.below_m) > self._magnet_radius_m
-            case "hangs":
-                return hangs
-            case "stands":
-                return stands
-            case "hangs or stands":
-                return hangs or stands
-            case "motors off":
-                return not s.motors_on
-            case "locked":
-                return s.locked
-            case "ended by the supervisor":
-                return self._ended_by_vehicle
-            case "tilted":
-                return self._least_up_z < self._tilt_up_z
-            case "not seen down":
-                return not self._seen_down.holds(s.t_s)
+        truths = {
+            "hangs on the target": hangs and s.miss_m <= self._magnet_radius_m,
+            "held off the target": hangs and off_m > self._magnet_radius_m,
+            "hangs": hangs,
+            "stands": stands,
+            "hangs or stands": hangs or stands,
+            "motors off": not s.motors_on,
+            "locked": s.locked,
+            "ended by the supervisor": self._ended_by_vehicle,
+            "tilted": self._least_up_z < self._tilt_up_z,
+            "not seen down": not self._seen_down.holds(s.t_s),
+        }
+        return truths[claim]
 
     def _watch_stop(self, s: Sample) -> None:
         """Judge obedience to the emergency stop, but only while packets arrive. Motors that are
@@ -370,8 +349,6 @@ def _airborne(s: Sample) -> bool:
 
 
 # --- What the program says at its end, as claims that are true or false of a vehicle ---
-# A flight ends by a row of the mission's table, in a phase, with an outcome; each of the three
-# becomes a sentence or an exit code that somebody acts on.
 
 
 Claims = set[Claim]
@@ -401,7 +378,6 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
 }
 """The claims in the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
-HELD_ELSEWHERE = "held-elsewhere"
 """The transitions of flights whose end the program does not know: whether the vehicle hangs or
 stands, and whether it came down at all."""
 RESCUE_CLAIMS: dict[Finding, Claims] = {
@@ -424,7 +400,7 @@ def last_row(report: FlightReport) -> str:
 def claims_of(report: FlightReport) -> Claims:
     """Return all claims that a report makes about the vehicle."""
     claims = ROW_CLAIMS.get(last_row(report), set()) | PHASE_CLAIMS.get(report.phase, set())
-    locked: Claims = {"locked"} if report.locked else set()
+    locked = {"locked"} if report.locked else set()
     return claims | OUTCOME_CLAIMS[report.outcome] | locked
 
 

@@ -1,20 +1,27 @@
 """How flights with faults ended: one flight's result, and a campaign's figures for JSON and as a
-table of faults and phases."""
+table."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
-from perchctl.campaign import CampaignFlight, align_columns, peak_mb, rate_record, rate_text
-from perchctl.faults.catalogue import AIR, FAULTS
+from perchctl.campaign import CampaignFlight, align_columns, rate_record, rate_text
+from perchctl.faults.catalogue import FAULTS
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED, Flag
 
-End = Literal["perched", "landed", "aborted", "refused", "failed", "gone"]
-"""`refused`: it never took off; `failed`: an exception ended the flight, after the rescue;
-`gone`: the program ended before its flight."""
+ENDS = {
+    "perched": "the magnet holds it, and its motors are off",
+    "landed": "it stands, and its motors are off",
+    "aborted": "stopped by the operator, by the vehicle or for safety",
+    "refused": "it never took off",
+    "failed": "an exception ended the flight, after the rescue",
+    "gone": "the program ended before its flight",
+}
+"""How a flight can end, and what it means."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,7 @@ class FaultResult(CampaignFlight):
     """One flight.
 
     Attributes:
+        outcome: one of `ENDS`.
         flags: what went wrong, with when.
         counted: the flags that no expected outcome covers.
         expected: the names of the expected outcomes whose cause came, whether or not a flag was
@@ -32,7 +40,6 @@ class FaultResult(CampaignFlight):
         astray_m: in the air, the farthest from where it should have been.
     """
 
-    outcome: End
     fault: str
     phase: str
     moment_s: float
@@ -63,19 +70,21 @@ class FaultResult(CampaignFlight):
 # --- A campaign's figures ---------------------------------------------
 
 
-ENDS: tuple[End, ...] = get_args(End)
 WORST = 20
-HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land")
-"""The column heads of the phases."""
+SHARES = {
+    "wrong": "with a flag that counts",
+    "not_known": "perchctl says: it hangs or stands",
+    "unconfirmed": "perchctl says: no landing was seen",
+}
+"""The counts that are given as shares of all flights, and what they mean."""
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """Return a campaign's figures as a record for JSON.
 
     Each flag is counted where no expected outcome covers it. `unavoidable` is the number of flights
-    with a covered flag; `expected_outcomes` gives the number of flights with each cause; `wrong`
-    is the share of flights with a flag that counts, `not_known` of those whose program did not
-    know whether the vehicle hangs or stands, `unconfirmed` of those whose landing it did not see.
+    with a covered flag; `expected_outcomes` gives the number of flights with each cause; those of
+    `SHARES` are shares.
     """
     return {
         "flights": len(results),
@@ -84,13 +93,12 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
         "unavoidable": sum(r.is_excused for r in results),
         "expected_outcomes": dict(Counter(name for r in results for name in r.expected)),
         **{name: rate_record(count, len(results)) for name, count in _counts(results).items()},
-        "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
 
 def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
-    """Return the numbers of flights that are given as shares."""
+    """Return the numbers of the flights of `SHARES`."""
     return {
         "wrong": sum(r.is_bad for r in results),
         "not_known": sum(r.row == NOT_KNOWN for r in results),
@@ -100,26 +108,33 @@ def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
     """Return the flights with a flag that counts, the gravest first."""
-    bad = [r for r in results if r.is_bad]
-    return sorted(bad, key=lambda r: (min(map(FLAGS.index, r.counted)), -len(r.counted), r.seed))
+    bad, order = [r for r in results if r.is_bad], list(FLAGS)
+    return sorted(bad, key=lambda r: (min(map(order.index, r.counted)), -len(r.counted), r.seed))
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """Return the figures, a table of faults by phases, and the worst flights as plain text."""
-    figures = fault_summary(results)
-    cells: dict[tuple[str, str], list[FaultResult]] = {}
-    for r in results:
-        cells.setdefault((r.fault, r.phase), []).append(r)
-    flown = [fault.name for fault in FAULTS if any(r.fault == fault.name for r in results)]
+    """Return the flights of each fault, the figures, and the worst flights as plain text."""
+    figures, flown = fault_summary(results), Counter(r.fault for r in results)
+    wrong = Counter(r.fault for r in results if r.is_bad)
+    excused = Counter(r.fault for r in results if r.is_excused)
+    rows = [(f.name, flown[f.name], wrong[f.name], excused[f.name]) for f in FAULTS]
     lines = align_columns(
-        [("fault", *HEADS)]
-        + [(name, *(_cell(cells.get((name, p.value), ())) for p in AIR)) for name in flown]
+        [("fault", "flights", "wrong", "unavoidable")]
+        + [(name, *map(str, counts)) for name, *counts in rows if counts[0]]
     )
-    lines += ["", "a cell: flights, !k of them wrong, u: unavoidable among them", ""]
-    shares = {name: rate_text(count, len(results)) for name, count in _counts(results).items()}
-    numbers = {name: figures[name] for name in ("flights", *ENDS, *FLAGS, "unavoidable")}
-    rows = shares | numbers | {f"  {name}": n for name, n in figures["expected_outcomes"].items()}
-    lines += [f"{name.replace('_', ' '):<26} {found}" for name, found in rows.items()]
+    lines.append("")
+    for name, count in _counts(results).items():
+        lines.append(f"{rate_text(count, len(results)):<29}{_explained(name, SHARES[name])}")
+    meanings = {
+        "flights": "all that were flown",
+        **ENDS,
+        **FLAGS,
+        "unavoidable": "with a flag that physics or the firmware excuse",
+    }
+    lines += [f"{figures[name]:>6}  {_explained(name, text)}" for name, text in meanings.items()]
+    for each in EXPECTED_OUTCOMES:
+        if count := figures["expected_outcomes"].get(each.name):
+            lines.append(f"{count:>8}  {_explained(each.name, each.reason)}")
     worst = worst_first(results)[:WORST]
     if worst:
         lines += ["", "worst flights"]
@@ -127,12 +142,8 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     return "\n".join(lines)
 
 
-def _cell(flights: Sequence[FaultResult]) -> str:
-    if not flights:
-        return "."
-    wrong = sum(r.is_bad for r in flights)
-    unavoidable = "u" if any(r.is_excused for r in flights) else ""
-    return f"{len(flights)}{f'!{wrong}' if wrong else ''}{unavoidable}"
+def _explained(name: str, meaning: str) -> str:
+    return f"{name.replace('_', ' ')}: {meaning}"
 
 
 def _line(r: FaultResult) -> tuple[str, ...]:

@@ -146,46 +146,44 @@ class Facts:
         return any(effect.func is act for effect in self.effects)
 
 
-class FactsRecorder:
-    """Follows the true vehicle sample by sample, and notes in `facts` when things happened."""
+class FactsRecorder(Facts):
+    """The facts of a flight, noted as it follows the true vehicle sample by sample."""
 
     def __init__(
         self, vehicle: SimulatedVehicle, profile: Profile, effects: tuple[e.Effect, ...] = ()
     ) -> None:
+        super().__init__(effects)
         complete = profile.planner.complete
-        self.facts = Facts(effects)
         self._watch_s = complete.hang_s + complete.watch_s - WATCH_WITHIN_S
         self._min_load_v = profile.safety.min_load_v
         self._vehicle = vehicle
         self._silent_s: float | None = None  # since when nothing has arrived
         self._heard_s = -math.inf  # when the newest silence ended that was long enough for a cut
-        self._landed_alone = self._locked_before = self._begun = False
+        self._landed_alone = self._begun = False
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
 
     def see(self, s: Sample) -> None:
-        """Note the next sample; `facts.begin_s` is set by then if the fault has begun."""
-        facts, before = self.facts, self._before
+        """Note the next sample; `begin_s` is set by then if the fault has begun."""
+        before = self._before
         self._note_silence(s)
         self._note_hanging(s)
-        if facts.begin_s is not None:
+        if self.begin_s is not None:
             flew = before is not None and before.motors_on and not before.floor
-            if not self._begun and flew and facts.does(e.reboots):
-                facts.rebooted_s = facts.begin_s
+            if not self._begun and flew and self.does(e.reboots):
+                self.rebooted_s = self.begin_s
             self._begun = True
             self._note_power(s)
         self._before = s
 
     def _note_silence(self, s: Sample) -> None:
-        facts = self.facts
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
-        facts.own_landing = facts.own_landing or (long and self._landed_alone)
-        locks = s.locked and not self._locked_before
+        self.own_landing = self.own_landing or (long and self._landed_alone)
+        locks = s.locked and not (self._before and self._before.locked)
         ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
-        if locks and (long or late) and facts.cut_s is None:
-            facts.cut_s = s.t_s
-        self._locked_before = s.locked
+        if locks and (long or late) and self.cut_s is None:
+            self.cut_s = s.t_s
         if s.uplink:
             self._heard_s = s.t_s if long else self._heard_s
             self._silent_s = None
@@ -194,15 +192,15 @@ class FactsRecorder:
             self._landed_alone = self._vehicle.firmware.planner.active
 
     def _note_hanging(self, s: Sample) -> None:
-        facts, before = self.facts, self._before
-        if facts.let_go_s is None and self._vehicle.world.magnet.let_go:
-            facts.let_go_s = s.t_s
-            facts.watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
+        before = self._before
+        if self.let_go_s is None and self._vehicle.world.magnet.let_go:
+            self.let_go_s = s.t_s
+            self.watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
         came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
-        if came_off and facts.slipped_s is None:
-            facts.slipped_s, facts.slipped_m = s.t_s, s.height_m
-        if facts.slipped_s is not None and s.t_s - facts.slipped_s <= TOPPLES_S:
-            facts.toppled = facts.toppled or s.up_z < TOPPLED_UP_Z
+        if came_off and self.slipped_s is None:
+            self.slipped_s, self.slipped_m = s.t_s, s.height_m
+        if self.slipped_s is not None and s.t_s - self.slipped_s <= TOPPLES_S:
+            self.toppled = self.toppled or s.up_z < TOPPLED_UP_Z
         if s.motors_on or not s.hanging:
             self._hangs_s = None
         elif self._hangs_s is None:
@@ -215,15 +213,13 @@ class FactsRecorder:
         weakest = min(world.powertrain.strength or (1.0,))
         lift_n = min(4.0 * MOTOR_FORCE_N, weakest * most_thrust_n(world.battery_rest_v))
         weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
-        if self.facts.weak_s is None and lift_n < LEAST_LIFT * weight_n:
-            self.facts.weak_s = s.t_s
-        if self.facts.low_s is None and world.battery_v < self._min_load_v:
-            self.facts.low_s, self.facts.low_m = s.t_s, s.height_m
+        if self.weak_s is None and lift_n < LEAST_LIFT * weight_n:
+            self.weak_s = s.t_s
+        if self.low_s is None and world.battery_v < self._min_load_v:
+            self.low_s, self.low_m = s.t_s, s.height_m
 
 
 # --- What a flight is held to -----------------------------------------
-# Where it should be in each phase, and by when it should be on its way down. Neither goes by the
-# program's estimate: that may be what is wrong.
 
 
 Place = tuple[float, float]
@@ -256,7 +252,7 @@ class PlaceBound:
     estimate, alignment and recovery; under a target in ascent, press and completion; and from the
     landing on where it should have been when the landing began.
 
-    Each target that looks like the own one counts: nothing on board can tell them apart.
+    Each target that looks like the own one counts.
     """
 
     def __init__(self, scenario: Scenario, profile: Profile) -> None:

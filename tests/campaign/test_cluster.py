@@ -24,7 +24,6 @@ pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 from perchctl.campaign import FlightResult, cluster, cluster_pool, flight_processes, fly_all
 from perchctl.campaign.cluster import WorkerRequirements, fly_verified, worker_requirements
 from perchctl.campaign.flights import fly_seed
-from perchctl.campaign.results_file import flown_record
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.places import data_file
 from perchctl.profile import load_profile
@@ -32,6 +31,7 @@ from tests.helpers.cluster import dies_in_flight, scheduler, worker
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.ended import ended
 from tests.helpers.flights import ROOT, SEED, SHORT
+from tests.helpers.results import flown_record
 from tests.helpers.seeds import Ended, ends_at_once, ends_first_only, fails_later
 
 # --- the address, and what it goes together with ------------------------------------------------
@@ -89,7 +89,6 @@ def flown_by(required: WorkerRequirements, patch: pytest.MonkeyPatch, threads: i
 
 def test_a_worker_like_this_computer_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     found = worker_requirements([load_profile("sim"), load_profile("rough")])
-    assert len(found.profiles) == 1  # both name the same files
     assert flown_by(found, monkeypatch).seed == 1
     assert len(pickle.dumps(found)) < 20_000  # it goes with each flight
 
@@ -123,7 +122,7 @@ def test_another_calibration_or_none_is_seen(
     assert flown_by(found, monkeypatch)
     file.write_text(file.read_text().replace("1", "2"))
     for _ in range(2):
-        with pytest.raises(InvalidValue, match=f"has {file} .* instead of"):
+        with pytest.raises(InvalidValue, match="has calibration or mask"):
             flown_by(found, monkeypatch)
         file.unlink(missing_ok=True)
 

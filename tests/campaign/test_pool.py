@@ -1,5 +1,5 @@
-"""The processes of a campaign: Ctrl-C is the parent's alone, and ends them at once; a lost process
-costs its flight, which is flown again; and one that flies on does not grow."""
+"""The processes of a campaign: Ctrl-C is the parent's alone, and ends them at once; a lost one is
+told; and one that flies on does not grow."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import signal
 import socket
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,6 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import defer_interrupts, flight_processes, fly_all
 from perchctl.campaign.flights import fly_seed
-from perchctl.campaign.pool import FLOWN_AGAIN
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate import (
     AGAIN_S,
@@ -41,7 +39,6 @@ from tests.helpers.seeds import (
     ends_first_only,
     fails_later,
     is_killed_later,
-    is_lost,
     lacks_a_module,
 )
 
@@ -182,28 +179,6 @@ def test_a_worker_that_lacks_a_module_is_no_fault_of_the_program() -> None:
         pytest.raises(InvalidValue, match=r"cannot load.*'mujoco'.*install"),
     ):
         fly_all(lacks_a_module, [0], pool)
-
-
-def test_a_lost_flight_is_flown_again_and_counted_once(tmp_path: Path) -> None:
-    """And those that others were flying meanwhile are flown once."""
-    fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN)
-    told: list[int] = []
-    with flight_processes(2) as pool:
-        results = fly_all(fly, [0, 1, 2, 1, 3], pool, lambda result: told.append(result.seed))
-    assert [result.seed for result in results] == [0, 1, 2, 3]
-    assert sorted(told) == [0, 1, 2, 3]
-    flown = Counter(path.name[0] for path in tmp_path.iterdir())
-    assert flown == {"0": 1, "1": 1 + FLOWN_AGAIN, "2": 1, "3": 1}
-
-
-def test_a_flight_that_is_lost_always_is_told(tmp_path: Path) -> None:
-    fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN + 1)
-    with (
-        pytest.raises(PerchError, match="flew seed 1 was ended from outside"),
-        flight_processes(1) as pool,
-    ):
-        fly_all(fly, [1], pool)
-    assert len(list(tmp_path.iterdir())) == FLOWN_AGAIN + 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -1,11 +1,8 @@
-"""Figures of a campaign and their intervals, and its progress."""
+"""Figures of a campaign and their intervals."""
 
 from __future__ import annotations
 
-import io
 import json
-import math
-import re
 from functools import partial
 from pathlib import Path
 
@@ -23,12 +20,11 @@ from perchctl.campaign import (
     rate_record,
     rate_text,
 )
-from perchctl.campaign.results import ENDS, rate_interval, worst_first
+from perchctl.campaign.results import ENDS, worst_first
 from perchctl.errors import SafetyAbort
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.progress import progress_bar
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT, short_profile
 from tests.helpers.results import aborted, landed, perched
@@ -65,7 +61,6 @@ def test_a_campaign_of_three() -> None:
         "locked": 1,
         "fell": 1,
         "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
-        "peak_memory_mb": 5e6,
         "worst_seeds": [3, 2],
     }
 
@@ -101,25 +96,6 @@ def test_the_table_names_the_worst_flights() -> None:
     assert "worst" not in campaign_table([PERCHED])
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_progress_is_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.setenv("COLUMNS", "80")
-    terminal = Terminal()
-    earlier = [LANDED] * 12 + [ABORTED] * 3 + [PERCHED] * 900
-    with progress_bar(1000, earlier, terminal) as advance:
-        for _ in range(10):
-            advance(PERCHED)
-    lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue()))
-    assert "925/1000" in lines[-2]
-    assert lines[-2].endswith("12 landed 3 aborted 910 perched")
-    assert len(lines[-2]) <= 80
-
-
 # --- refused before take-off: a result of the campaign, not its end -----------------------------
 
 
@@ -146,26 +122,6 @@ def test_the_command_says_so_after_its_table(tmp_path: Path) -> None:
     assert said.code == SafetyAbort.exit_code
     assert json.loads(said.stdout)["refused"] == 2
     assert said.complaint.startswith("every flight was refused before take-off: the battery rests")
-
-
-# --- a rate's interval against the binomial law that it stands for ------------------------------
-
-
-def _at_most(k: int, n: int, p: float) -> float:
-    """The chance of at most k of n."""
-    return sum(math.comb(n, i) * p**i * (1.0 - p) ** (n - i) for i in range(k + 1))
-
-
-@given(st.integers(0, 60), st.integers(1, 60), st.sampled_from([0.5, 0.9, 0.95, 0.99]))
-def test_beyond_a_bound_what_was_seen_has_half_of_the_rest(k: int, n: int, level: float) -> None:
-    k = min(k, n)
-    low, high = rate_interval(k, n, level)
-    assert 0.0 <= low <= k / n <= high <= 1.0
-    side = 0.5 * (1.0 - level)
-    if k:
-        assert 1.0 - _at_most(k - 1, n, low) == pytest.approx(side, abs=1e-9)
-    if k < n:
-        assert _at_most(k, n, high) == pytest.approx(side, abs=1e-9)
 
 
 def test_a_rate_in_words_and_as_a_record() -> None:

@@ -18,10 +18,10 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import VERDICT_TEXTS, mirrored_note
+from perchctl.camera import VERDICT_TEXTS
 from perchctl.check import Row, Verdict, camera
 from perchctl.check import profile as of_profile
-from perchctl.check.rehearsal import Blur, Rehearsal, rehearse
+from perchctl.check.rehearsal import Rehearsal, rehearse
 from perchctl.check.row import Finding, ask
 from perchctl.errors import NotFound
 from perchctl.faults.edges import CameraFault, FaultyCamera
@@ -113,17 +113,6 @@ def good() -> tuple[Rehearsal, dict[str, Row]]:
     return shown("none")
 
 
-@pytest.mark.parametrize("is_set", [False, True])
-def test_the_advice_for_a_mirrored_picture_goes_by_the_profile(is_set: bool) -> None:
-    done, _ = shown("mirrored")
-    config = PROFILE.camera.model_copy(update={"mirrored": is_set})
-    note = mirrored_note(config)
-    noted = replace(done, problems=Counter({note: done.pictures}))
-    rows = rows_of(noted, PROFILE.model_copy(update={"camera": config}))
-    assert rows["mirrored"].advice == note.partition(": ")[2]
-    assert rows["pictures"].advice == "see mirrored"
-
-
 def test_a_good_camera_fails_nothing() -> None:
     _, rows = good()
     assert [row for row in rows.values() if row.verdict in ("warn", "fail", "skipped")] == []
@@ -134,8 +123,7 @@ def test_a_good_camera_fails_nothing() -> None:
     ("frozen", "pictures", "fail", "stands still"),
     ("snow", "pictures", "fail", "snow"),
     ("dark", "pictures", "fail", "dark"),
-    ("mirrored", "mirrored", "fail", "mirrored"),
-    ("lossy, and a wrong print", "lost frames", "warn", "longest gap"),
+    ("mirrored", "pictures", "fail", "mirrored"),
     ("lossy, and a wrong print", "print", "fail", "print error"),
     ("slow", "frame rate", "fail", "6 Hz"),
     ("out of focus", "focus", "fail", "blur sigma 3"),
@@ -154,7 +142,7 @@ def test_a_fault_of_the_simulated_camera_makes_its_row(
 
 
 def test_what_a_target_would_show_is_not_known_without_one() -> None:
-    for name in ("target", "focus", "mirrored", "print"):
+    for name in ("target", "focus", "print"):
         assert shown("bare")[1][name].verdict is Verdict.SKIPPED, name
     far = rehearsed(away_m=FAR_FOR_BOTH_M, duration_s=0.2)
     assert rows_of(far)["print"].verdict is Verdict.SKIPPED, "both markers are needed"
@@ -184,7 +172,7 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
 
 @pytest.mark.parametrize(("name", "verdict", "changes"), [
     ("lost frames", "fail", {"arrivals": gaps(*[0.03] * 20, 0.7)}),
-    ("lost frames", "fail", {"arrivals": gaps(*[0.03] * 12, *[0.12] * 9)}),
+    ("lost frames", "warn", {"arrivals": gaps(*[0.03] * 20, 0.3)}),
     ("lost frames", "skipped", {"arrivals": gaps(0.03, 0.03)}),
     ("lost frames", "skipped", {"live": False}),
     ("frame rate", "warn", {"arrivals": gaps(*[0.08] * 20)}),
@@ -194,11 +182,7 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("picture age", "skipped", {"live": False}),
     ("pictures", "warn", {"problems": Counter({VERDICT_TEXTS["snow"]: 2})}),
     ("pictures", "pass", {"repeats": 100}),
-    ("lost frames", "pass", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.05, 0.033] * 4),
-                             "repeats": 30}),
-    ("lost frames", "warn", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.14] * 5), "repeats": 30}),
-    ("focus", "warn", {"blur": Blur(2.0, 2.0)}),
-    ("focus", "warn", {"blur": Blur(0.8, 2.5)}),
+    ("focus", "warn", {"blur_px": 2.0}),
     ("target", "warn", {"found": 3, "target": None}),
     ("target", "fail", {"target": target_at(1.0, (0.0, 0.0, 0.23), (0.0, 0.0, 0.0))}),
     ("loop", "warn", {"work_s": [0.028] * 20}),
@@ -224,20 +208,9 @@ def test_what_a_receiver_gives_out_again_is_counted_once() -> None:
     assert done.found == done.pictures, "nor does it make the target seem unseen"
 
 
-def test_a_rate_below_the_wanted_one_warns() -> None:
-    slow = PROFILE.model_copy(
-        update={"camera": PROFILE.camera.model_copy(update={"rate_hz": 60.0})}
-    )
-    rows = rows_of(good()[0], slow)
-    assert rows["frame rate"].verdict is Verdict.WARN
-    assert "asked for 60" in rows["frame rate"].found
-
-
 @pytest.mark.parametrize(("finding", "verdict", "words"), [
-    (camera.opened_finding("camera:0", []), "pass", "camera:0"),
     (camera.size_finding((320, 240), (640, 480)), "fail", "320x240"),
     (camera.size_finding((640, 480), (640, 480)), "pass", "640x480"),
-    (camera.size_finding(None, (640, 480)), "skipped", ""),
 ])  # fmt: skip
 def test_what_a_camera_delivers_otherwise_makes_its_row(
     finding: Finding, verdict: str, words: str
@@ -246,15 +219,15 @@ def test_what_a_camera_delivers_otherwise_makes_its_row(
     assert words in finding.found
 
 
-def test_a_missing_camera_names_those_that_are_there() -> None:
-    error = NotFound("camera:7 was not found; there are camera:0; plug in the camera")
-    first, *rest = camera.refused_rows(error, ["camera:0"], PROFILE)
+@pytest.mark.parametrize(("text", "advice"), [
+    ("camera:7 was not found; there are camera:0; plug in the camera", "plug in the camera"),
+    ("http://x: no answer", "--cameras lists"),
+])  # fmt: skip
+def test_a_missing_camera_skips_the_rest(text: str, advice: str) -> None:
+    first, *rest = camera.refused_rows(NotFound(text), PROFILE)
     assert (first.name, first.verdict) == ("camera", Verdict.FAIL)
-    assert "camera:0" in first.found
-    assert first.advice == "plug in the camera"
+    assert advice in first.advice
     assert {r.verdict for r in rest} == {Verdict.SKIPPED}
-    told = camera.refused_rows(NotFound("http://x: no answer"), ["camera:2"], PROFILE)[0]
-    assert "camera:2" in told.advice
 
 
 # --- The rehearsal itself, and the computer ---------------------------------------------
@@ -271,7 +244,7 @@ def test_a_rehearsal_needs_no_vehicle() -> None:
 
 def test_the_log_s_folder_is_not_made_and_a_file_in_its_place_fails(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "b"
-    assert "(new)" in of_profile.log_finding(folder).found
+    assert of_profile.log_finding(folder).verdict is not Verdict.FAIL
     assert not (tmp_path / "a").exists()
     (tmp_path / "taken").write_text("")
     row = of_profile.log_finding(tmp_path / "taken")
@@ -288,15 +261,3 @@ def test_a_full_disk_makes_its_row(
         of_profile.shutil, "disk_usage", lambda path: SimpleNamespace(free=free, total=10**12)
     )
     assert of_profile.log_finding(tmp_path).verdict == verdict
-
-
-def test_a_disk_that_tells_no_space_skips_its_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def silent(path: Path) -> None:
-        raise OSError(107, "Transport endpoint is not connected")
-
-    monkeypatch.setattr("perchctl.check.profile.shutil.disk_usage", silent)
-    row = of_profile.log_finding(tmp_path)
-    assert row.verdict is Verdict.SKIPPED
-    assert row.found == "free space not known (Transport endpoint is not connected)"

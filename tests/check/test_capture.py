@@ -65,7 +65,7 @@ def rows_of(it: Scripted, sample: Telemetry | None = None) -> dict[str, Row]:
 
     seen = capture.listen(heard, it, it.clock, it.wait)
     found = capture.mocap_rows_at_rest(seen, PROFILE)
-    assert [row.name for row in found] == ["capture", "body", *capture.CAPTURE]
+    assert [row.name for row in found] == ["capture", *capture.BODY_ROWS]
     return {row.name: row for row in found}
 
 
@@ -136,6 +136,6 @@ def test_without_a_vehicle_no_place_is_compared() -> None:
 
 def test_one_that_does_not_open_skips_the_rest() -> None:
     rows = capture.refused_rows("no motion capture vicon:lab: no answer within 5 s", CONFIG)
-    assert [row.name for row in rows] == ["capture", "body", *capture.CAPTURE]
+    assert [row.name for row in rows] == ["capture", *capture.BODY_ROWS]
     assert rows[0].verdict is Verdict.FAIL
     assert {row.verdict for row in rows[1:]} == {Verdict.SKIPPED}

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import CheckScope, Row, Verdict, camera, check, session
-from perchctl.check.capture import CAPTURE, COMPARED
+from perchctl.check.capture import BODY_ROWS, COMPARED
 from perchctl.commands import app
 from perchctl.commands import check as command
 from perchctl.commands.check import exit_code, report, table
@@ -148,13 +148,12 @@ def test_a_flight_is_refused_for_what_the_profile_or_the_disk_fails(
 
 def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text(
-        "extends: sim\nvehicle: {gear_body_m: [0.0, 0, 0.03]}\n"
-        "camera: {mount: {position_m: [0.0, 0.0, 0.03]}}\nlink: {connect_timeout_s: 0.4}\n"
+        "extends: sim\nsafety: {fence_radius_m: 0.2}\nlink: {connect_timeout_s: 0.4}\n"
     )
     words = ["fly", "-p", "p.yaml", "-u", NOWHERE, "--source", "camera:97", "--yes"]
     said = CliRunner().invoke(app, words)
     warned_of = [line for line in said.stderr.splitlines() if line.startswith("perchctl: check: ")]
-    assert any("camera place" in line for line in warned_of)
+    assert any("fence" in line for line in warned_of)
     assert said.exit_code in (10, 20)
 
 
@@ -162,12 +161,11 @@ def test_every_row_is_on_its_page() -> None:
     page = (ROOT / "docs" / "check.md").read_text(encoding="utf-8")
     for name in (
         *VEHICLE,
-        *CAPTURE,
+        *BODY_ROWS,
         COMPARED,
         *camera.PICTURES,
         camera.IN_VIEW,
         "capture",
-        "body",
         "camera",
         "size",
         "loop",

@@ -14,7 +14,6 @@ from perchctl.profile import DOUBTFUL, Profile, load_profile
 from tests.helpers.flights import short_profile
 
 CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
-    ("camera place", {"camera.mount.position_m": [0, 0, 0.03]}, "the gear's tip"),
     ("heights", {"planner.search.max_height_m": 2.95}, "safety.max_height_m (3 m)"),
     ("heights", {"safety.ground_tolerance_m": 1.0}, "one on the ground"),
     ("fence", {"safety.fence_radius_m": 0.2}, "draught"),
@@ -32,7 +31,6 @@ CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
     ("thresholds", {"planner.perch.mode": "raw", "planner.perch.thrust": 30000}, "30000"),
     ("thresholds", {"safety.max_tilt_deg": 15}, "a gust"),
     ("thresholds", {"link.telemetry_period_s": 0.06}, "one lost packet"),
-    ("way", {"planner.approach_xy_m": [1.5, 1.5]}, "2.12 m"),
 )
 """A row, what brings its warning about on top of `sim`, and what it says."""
 

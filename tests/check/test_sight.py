@@ -10,13 +10,12 @@ import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
 from perchctl.check.camera import IN_VIEW, names_of, picture_rows
-from perchctl.check.rehearsal import Blur, Looked, Rehearsal, telemetry_for
+from perchctl.check.rehearsal import Rehearsal, telemetry_for
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision import CameraModel, Frame, PipelineOutput
-from perchctl.vision.types import Detection, Detections, Stage
+from perchctl.vision import CameraModel
 from tests.helpers.checks import AT_REST, PROFILE
 from tests.helpers.flights import short_profile
 from tests.helpers.mission import target_at
@@ -25,23 +24,12 @@ TARGET = short_profile({"positioning": "target"}, base="sim")
 CAMERA = CameraModel(
     (640, 480), np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]]), np.zeros(5)
 )
-NOTHING = Detections(frame_index=1, t_s=0.0)
-PICTURE = Frame(1, 0.0, np.zeros((480, 640), np.uint8), 0.0)
-
-
-def shown(left_px: float) -> Looked:
-    """A picture with the large marker so far from its left edge."""
-    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    corners = 30.0 * unit + np.array([left_px, 200.0])
-    seen = replace(NOTHING, large=Detection("large", corners, 0.1, True))
-    return Looked(PICTURE, PipelineOutput(seen, {}, None, Stage.LARGE))
 
 
 def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) -> Rehearsal:
     """Under a target that is there from where the vehicle stands."""
     target = target_at(1.0, (x, y, z), (0.0, 0.0, 0.0))
     made = Rehearsal(live=True, pictures=60, found=60, target=target)
-    made.looked, made.blur = [shown(300.0)], Blur(0.6, 0.6)
     return replace(made, **changes)
 
 
@@ -50,20 +38,17 @@ def rows_of(done: Rehearsal, profile: Profile = TARGET) -> dict[str, Row]:
     return {row.name: row for row in found if row.name == IN_VIEW}
 
 
-def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
+def test_under_the_target_it_passes() -> None:
     rows = rows_of(rehearsed())
     assert list(rows) == [IN_VIEW]
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
-    assert "0.07 m aside of the camera's axis 2.00 m above it" in rows["in view"].found
 
 
 @pytest.mark.parametrize(("verdict", "words", "advice", "done"), [
     ("fail", "no, and fly refuses", "at most 3.2 m above the camera",
      rehearsed(found=0, target=None)),
     ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
-    ("warn", "in 33 % of the pictures", "nearer", rehearsed(found=20)),
     ("warn", "not at the end", "lost frames", rehearsed(target=None)),
-    ("warn", "only 1 % of the picture's width", "put the vehicle", rehearsed(looked=[shown(5.0)])),
     ("skipped", "no picture came", "", rehearsed(pictures=0)),
 ])  # fmt: skip
 def test_a_sight_makes_its_row(verdict: str, words: str, advice: str, done: Rehearsal) -> None:

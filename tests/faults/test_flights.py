@@ -29,7 +29,6 @@ from perchctl.faults.edges import PlantedError
 from perchctl.faults.effects import FOR_EVER, deck_silent
 from perchctl.faults.flight import fly_with_fault
 from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED
-from perchctl.faults.promises import PROMISES, Promise
 from perchctl.faults.results import ENDS, worst_first
 from perchctl.flight import loop
 from perchctl.mission import Phase
@@ -48,13 +47,42 @@ GUARD = {
 """Each fault once with each positioning, the phases by turns."""
 
 
+# What docs/faults.md promises: no flag counts, and the flight perches or lands, but for these.
+MAY_ABORT = {
+    "uplink-silent", "link-silent", "weak-magnet-uplink", "brown-out", "ceiling-beside-its-plane",
+    "emergency-stop-lost", "operator-twice", "operator-hammers", "killed", "suspended",
+}  # fmt: skip
+OTHER_ENDS = {"killed": "gone", "suspended": "gone", "exception": "failed"}
+MAY_BE_UNSEEN = {
+    "downlink-silent", "state-block-dead", "attitude-block-dead", "variance-block-dead",
+    "telemetry-delayed", "hung", "slow", "hung-and-packet-lost", "position-frozen",
+    "attitude-frozen", "acceleration-frozen", "thrust-frozen", "supervisor-frozen",
+    "estimate-jumps", "height-jumps", "estimate-drifts", "estimate-nan", "external-position",
+    "external-occluded", "external-swapped", "external-scaled", "external-late",
+    "external-mirrored", "deck-silent",
+}  # fmt: skip
+"""What is wrong with the estimate may end in an unconfirmed landing, or held off the target."""
+NAMED = {"camera-mirrored": "camera.mirrored", "camera-turned": "camera.mount"}
+"""A flight that does not perch says why."""
+
+
+def keeps_promise(r: FaultResult) -> bool:
+    if r.counted:
+        return False
+    if r.outcome == "refused" or (
+        r.fault in MAY_BE_UNSEEN and r.row in (UNCONFIRMED, "held-elsewhere")
+    ):
+        return True
+    if r.outcome != "perched" and NAMED.get(r.fault, "") not in r.reason:
+        return False
+    if r.expected or (r.outcome == "aborted" and r.fault in MAY_ABORT):
+        return True
+    return r.outcome in ("perched", "landed", OTHER_ENDS.get(r.fault))
+
+
 @cache
 def profile(by: str = "deck") -> Profile:
     return with_positioning(load_profile(SHORT), by)
-
-
-def promise_of(name: str) -> Promise:
-    return PROMISES[BY_NAME[name].promise]
 
 
 def flown(
@@ -86,28 +114,28 @@ def test_nothing_goes_wrong(name: str, phase: Phase, by: str) -> None:
     assert result.counted == (), result
     # By the target alone it may not know at the end whether it hangs or stands, and says so.
     not_known = by == "target" and result.row == NOT_KNOWN
-    assert not_known or promise_of(name).is_kept(result), result
+    assert not_known or keeps_promise(result), result
 
 
-def test_each_fault_stands_under_one_line_of_the_table() -> None:
-    """The last line is of what no fault brings about by itself."""
-    assert {fault.promise for fault in FAULTS} == {*PROMISES} - {"ended"}
+@pytest.mark.parametrize(
+    ("name", "changes", "kept"),
+    [
+        ("operator-once", {}, True),
+        ("operator-once", {"outcome": "aborted"}, False),
+        ("operator-once", {"counted": ("fell",)}, False),
+        ("operator-once", {"outcome": "aborted", "row": UNCONFIRMED}, False),
+        ("downlink-silent", {"outcome": "aborted", "row": UNCONFIRMED}, True),
+        ("killed", {"outcome": "gone"}, True),
+        ("camera-turned", {"reason": "turn camera.mount by 90 deg"}, True),
+        ("camera-turned", {"reason": "target not found"}, False),
+    ],
+)
+def test_a_broken_promise_is_seen(name: str, changes: dict[str, Any], kept: bool) -> None:
+    assert keeps_promise(made(1, name, Phase.ALIGN, **changes)) is kept
 
 
-def test_a_broken_promise_is_seen() -> None:
-    once = promise_of("operator-once")
-    assert once.is_kept(made(1, "operator-once", Phase.ALIGN))
-    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, outcome="aborted"))
-    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, counted=("fell",)))
-    silent = promise_of("downlink-silent")
-    unseen = {"outcome": "aborted", "row": UNCONFIRMED}
-    assert silent.is_kept(made(1, "downlink-silent", Phase.ALIGN, **unseen))
-    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, **unseen))
-    turned = promise_of("camera-turned")
-    assert turned.is_kept(
-        made(1, "camera-turned", Phase.ALIGN, reason="turn camera.mount by 90 deg")
-    )
-    assert not turned.is_kept(made(1, "camera-turned", Phase.ALIGN, reason="target not found"))
+def test_exceptions_are_of_faults_that_there_are() -> None:
+    assert MAY_ABORT | MAY_BE_UNSEEN | {*OTHER_ENDS} | {*NAMED} <= {*BY_NAME}
 
 
 class HeightWatched(faulty.FaultyFlight):
@@ -155,13 +183,6 @@ def test_it_does_not_climb_with_an_estimate_that_nothing_corrects(
     assert flight.rise_m < 0.15
 
 
-@pytest.mark.long
-def test_a_deck_that_is_blind_for_a_moment_is_waited_for() -> None:
-    flight, result = deck_lost(Phase.ALIGN, 0.3, -0.08)
-    assert (result.outcome, result.counted) == ("perched", ()), result
-    assert math.isinf(flight.landed_for_s)
-
-
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[FaultResult, Path]:
     """Killed while it aligns, in the air: nothing can be done about that."""
@@ -186,12 +207,6 @@ def test_the_log_ends_where_the_program_did(killed: tuple[FaultResult, Path]) ->
     assert ticks[-1] == pytest.approx(result.time_s, abs=0.05)
 
 
-def test_the_operator_s_word_is_excused() -> None:
-    result = flown("operator-twice", Phase.SEARCH)
-    assert result.outcome == "aborted"
-    assert result.counted == ()
-
-
 @pytest.mark.parametrize(("name", "astray_m"), [("bare-ceiling", 2.0), ("kick", 0.0)])
 def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: float) -> None:
     """By the true room: a bare ceiling has none where one was drawn."""
@@ -205,14 +220,7 @@ def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: fl
 
 @pytest.mark.parametrize(
     ("name", "heard"),
-    [
-        ("kick", True),
-        ("battery-block-dead", True),
-        ("downlink-silent", False),
-        ("state-block-dead", False),
-        ("attitude-block-dead", False),
-        ("thrust-frozen", False),
-    ],
+    [("kick", True), ("state-block-dead", False), ("thrust-frozen", False)],
 )
 def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> None:
     scenario = draw_scenario(profile(), SEED)
@@ -310,8 +318,8 @@ def test_the_table_fits_the_terminal() -> None:
     assert max(map(len, fault_table(every).splitlines())) <= 80
     shown = fault_table(RESULTS)
     for row in (
-        r"^kick +\. +\. +\. +2!1 ", r"^killed +\. +\. +\. +1u ", r"^not known +1 of 5 ",
-        r"^ +let go after the flight +1$",
+        r"^kick +2 +1 +0$", r"^killed +1 +0 +1$", r"^1 of 5 .* not known: ",
+        r"^ +1 +let go after the flight: ",
     ):  # fmt: skip
         assert re.search(row, shown, re.MULTILINE), row
 

@@ -163,13 +163,6 @@ def test_a_slip_is_a_fall_where_it_is_too_deep_for_what_the_magnet_held() -> Non
     assert limits == [0.15, 0.15, 0.6, 0.6, 1.0, 1.0]
 
 
-def test_a_slip_with_the_motors_turning_is_a_descent() -> None:
-    """In position mode the thrust never goes below a third of the weight."""
-    judge = slip(0.2, 0.4 * G, 0.2, 0.5)
-    assert judge.flags == {}
-    assert 0.15 < judge.drop_m < 0.4
-
-
 @pytest.mark.parametrize(
     ("height_m", "acc", "ended"), [(0.3, 0.4 * G, False), (2.0, G, False), (2.0, G, True)]
 )
@@ -232,14 +225,9 @@ def test_lied(claim: Claim) -> None:
             assert Script((truth, 1.0)).claim(claim).show(truth, 2.0).flags == flags, truth
 
 
-def test_what_tilted_and_crashed_before_did_so() -> None:
-    script = Script((HOVER._replace(up_z=0.2, ended_by_vehicle=True), 0.2), (FLOOR, 1.0))
-    script.claim("tilted", "ended by the supervisor")
-    assert script.show(FLOOR, 2.0).flags == set()
-
-
-def test_a_claim_has_half_a_second_to_become_true() -> None:
-    script = Script((FLOOR_ON, 1.0)).claim("motors off")
+def test_a_claim_may_be_of_before_or_become_true_within_half_a_second() -> None:
+    script = Script((HOVER._replace(up_z=0.2, ended_by_vehicle=True), 0.2), (FLOOR_ON, 1.0))
+    script.claim("tilted", "ended by the supervisor", "motors off")
     assert script.show(FLOOR_ON, 0.3).show(FLOOR, 2.0).flags == set()
 
 
@@ -326,12 +314,7 @@ def test_the_second_ctrl_c_stops_the_motors_within_half_a_second(
         script.show(LOW, silent_s, uplink=False)
     script.show(LOW, after_s - silent_s)
     assert script.show(LOW, 1.0, motors_on=False).flags == flags
-
-
-def test_motors_that_the_second_ctrl_c_stopped_stay_off() -> None:
-    script = Script((LOW, 1.0)).press().show(LOW, 0.6).press().show(LOW, 0.6, motors_on=False)
-    assert script.show(LOW, 1.0, motors_on=False).flags == set()
-    assert script.show(LOW, 0.1).flags == {"stop_not_obeyed"}
+    assert script.show(LOW, 0.1).flags == {"stop_not_obeyed"}, "they stay off"
 
 
 def test_one_ctrl_c_asks_for_no_stop_and_nobody_obeys_after_the_end() -> None:

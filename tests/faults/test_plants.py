@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.commands.fly import POSITIONINGS, with_positioning
 from perchctl.faults import flight as faulty
-from perchctl.faults.flight import fly_fault_seed
+from perchctl.faults.flight import fly_fault_in_folder
 from perchctl.faults.oracle import Flag
 from perchctl.flight import OperatorSwitch, loop
 from perchctl.mission import Observation, Operator, Phase, PlannerState, lander, planner
@@ -166,7 +166,7 @@ def test_the_campaign_notices(plant: Plant, by: str) -> None:
         with Patch.context() as patch:
             if planted:
                 plant.into(patch)
-            result = fly_fault_seed(profile, seed, plant.faults)
+            result = fly_fault_in_folder(profile, plant.faults, None, False, seed)
         return bool(set(plant.flags) & set(result.counted))
 
     assert any(

@@ -53,15 +53,6 @@ def test_the_largest_raw_thrust_presses_at_any_mass(
     assert sample_of(heavy).pressing is pressing
 
 
-def test_a_sample_of_a_vehicle_on_the_floor(vehicle: WatchedVehicle) -> None:
-    vehicle.advance_to(1.0)
-    sample = sample_of(vehicle)
-    assert sample.floor
-    assert abs(sample.height_m) < 0.002
-    assert sample.acc_g == pytest.approx(1.0, abs=0.01)
-    assert True not in (sample.motors_on, sample.hanging, sample.locked, sample.pressing)
-
-
 def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehicle) -> None:
     x_m, y_m = vehicle.world.magnet.target_xy_m
     vehicle.world.set_pose((x_m + 0.04, y_m, 1.0), velocity_mps=(0.3, -0.4, 9.0))
@@ -103,15 +94,14 @@ class Recorded:
             firmware=SimpleNamespace(planner=self.planner, supervisor=self.supervisor),
             scenario=SimpleNamespace(mass_kg=0.04),
         )
-        self.recorder = FactsRecorder(vehicle, PROFILE, effects)
-        self.facts = self.recorder.facts
+        self.facts = FactsRecorder(vehicle, PROFILE, effects)
         self.t_s = 0.0
 
     def show(self, sample: Sample, for_s: float, *, begun: bool = True, **changes: Any) -> Recorded:
         for _ in range(round(for_s / DT_S)):
             if begun and self.facts.begin_s is None:
                 self.facts.begin_s = self.t_s
-            self.recorder.see(sample._replace(t_s=self.t_s, **changes))
+            self.facts.see(sample._replace(t_s=self.t_s, **changes))
             self.t_s += DT_S
         return self
 

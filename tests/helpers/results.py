@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from perchctl.campaign import FlightResult
+from perchctl.record import to_exact
 
 PERCHED = FlightResult(0, "perched", "hanging still", 0.002, 20.0, 1, False, False)
 LANDED = replace(PERCHED, outcome="landed", reason="battery at 2.9 V", miss_m=None, time_s=30.0)
@@ -19,5 +21,11 @@ def landed(seed: int) -> FlightResult:
 
 
 def aborted(seed: int) -> FlightResult:
-    """It fell, and its process held more memory than any test's."""
-    return FlightResult(seed, "aborted", "tilted", None, 10.0, 1, True, True, peak_memory_mb=5e6)
+    """It fell, and was locked."""
+    return FlightResult(seed, "aborted", "tilted", None, 10.0, 1, True, True)
+
+
+def flown_record(result: FlightResult) -> dict[str, Any]:
+    """What equal flights share on all computers: without log and timings."""
+    record: dict[str, Any] = to_exact(result)
+    return {k: v for k, v in record.items() if k not in ("cpu_s", "log", "log_problem")}

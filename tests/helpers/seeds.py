@@ -4,7 +4,6 @@ them, which each process would take seconds for."""
 from __future__ import annotations
 
 import os
-import secrets
 import signal
 import time
 from dataclasses import dataclass
@@ -46,19 +45,6 @@ def lacks_a_module(seed: int) -> Ended:
 def fails_later(seed: int) -> Ended:
     if seed:
         raise ZeroDivisionError("no such luck")
-    return ends_at_once(seed)
-
-
-def no_form() -> object:
-    return lambda: None
-
-
-def is_lost(seed: int, folder: Path, times: int) -> Ended:
-    """The flight of seed 1 loses its process so many times; each flight leaves a mark."""
-    mark = folder / f"{seed}_{secrets.token_hex(4)}"
-    mark.touch()
-    if seed == 1 and len(list(folder.glob("1_*"))) <= times:
-        os.kill(os.getpid(), signal.SIGKILL)
     return ends_at_once(seed)
 
 

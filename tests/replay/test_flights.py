@@ -11,8 +11,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.analysis import replay
 from perchctl.analysis.replayer import Replay
 from perchctl.campaign.flights import fly_seed
-from perchctl.faults import FAULTS
-from perchctl.faults.flight import fly_fault_seed
+from perchctl.faults import FAULTS, fly_fault_in_folder
 from perchctl.profile import changed_profile
 from perchctl.record import read_log, recorded_pictures
 from tests.helpers.flights import short_profile
@@ -27,9 +26,9 @@ the seeds draw others, and one that refuses the flight, or takes the log's disk,
 def flown(folder: Path, seed: int, faults: tuple[str, ...] = ()) -> Replay | None:
     """Fly, and decide again; None where the log could not hold the flight, which a fault may
     forbid, or the flight was refused."""
-    path = folder / "f.jsonl"
+    path = folder / f"flight_seed{seed}.jsonl"
     if faults:
-        fly_fault_seed(short_profile(), seed, faults, path)
+        fly_fault_in_folder(short_profile(), faults, folder, False, seed)
     else:
         fly_seed(short_profile(), seed, path)
     log = read_log(path)

@@ -29,7 +29,7 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-from perchctl.faults.flight import fly_fault_seed  # noqa: E402
+from perchctl.faults import fly_fault_in_folder  # noqa: E402
 from perchctl.flight import (  # noqa: E402
     FlightParts,
     fly_lockstep,
@@ -83,7 +83,9 @@ def _seen(log: Path) -> None:
 
 
 def _fault(log: Path, fault: str, seed: int) -> None:
-    fly_fault_seed(short_profile(SMALL), seed, (fault,), log)
+    flown = fly_fault_in_folder(short_profile(SMALL), (fault,), log.parent, False, seed)
+    assert flown.log is not None
+    flown.log.rename(log)
 
 
 def _hung_within(log: Path) -> None:
