@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 
 import pytest
 
-from perchctl import children
 from tests.helpers.flights import ROOT
 
 
@@ -43,22 +41,3 @@ def test_the_simulator_starts_no_process_as_it_is_loaded() -> None:
         "import perchctl.sim.world; print(begun, 'glfw' in sys.modules)"
     )
     assert loaded(code) == "[] False\n"
-
-
-def test_a_foreign_connection_cannot_take_the_childs_place() -> None:
-    """A connection without the token is closed before anything is unpickled."""
-    with children.listen() as listener:
-        foreign = socket.create_connection(listener.getsockname())
-        foreign.sendall(b"0" * 64)
-        connection = socket.create_connection(listener.getsockname())
-        connection.sendall(b"f" * 64)
-        friend = children.Channel(connection)
-        channel = children.accept(listener, "f" * 64, 5.0, lambda: True)
-        assert channel is not None
-        friend.send({"a": 1})
-        assert channel.receive(5.0) == {"a": 1}
-        friend.close()
-        with pytest.raises(EOFError):
-            channel.receive(5.0)
-        channel.close()
-        foreign.close()

@@ -140,7 +140,7 @@ def test_a_file_of_the_wrong_kind_is_named_as_what_it_is(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copyfile(ROOT / "calib" / "example_640x480.yaml", "cal.yaml")
-    shutil.copyfile(ROOT / "docs" / "pictures" / "calibration.png", "pic.png")
+    shutil.copyfile(ROOT / "docs" / "pictures" / "target.png", "pic.png")
     Path("mine.yaml").write_text("extends: sim\nplaner: {attempts: 3}\n")
     result = run(*words)
     assert result.code == 30
