@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
+from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.base import without_constants
@@ -81,6 +82,10 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
+        if (kind := file_kind(path)) == "a camera calibration":
+            raise InvalidValue(
+                f"{path} is {kind}, no profile: name it in a profile's camera.calibration"
+            ) from None
         raise InvalidValue(_one_sentence(path, error)) from None
 
 

@@ -310,7 +310,8 @@ def attributes_read() -> set[tuple[str, str]]:
 
 
 ALIASES = {
-    "profile": ("config",), "camera": ("config",), "detector": ("config",), "pose": ("config",), "kalman": ("config",),
+    "profile": ("config",),
+    "camera": ("config",), "detector": ("config",), "pose": ("config",), "kalman": ("config",),
     "merge": ("config",), "weights": ("weights",), "large": ("large", "config", "old"),
     "small": ("small", "config", "old"), "mount": ("self",), "simulation": ("ranges", "sim"),
     "link": ("_config",), "landing": ("landing_config",), "positioning": ("config", "_config"),
