@@ -21,6 +21,7 @@ from tests.helpers.boards import (
     draw_poses,
 )
 from tests.helpers.gear import SIZE_PX, Pictures, legs, turned_about
+from tests.helpers.recording import VIEWS, picture
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
 
@@ -163,3 +164,9 @@ def test_pictures_that_do_not_show_it_are_refused(
 ) -> None:
     with pytest.raises(InvalidValue, match=told):
         learn_gear(Pictures(pictures))
+
+
+def test_a_picture_of_the_target_is_named_as_that() -> None:
+    said = find_board(picture(VIEWS["both"]), CHARUCO)
+    assert "perching target" in str(said)
+    assert "make-target board" in str(said)

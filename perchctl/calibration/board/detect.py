@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from perchctl.camera import Grey
 from perchctl.geometry import Array
+from perchctl.profile import TargetConfig, aruco_dictionary
 from perchctl.target import Board
 from perchctl.vision import split_fields
 
@@ -112,7 +113,7 @@ def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
     detector.setCharucoParameters(completing)
     corners, ids, _, marker_ids = detector.detectBoard(image)
     if marker_ids is None or len(marker_ids) == 0:
-        return "no board found"
+        return _without_board(image)
     numbers = np.array([] if ids is None else ids, dtype=np.intp).ravel()
     plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
     if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
@@ -127,8 +128,18 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
     if not found:
         found, corners = cv2.findChessboardCornersSB(image, size, flags=_SECTORS)
     if not found:
-        return "no board found"
+        return _without_board(image)
     return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
+
+
+def _without_board(image: Grey) -> str:
+    """Return why a picture shows no board: the target is the other print that lies about."""
+    marker = TargetConfig().large
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
+    _, ids, _ = detector.detectMarkers(image)
+    if ids is not None and marker.id in ids:
+        return "it shows the perching target; print a board with perchctl make-target board"
+    return "no board found"
 
 
 def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
