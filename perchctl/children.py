@@ -65,8 +65,7 @@ def connect_back() -> Channel:
 
 def end_with_parent(last: Callable[[], object] = lambda: None) -> None:
     """End this process of `multiprocessing` as soon as its parent is gone, killed or not, since
-    nobody waits for its work; `last` is called before. The function is here since this module loads
-    at once: a busy computer takes long to load the whole program."""
+    nobody waits for its work; `last` is called before."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

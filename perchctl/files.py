@@ -1,8 +1,7 @@
 """The one way to write a whole file, and what a file is by its content.
 
 A file is written under a temporary name beside its place, brought to the disk, and renamed:
-a reader finds the old file or the new one, never a part of one. Logs and sessions, which grow
-line by line, are not written this way.
+a reader finds the old file or the new one, never a part of one.
 
 One rule for what a command writes: an existing file is replaced with ``--force`` only, which is
 asked before any long work; folders that are missing are made.

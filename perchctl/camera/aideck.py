@@ -27,8 +27,7 @@ from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
 STALLED_S = 2.0
-"""A picture that takes longer from its first byte to its last is dropped: its end would be taken
-for its time of arrival."""
+"""A picture that takes longer from its first byte to its last is dropped."""
 MAX_PACKET_BYTES = 1022
 """Largest length of a packet: the deck's buffers hold no more (its MTU)."""
 MOST_SIDE_PX = 1024

@@ -29,8 +29,7 @@ VERDICT_TEXTS: dict[Kind, str] = {
 FROZEN_AFTER_S = 0.4
 """Time without a change after which repeated is frozen."""
 UNIFORM_SIGMA = 1.5
-"""Spread below which a picture shows nothing; a blank video screen has below 1, the noise of a
-camera alone more than 2."""
+"""Spread below which a picture shows nothing: a blank screen has below 1."""
 DARK_LEVEL = 30.0
 """Mean plus two spreads below which a picture is dark."""
 SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3

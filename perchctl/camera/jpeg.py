@@ -63,8 +63,6 @@ class JpegSplitter:
 
     It follows the JPEG's own structure instead of the multipart headers. Wrong lengths, odd
     boundaries and missing headers therefore do no harm, and a picture is out with its last byte.
-    A damaged picture is dropped, and the search goes on where its structure breaks: up to 64 kB
-    later if the damage is in a segment's length.
     """
 
     def __init__(self) -> None:

@@ -117,8 +117,7 @@ MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
-"""By which a camera's clock may run slow before its pictures look older than they are. Allowing
-for it is safer than a short window: that would forget the fastest amid a heap."""
+"""By which a camera's clock may run slow before its pictures look older than they are."""
 
 _OPTIONS = {
     "rtsp_flags": "prefer_tcp",  # a lost packet costs every picture up to the next whole one
@@ -137,9 +136,7 @@ class TransferDelay:
     """Tells how long a picture was under way beyond the fastest of the last ten seconds.
 
     Pure. The camera's own time of a picture shows the delay. What piles up behind a radio that
-    stalls comes in a heap, and would look as if it had just been taken. Where the camera's time
-    goes backwards, as when its clock is set back, it starts anew, and one set forward makes the
-    next picture the fastest.
+    stalls comes in a heap, and would look as if it had just been taken.
     """
 
     def __init__(self) -> None:

@@ -39,8 +39,7 @@ WORKERS_S = 20.0
 _CLOSE_S = 1.0
 _QUIET = ("distributed", "tornado", "asyncio")
 _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
-"""The libraries that compute a flight's figures or carry them between computers; OpenCV has
-several package names and is compared apart."""
+"""Compute a flight's figures or carry them; OpenCV, of several names, is compared apart."""
 
 
 # --- What each worker must have ---------------------------------------

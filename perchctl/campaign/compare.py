@@ -196,7 +196,7 @@ class Sweep:
         """Return the figures of each value (a cell), by the seeds that were flown with every
         value, for JSON. `best`: the value with the most successes, of these the one with the
         smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,
-        None where they are the same. What is proven there counts that it was picked out of all."""
+        None where they are the same."""
         seeds = whole_seeds(results, len(self.profiles))
         own = len(self.profiles) - 1
         cells = [

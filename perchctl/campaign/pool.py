@@ -50,9 +50,8 @@ def flight_processes(jobs: int) -> Iterator[Executor]:
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
     """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started
-    within it never see them. Python's handlers are replaced meanwhile, too: a signal mask belongs
-    to one thread, so a library's thread may take the signal, and Python would still handle it in
-    the main thread."""
+    within it never see them. Python's handlers are replaced, too: a
+    library's thread may take the signal."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     came: list[int] = []
     handlers: dict[signal.Signals, Any] = {}

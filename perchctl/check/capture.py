@@ -9,9 +9,7 @@ B the rigid body's axes, where they should be none:
     R_seen = A R_own B
 
 A turn between two moments is ``A w`` in the capture's world where the vehicle has ``w``, and
-``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors. A's turn
-about the vertical is the capture's own affair, its tilt is another axis up; B is a body whose axes
-were not defined along the vehicle's.
+``B^T v`` in the body's axes where it has ``v``: two rotations between sets of vectors.
 """
 
 from __future__ import annotations

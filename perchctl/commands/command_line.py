@@ -1,7 +1,6 @@
 """What the subcommands share: the application, its failures as sentences, common options.
 
-A subcommand is one file of `perchctl.commands`: options, work and words together. It is loaded
-only as it is used, so that the help is quick, and may import whatever it needs at its top.
+A subcommand is one file of `perchctl.commands`: options, work and words together.
 """
 
 from __future__ import annotations

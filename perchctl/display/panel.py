@@ -99,8 +99,7 @@ PERIOD_S = 0.1
 CLOSE_TIMEOUT_S = 1.0
 EVENTS_KEPT = 1000
 WIDTH = 78
-"""Of 80: a terminal echoes ^C behind the panel, and where that wraps, the next picture of the
-panel is drawn a line too low, with a piece of the last one left above it."""
+"""Of 80: a terminal echoes ^C behind the panel, which must not wrap."""
 
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
 

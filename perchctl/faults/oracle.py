@@ -55,8 +55,7 @@ SAY_OFF: frozenset[Claim] = frozenset(
     {"held off the target", "hangs", "stands", "hangs or stands", "motors off"}
 )
 SEEN_S = 6.0
-"""A vehicle at rest whose telemetry arrived for this long must have been seen; the program
-treats a contradicting supervisor as stale after 5 s."""
+"""A vehicle at rest whose telemetry arrived for this long must have been seen."""
 STOP_S = 0.5
 """The motors must be off this long after the second Ctrl-C."""
 SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0

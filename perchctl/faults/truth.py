@@ -25,8 +25,7 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
 
 FULL_THRUST = 60000.0
-"""The largest raw thrust order (docs/firmware.md, "Raw thrust"): it lifts every vehicle that can
-fly."""
+"""The largest raw thrust order (docs/firmware.md, "Raw thrust")."""
 PRESSING_RATIO = 1.02
 """Rotors that lift more than this part of the weight press against whatever is in the way."""
 

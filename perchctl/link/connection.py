@@ -22,9 +22,7 @@ CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
 """Lost packets in a row after which cflib gives a radio up: about 200 s, cflib's own 100 are 0.2 s.
-
-Waiting is the better way back: a driver that goes on repeating is heard with the first packet that
-the vehicle answers; one that has given up resets its dongle, and agrees upon safelink anew."""
+Waiting is the better way back: one that has given up agrees upon safelink anew."""
 REOPEN_PAUSE_S = 0.05
 SAFELINK_S = 0.15
 """The driver's ten attempts at a safelink take 20 to 50 ms."""

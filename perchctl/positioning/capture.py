@@ -29,8 +29,7 @@ KEPT = 64
 """Frames that wait to be read; older ones fall out."""
 LONGEST_LINE = 300
 UP_TIMEOUT_S = 15.0
-"""For the child's Python to start: of its own, so that a busy computer is not taken for a
-motion capture that does not answer."""
+"""For the child's Python to start: a busy computer is no silent motion capture."""
 _END_TIMEOUT_S = 2.0
 _PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
 _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
@@ -209,8 +208,7 @@ MOST_HZ = 500.0
 PAUSE_S, AT_ONCE_S = 0.1, 2e-4
 
 Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, float]]]
-"""Position and quaternion (w, x, y, z) by name: plain numbers, so that nothing of the library
-travels. They are sent with the time of their arrival, on the monotonic clock of all processes."""
+"""Position and quaternion (w, x, y, z) by name: nothing of the library travels."""
 
 
 def serve_parent() -> None:

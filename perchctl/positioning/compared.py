@@ -3,8 +3,7 @@
 Axes that are swapped do not show on a vehicle at rest that stands as it stood when its body was
 defined: all numbers look right. Only a hand that lifts and turns it tells. So each comparison is
 written down, for exactly the vehicle and set-up that it is true of, and a flight asks for one that
-passed, at most `VALID_S` old. What cannot be read, or is of another time than the past, is no
-comparison.
+passed, at most `VALID_S` old.
 """
 
 from __future__ import annotations

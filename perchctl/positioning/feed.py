@@ -60,8 +60,7 @@ class CaptureSource(Protocol):
 
 
 QUIET_S = 0.1
-"""Without a position for so long, or for two periods, it is said why. One frame that is missing
-among good ones is none of the pilot's business."""
+"""Without a position for so long, or for two periods, it is said why."""
 HANGS_S = 0.2
 """The turns come every 10 ms, or as often as a simulated flight's loop turns."""
 RATE_OVER_S = 1.0

@@ -104,8 +104,7 @@ MOST_LATENCY_S = 1.0
 START_LATENCY_S = 0.07
 """Where a flight begins that measures it: most cameras are 60 to 100 ms late."""
 USED_LATENCY_S = (0.02, 0.2)
-"""What such a flight uses: no camera's exposure and transfer take less; and past the second a
-picture is so late that the target is not to be steered by."""
+"""What such a flight uses: no camera takes less; later pictures are not to be steered by."""
 
 
 class CameraConfig(Section):

@@ -5,7 +5,6 @@ list of keys. A float is written by its shortest text that reads back to the sam
 and NaN as ``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its
 type and shape; an enum by its value; where a field takes one of several dataclasses, such as a
 command, the class's name stands before it. None is left out where it is the field's default.
-A field of type Any holds JSON's own types and comes back as them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """What the messages of a flight's recording are made of: the log's own records.
 
-They are Foxglove's protobuf ones, with the definitions of Foxglove's own package: a picture stays
-the bytes that it came as, which the JSON variant of the same schemas would make a third longer.
+They are Foxglove's protobuf ones, with the definitions of Foxglove's own package.
 What is perchctl's own is JSON. Frames: `world` (of the state estimate), `body`, `gear`, `camera`
 (OpenCV's axes, which are Foxglove's), `target` and `setpoint`.
 """

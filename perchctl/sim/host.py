@@ -43,8 +43,7 @@ class VehicleHost:
     """One vehicle, its CRTP endpoint, its video stream and the server of a motion capture.
 
     The endpoint is a socket on loopback: one CRTP packet a UDP datagram, as cflib's `udp://`
-    driver sends them. Answers go to the address that asked. What the vehicle sends by itself goes
-    to the last address that sent anything but a scan's probe.
+    driver sends them. Answers go to the address that asked.
 
     Args:
         camera: None: no camera and no stream.

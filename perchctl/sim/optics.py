@@ -20,8 +20,7 @@ from perchctl.vision import CameraModel
 Picture = NDArray[np.uint8]
 
 FINE_PX, COARSE_PX = 2, 8
-"""Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks, each
-with a coarse node in its centre."""
+"""Distances of the nodes of the two ray grids."""
 
 FAR_AWAY_M = 1e4
 """The coordinates given to rays that miss the plane."""
@@ -115,8 +114,7 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
 
 
 VIGNETTING_EXPONENT = 0.6
-"""Relative light is (1 + tan^2(angle))^-exponent; 2 would be the cos^4 law of a
-bare lens, real ones correct most of it."""
+"""Relative light is (1 + tan^2(angle))^-exponent."""
 
 
 @dataclass(frozen=True, eq=False)

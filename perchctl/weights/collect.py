@@ -43,8 +43,7 @@ from perchctl.weights.data import HEADER, row_text
 SEEN_SHARE = 0.9
 """Of a position's frames both markers must be in so many."""
 STILL_PX = 1.0
-"""The target's picture must not wander farther than this within a position (between its
-thirds), nor shake with a greater standard deviation."""
+"""The target's picture must not wander farther within a position, nor shake more."""
 FAR_M, FAR_RAD = 0.03, math.radians(10.0)
 """An actual pose that differs from the camera's by more is a mistake."""
 SAMPLES = 30

@@ -30,9 +30,8 @@ from perchctl.geometry import Array
 from perchctl.weights.data import AXES, YAW, Measurements, wrap
 
 OUTLIER_SIGMAS = 6.0
-"""A row does not count on an axis where a marker's error is farther from the median of
-its position than this many robust standard deviations (1.4826 times the median absolute
-deviation): of a million normal errors not one."""
+"""A row does not count on an axis where a marker's error is farther from the median of its
+position than this many robust standard deviations."""
 LEAST_ROWS = 8
 """Rows a position, on average, below which nothing is called an outlier."""
 _MAD_TO_SIGMA = 1.4826

@@ -44,9 +44,7 @@ class RangeError:
 
 
 def limit_mm(z_m: float) -> float:
-    """Return the error that perching allows: 1 mm, or 1 % of the distance where that is more. The
-    gear settles within 4 mm a hand's breadth under the target, and an approach from 1.5 m
-    tolerates centimetres."""
+    """Return the error that perching allows: 1 mm, or 1 % of the distance where that is more."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 

@@ -75,8 +75,7 @@ class Calibration:
     @property
     def level(self) -> Level:
         """Verdict by the predicted error straight ahead of the camera, where perching happens;
-        aside, where the search may see the target first, twice the limit will do. Of what the
-        boards did not cover nothing is known: a calibration that lacks coverage is no good one."""
+        aside twice the limit will do."""
         ahead = max(e.axis_mm95 / limit_mm(e.z_m) for e in self.errors)
         aside = max(e.mm95 / limit_mm(e.z_m) for e in self.errors)
         if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.lacks:

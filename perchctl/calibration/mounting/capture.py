@@ -20,8 +20,7 @@ from perchctl.errors import InvalidValue, TimedOut
 from perchctl.vision import Frame
 
 LEAST_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
-"""For which a part is recorded, also where no turn is missing any more: more pictures, and as
-many times smaller intervals."""
+"""For which a part is recorded, also where no turn is missing any more."""
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
 BEFORE_S = 1.5

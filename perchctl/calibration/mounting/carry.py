@@ -4,9 +4,7 @@ One rotation chain holds at each picture's exposure:
 ``R_cam_target = R_body_cam^T R_world_body(t - latency)^T R_world_target``. The gyroscope's rates,
 integrated, give R_world_body; its world is the body at the first sample. What is solved for
 together: the camera's turn, the target's, the latency, the gyroscope's constant error and scale,
-and a random walk of the integrated rotation. The attitude that the vehicle itself estimates is not
-used: it rests on accelerometers, whose constant error looks just like a camera that is tilted in
-the body.
+and a random walk of the integrated rotation.
 """
 
 from __future__ import annotations

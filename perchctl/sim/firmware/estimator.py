@@ -6,10 +6,6 @@ parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
 A deck's velocity is as old as the firmware's: its filter sums up an accelerometer that is
 low-passed at 30 Hz by two poles, and does so 100 times a second (source).
-
-A deck's attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
-the filter's other measurements can: a vehicle that is put on its back by hand, faster
-than any gyroscope measures, is still estimated as level.
 """
 
 from __future__ import annotations

@@ -122,9 +122,7 @@ class OutsideFilter:
     """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate.
 
     `covariance` (9, 9) is what it knows of its own errors: position, velocity and attitude, with
-    all that one says about another; SI, radians, world axes. As in the firmware (source:
-    `kalman_core`), but for the axes: velocity and attitude errors are the world's here and the
-    body's there, which is the same for a vehicle that is nearly level.
+    all that one says about another; SI, radians, world axes.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
