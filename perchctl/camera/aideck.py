@@ -33,7 +33,6 @@ MAX_PACKET_BYTES = 1022
 MOST_SIDE_PX = 1024
 
 # What waits unread while the reader stalls is then given out one by one, dated when it is read.
-# Linux holds at most twice this, three raw pictures or some forty JPEGs; then the deck has to wait.
 _RECEIVE_BYTES = 131072
 _PACKET = struct.Struct("<HBB")
 _HEADER = struct.Struct("<BHHBBI")
@@ -150,9 +149,7 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
 
 # --- A colour camera's mosaic in what is delivered as a grey picture ---
 # The sensor's pixels look through colour filters, two by two, and a raw picture, or a JPEG that
-# was made of one as if it were grey, has their pattern all over it. Corners measured on it are
-# off by up to 6 times as much, and a fifth of the far markers is not found (`benchmarks/aideck.py
-# --mosaic`).
+# was made of one as if it were grey, has their pattern all over it. (`benchmarks/aideck.py --mosaic`)
 
 
 LEAST_SHARE = 0.04

@@ -88,8 +88,7 @@ def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 # --- Pictures that a receiver gives out again because no new one has come ---
 # A receiver of 25 pictures a second in a stream of 60 gives each out two or three times. A second
-# time is no second measurement, and its time is the first one's. Equal bytes show it: a camera's
-# noise makes each new picture differ from the last.
+# time is no second measurement, and its time is the first one's.
 
 
 Grey = NDArray[np.uint8]

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from perchctl.sim import SharedTime
 
 SIM_PATIENCE_S = 5.0
-"""Wait for a stopped simulator, on the wall's clock: longer than the simulator waits for the loop,
-so that they never wait for each other."""
+"""Wait for a stopped simulator, on the wall's clock: longer than it waits for the loop."""
 _POLL_S = 0.001
 
 

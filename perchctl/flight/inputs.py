@@ -216,8 +216,7 @@ class FlightInputs:
         if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
-        # A dark target may still be seen, and a bare ceiling looks like an empty screen: such
-        # pictures are searched all the same, with a note.
+        # A dark target may still be seen, and a bare ceiling looks like an empty screen.
         self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
         if kind != "ok" and self._note is None:
             return VERDICT_TEXTS[kind]

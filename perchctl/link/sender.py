@@ -29,8 +29,7 @@ STALE_S = 0.25
 """A setpoint that has waited longer, behind a command that hung, is for another moment."""
 GUARD_PERIOD_S = 0.05
 HANGS_S = 0.5
-"""For so long the library may hold one piece: by then the vehicle levels out by itself
-(docs/firmware.md, "Silence")."""
+"""For so long the library may hold one piece (docs/firmware.md, "Silence")."""
 RETRY_S = 0.002
 """Until a piece that found no room is offered again: about what one packet takes by radio."""
 

@@ -183,8 +183,7 @@ FIRST_SAMPLE_TIMEOUT_S = 3.0
 AWAIT_SLOW_S = 1.0
 """The first sample waits that long for the slow blocks."""
 BLOCKS_DELETED_AFTER_S = 1.0
-"""A vehicle that hears no radio for so long deletes its log blocks (docs/firmware.md, "Radio
-silence")."""
+"""Without radio for so long a vehicle deletes them (docs/firmware.md, "Radio silence")."""
 RESUME_PERIOD_S = 0.25
 """Longer than the slowest block's period: one that was started shows by then."""
 MOST_SAMPLES = 2000

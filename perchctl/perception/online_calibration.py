@@ -87,17 +87,15 @@ def update_calibration(
 # in the delay and the turn, and one least squares over a flight gives both.
 #
 # The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
-# each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
-# through the same one, and what is summed are the innovations: the generalized least squares of the
-# whole flight with a few numbers of memory (de Jong 1991, "The diffuse Kalman filter").
+# each row (`X`, `Y`, `HEADING`) and the factors go through the Kalman filter of a level that walks,
+# and what is summed are the innovations (de Jong 1991, "The diffuse Kalman filter").
 
 
 X, Y, HEADING = range(3)
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
 """Columns: the place (rad for the heading), and what may explain its moves."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
-"""What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of roll
-and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of drift."""
+"""What is thought possible before anything is seen, standard deviations."""
 
 ATTITUDE_STEP_S = 0.02
 """Of the difference that stands for a speed."""

@@ -314,8 +314,7 @@ class Judge:
             return None
         if pose == self._newest:
             # Measured noise never repeats all seven numbers; a filter or a doubled frame may,
-            # for a frame or two, and then nothing is lost. So a repetition is no news, and
-            # `Placed.t_s` stays that of its first frame.
+            # for a frame or two, and then nothing is lost.
             if self._stranger is None:
                 self.problem = f"{self._who} is frozen: is it hidden, or the capture paused?"
             return None

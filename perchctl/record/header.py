@@ -91,8 +91,7 @@ def _packed(mask: NDArray[np.bool_]) -> str:
 
 # --- A fingerprint of how this computer calculates ---------------------------------------------
 # Libraries choose their kernels by the processor: numpy's BLAS and vector functions, OpenCV's
-# filters, the sine of the C library. They sum in another order, or round once where others round
-# twice, so that the last bits of a pose are a processor's own.
+# filters, the sine of the C library. The last bits of a pose are a processor's own.
 
 
 _SIDES = (2, 3, 4, 6, 8, 12)

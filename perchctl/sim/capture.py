@@ -218,9 +218,7 @@ class SimCapture:
 
 
 # --- The server on loopback -------------------------------------------
-# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it. Of the systems
-# which that package reads without a vendor's machine this one hands a frame on the soonest: VRPN's
-# client looks only every 10 ms, Qualisys's binds one fixed port.
+# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it.
 #
 # Little-endian; each message begins with its kind and the length of what follows. Of a frame only
 # the rigid bodies are filled in; a client steps over the empty lists.

@@ -174,8 +174,7 @@ BY_LOG_CODE = {number.log_code: number for number in BY_CTYPE.values()}
 
 
 # --- Tables of contents: which log variables and parameters there are, by number ---
-# cflib keeps a table in a file named after its CRC, so the CRC follows from the contents and
-# nothing else: the same table has the same CRC in every process.
+# cflib keeps a table in a file named after its CRC, which follows from the contents alone.
 
 
 class Toc:

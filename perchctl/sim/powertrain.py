@@ -29,8 +29,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 # The curve is the firmware's own for the propellers of the Crazyflie 2.1+ (its platform
 # defaults, release 2026.08, from a thrust stand): a cubic in the motor's mean voltage,
 # which is the duty cycle times the battery's voltage. Below `STANDSTILL_V` the cubic is
-# negative: the motor stands still. The duty cycles of docs/firmware.md, "Thrust to PWM",
-# for seven thrust commands follow from it within half a per cent.
+# negative: the motor stands still (docs/firmware.md, "Thrust to PWM").
 
 
 FULL_COMMAND = 65535.0
@@ -76,8 +75,6 @@ def thrust_n(volts: float) -> float:
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
 #   state (source: power management) are a discharge curve of the Crazyflie's own cell.
-#   It is flat in the middle and falls ever faster below a tenth, where 24 s of hovering take
-#   0.7 V; what lies between 0 and 10 per cent is shaped as lithium polymer cells fall off.
 # - The voltage falls under load by the cell's resistance at once, and in an old or cold cell
 #   by some more within `SLOW_S`: ions that have to come from farther away.
 # - An old cell holds less charge and has more resistance; `knee` says at which part of the

@@ -86,8 +86,7 @@ class Sheet:
 
     def _build(self, px_per_m: float, window_px: float) -> SheetTexture:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
-        # In place: at the finest level each array of these has 20 MB, and a campaign's peak of
-        # memory is here.
+        # In place: a campaign's peak of memory is here.
         sheet = self.drawing.sheet_coverage(px_per_m, size, window_px)
         alpha = np.multiply(sheet, 255.0)
         alpha = np.rint(alpha, out=alpha).astype(np.uint8)
@@ -173,8 +172,7 @@ class Placed:
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
         x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
         # How far each block's centre is from the sheet's, along the axis along which it is farther,
-        # and how far from there its pixels look at most: half a block to each side, by the distance
-        # of the nodes at both sides; the outermost pixels' centres lie an eighth less far out.
+        # and how far from there its pixels look at most: half a block to each side.
         off_m = cv2.max(np.abs(x[1:-1, 1:-1]), np.abs(y[1:-1, 1:-1]))
         reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / COARSE_PX)
         half_m = self.sheet.drawing.sheet_side_m / 2.0

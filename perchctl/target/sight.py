@@ -217,9 +217,7 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
 
 # --- Near the target: from where on a mounting is blind ---------------
 # With the gear under the target's centre, the vehicle level and its heading the target's, as in
-# an ascent: so the outline of the markers is upright in body axes. A camera beside the gear sees
-# the target aside of its axis, and its picture is wider than high: with the offset along the
-# picture's width it loses the target later.
+# an ascent: so the outline of the markers is upright in body axes.
 
 
 FROM_M = 0.10

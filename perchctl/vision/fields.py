@@ -23,8 +23,7 @@ from perchctl.vision.types import FieldState, Frame
 Grey = NDArray[np.uint8]
 
 _COMBED = 1.4  # fields a pixel apart
-# Of so many rows in a group all but the outer four are compared with their neighbours. Odd and even
-# rows must both be: a single lost line then counts among both kinds of differences.
+# Of so many rows in a group all but the outer four are compared with their neighbours.
 _GROUP = 8
 _STRONG = 5.0  # of the mean difference within a field, for one to count
 _LEAST_GREY = 8.0

@@ -115,8 +115,7 @@ def update_tracks(
 # --- Whether a pose is the target's that was locked on ----------------
 # Another target, or a marker of another size, cannot be told from the target in a picture, but the
 # target does not jump. A pose that contradicts the lock by more than noise, motion and drift
-# explain is a stranger's and feeds no filter. It is watched, and stays one however vague the lock
-# becomes.
+# explain is a stranger's and feeds no filter.
 #
 # The lock goes over to a stranger that rests on both markers: at once if the lock never did, or, if
 # it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the

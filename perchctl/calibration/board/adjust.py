@@ -145,8 +145,7 @@ def lens_covariance(views: Sequence[BoardView], fit: Fit) -> Array:
 # A corner is left out when it is off by more than 5 times the spread of its view (at least that of
 # all views) and by more than 0.3 px. A view is left out when the RMS of its remaining corners is
 # above 2.5 times the median view's and above 0.1 px, when more than a quarter of its corners are
-# out, or when fewer than 6 remain. What remains is solved again, until nothing changes. As an
-# outlier bends the fit that judges it, the worst views go first.
+# out, or when fewer than 6 remain. The worst views go first, until nothing changes.
 
 
 CORNER_FACTOR = 5.0

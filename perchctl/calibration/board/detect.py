@@ -170,9 +170,7 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 #
 # with d1, d2 the distances from two lines through the corner and w1, w2 the edges' spread,
 # one for each line since motion blurs them unequally. Light that falls off over the corner
-# scales the contrast too (h); without that term it pulls corners by 0.01 px. Any blur or
-# shift of edges (bloom) that is the same on both sides of the corner leaves the fitted place
-# where it is. All corners of a picture run through the same arrays (Gauss-Newton).
+# scales the contrast too (h); without that term it pulls corners by 0.01 px.
 
 
 REACH = 0.42

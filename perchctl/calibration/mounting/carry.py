@@ -172,8 +172,6 @@ def _check(rows: Rows, latency_s: float, cov: Array) -> None:
 
 
 # --- The vehicle's rotation, from its gyroscope -----------------------
-# Rates integrated over the whole recording drift by the sensor's constant error and by its noise's
-# random walk only, some hundredths of a degree in half a minute.
 
 
 @dataclass(frozen=True, eq=False)

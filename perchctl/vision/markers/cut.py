@@ -355,8 +355,7 @@ class Outline:
 
 
 Texture = tuple[NDArray[np.float32], Array]
-"""How white the paper is, float32 (m, m), 0 to 1, and T (3, 3), which maps own coordinates to its
-pixels."""
+"""How white the paper is, float32 (m, m), 0 to 1, and T (3, 3) from own coordinates to it."""
 
 
 @lru_cache(maxsize=8)

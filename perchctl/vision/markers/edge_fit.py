@@ -505,8 +505,7 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
 # The edge in each profile is the gradient's windowed centroid, at first by a wide window, then by
-# one that is centred on the side's own line: narrow, hence calm in noise. All that a row (one side
-# of one marker) shares is (rows,), what differs from profile to profile (rows, n).
+# one that is centred on the side's own line. Of a side is (rows,), of a profile (rows, n).
 
 
 _ALONG32 = ALONG.astype(np.float32)

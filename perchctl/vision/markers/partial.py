@@ -183,8 +183,7 @@ def _corners(
 
 
 KnownBy = Literal["bits", "track", "other"]
-"""By what it is known which marker it is: by its cells alone, by its place in the picture before,
-or by the target's other marker."""
+"""By what a marker is known: its cells alone, its place before, or the other marker."""
 _LEAST_KNOWN = 0.6  # of all cells
 _GLARE, _BRIGHTEST_GREY = 0.25, 250.0  # over white, of the contrast; as bright as can be
 _UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords differ in two

@@ -277,8 +277,7 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 
 
 # --- The light on a marker: what turns its drawing into grey values ---
-# Offset, gain, their slopes, the bend of the tone curve and the grey beyond the sheet: all of them
-# shift edges if left out.
+# Offset, gain, their slopes, the tone curve's bend, the grey beyond the sheet: all shift edges.
 
 
 def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
