@@ -6,8 +6,7 @@ has to be in the deck's GAP8; it sends raw or JPEG pictures of 324x244.
 The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
 one byte of routing, one of function, and the data. A picture is a packet with its header,
 ``<BHHBBI``: magic 0xBC, width, height, depth, format, size; then packets of chunks until `size`
-bytes have come. cflib's own reader of these packets blocks for ever when the deck goes away, so it
-is not used.
+bytes have come. (cflib's own reader blocks for ever when the deck goes away.)
 """
 
 from __future__ import annotations
@@ -149,7 +148,7 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
 
 # --- A colour camera's mosaic in what is delivered as a grey picture ---
 # The sensor's pixels look through colour filters, two by two, and a raw picture, or a JPEG that
-# was made of one as if it were grey, has their pattern all over it. (`benchmarks/aideck.py --mosaic`)
+# was made of one as if it were grey, has their pattern all over it.
 
 
 LEAST_SHARE = 0.04

@@ -129,7 +129,6 @@ class LiveSource:
 
     A subclass has `_connection`, which opens the camera and reads it. It is called again
     `reconnect_wait_s` after it ended, until `most_failed` of them in a row have brought no picture.
-    Before the first picture an error of perchctl's own is final, too. `failure` holds it then.
     """
 
     live = True

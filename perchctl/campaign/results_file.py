@@ -1,8 +1,6 @@
 """What stays of a campaign: a file of results that grows line by line, and logs.
 
-Line 1 of the file is a header that says what is flown; then comes one record a flight. A line is
-in the file whole or, if the program or the computer was ended while it was written, is the last
-one, which is removed when the campaign goes on.
+Line 1 of the file is a header that says what is flown; then comes one record a flight.
 """
 
 from __future__ import annotations

@@ -60,8 +60,7 @@ STOP_S = 0.5
 """The motors must be off this long after the second Ctrl-C."""
 SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0
 """A press counts as the second Ctrl-C (docs/faults.md, 16) this long after the first and after
-this long without any; faster presses may be one key held down, until they have gone on for the
-third time."""
+this long without any, or when faster presses have gone on for the third time."""
 
 
 class Sample(NamedTuple):

@@ -42,8 +42,8 @@ class WallClock:
 class SimulatedClock:
     """Simulated time in real time: it waits for the loop, and the loop for it.
 
-    The simulator advances it with the wall's clock. On a busy computer it stands still until the
-    slower of the two has caught up, so no age grows by that. `now` may be called from any thread.
+    The simulator advances it with the wall's clock. On a busy computer it stands still.
+    `now` may be called from any thread.
     `zero_s`: its reading at the simulator's start, such that it first agrees with `time.monotonic`.
     """
 

@@ -1,8 +1,7 @@
 """Criteria for a vehicle on the ground, used by `fly` before it takes off and by `check`. Pure.
 
 Each gives what is wrong, or None. Of a vehicle at rest two things are known without a motion
-capture: where the ground is, and which way is up. The rest shows when a hand lifts and turns the
-vehicle (`perchctl check --lift`), or in its first centimetres in the air.
+capture: where the ground is, and which way is up.
 """
 
 from __future__ import annotations

@@ -79,8 +79,7 @@ class Connection:
 
         Nothing waits here for cflib's lock, or for the one place in its radio's queue. In
         cflib's own `send_packet` it would: for 2 s, with the lock held, and then the driver
-        reports its end from inside the call. What the radio has taken it repeats until it is
-        acknowledged, and cannot be called back.
+        reports its end from inside the call.
         """
         if self.lost is not None:
             return False
@@ -127,8 +126,6 @@ class Connection:
         """Open new drivers until one answers, in the place of one that has ended, or that is
         given up now for this cause. Returns at once; until then the link is `lost`.
 
-        cflib's own `open_link` would reset the vehicle's log blocks and read every table and
-        parameter before it is connected; the driver alone is up in milliseconds.
         """
         with self._change:
             if self._left or (self._opener is not None and self._opener.is_alive()):

@@ -101,8 +101,7 @@ class MotionLink(ListeningLink):
 
     def _on_motion(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
         """Take a packet of `MOTION_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
-        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed. A sample with a
-        value that is no number is dropped: it would spoil what is solved from the others."""
+        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed."""
         now_s = self._blocks.last_arrival_s = self._clock()
         t_s = self._timebase.to_loop_s(stamp, now_s)
         self._motors_run = bool(int(values["supervisor.info"]) & FLYING)

@@ -3,9 +3,6 @@
 No current is measured on a Crazyflie. Assumed are a cell's resting voltage by its charge (`VOLTS`)
 and the current at full thrust (`FULL_A`). Fitted are the sag under full thrust and `hunger`: how
 much faster this battery empties than assumed, by least squares, with old readings fading.
-
-Before each attempt, what is left until `battery-low` would fire is compared with what the way up,
-the press and the way down take at the profile's speeds, with a reserve.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The mission as one ordered table: the first transition that matches wins, safety on top.
 
-The diagram and the table of docs/mission.md are drawn from `TABLE`. Above it stand the
-predicates and reasons that need more than a line.
+The diagram and the table of docs/mission.md are drawn from `TABLE`.
 """
 
 from __future__ import annotations

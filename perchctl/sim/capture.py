@@ -219,9 +219,7 @@ class SimCapture:
 
 # --- The server on loopback -------------------------------------------
 # It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it.
-#
-# Little-endian; each message begins with its kind and the length of what follows. Of a frame only
-# the rigid bodies are filled in; a client steps over the empty lists.
+# Of a frame only the rigid bodies are filled in; a client steps over the empty lists.
 
 
 CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7

@@ -28,8 +28,7 @@ from typing import Any
 
 import numpy as np
 
-# Nothing is drawn with it; its window library would start a process with each import, which
-# complains where it is ended halfway.
+# Nothing is drawn with it; its window library would start a process with each import.
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 import mujoco

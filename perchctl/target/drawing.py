@@ -33,8 +33,7 @@ one the small marker is never found (measured for ids whose centre is black)."""
 SAMPLED_MARGIN = 0.13
 """Share of a cell, at each of its sides, that cv2.aruco does not sample."""
 MAX_WHITE_IN_BLACK_CELL = 0.3
-"""White that the small marker and its ring may bring into a black cell of the large
-one; half is where it reads as white, and the detector samples a cell coarsely."""
+"""White that the small marker and its ring may bring into a black cell of the large one."""
 
 
 @dataclass(frozen=True)

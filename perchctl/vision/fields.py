@@ -3,9 +3,8 @@
 An interlaced frame is two pictures, half a frame's period apart, each in every second row.
 What moved between them stands in it like a comb: rows are unlike their neighbours.
 Only strong differences count, so that a small target in a noisy picture is enough.
-Of two frames in a row the later field of the
-first is more like the earlier field of the second than the other way around. Until the order is
-known the mean of both fields' corners is taken.
+The later field of a frame is more like the earlier
+field of the next. Until the order is known the mean of both fields' corners is taken.
 """
 
 from __future__ import annotations

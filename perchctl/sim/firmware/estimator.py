@@ -3,9 +3,6 @@
 Drift runs from the moment the motors first turn. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
-
-A deck's velocity is as old as the firmware's: its filter sums up an accelerometer that is
-low-passed at 30 Hz by two poles, and does so 100 times a second (source).
 """
 
 from __future__ import annotations

@@ -26,9 +26,8 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
 # --- What the gyroscope and the accelerometer read, as the estimator gets it: means of 100 a second
 # Their errors are those of the trial in docs/firmware.md, "Target as position": white noise, that
-# sums up to a random walk of attitude and velocity, and a bias. On the ground the firmware takes
-# the gyroscope's mean for its bias and scales the accelerometer to 1 g (source); what the scenario
-# gives as bias of the gyroscope is what that leaves.
+# sums up to a random walk of attitude and velocity, and a bias. A gyroscope's bias is
+# what the firmware's own, taken on the ground, leaves of it.
 
 
 IMU_EVERY = 5
