@@ -1,9 +1,10 @@
 """What a calibration's error means in mm at the target.
 
-The pose solve takes up a part of a wrong calibration. So the error at the target is not the ray's error times the distance but the
-change of the solved position. For a target at a place, with J the derivative of its corners by its
-pose and L by the lens, a lens error d moves the solved pose by -(J'J)^-1 J'L d; its translation is
-the error at the target's centre, and the parameters' covariance gives its 95 % line.
+The pose solve takes up a part of a wrong calibration. So the error at the target is not the ray's
+error times the distance but the change of the solved position. For a target at a place, with J the
+derivative of its corners by its pose and L by the lens, a lens error d moves the solved pose by
+-(J'J)^-1 J'L d; its translation is the error at the target's centre, and the parameters' covariance
+gives its 95 % line.
 """
 
 from __future__ import annotations
