@@ -1,11 +1,10 @@
 """Pictures of interlaced cameras: found out, taken apart, and put in their order of time; pure.
 
 An interlaced frame is two pictures, half a frame's period apart, each in every second row.
-What moved between them stands in it like a comb: a row is unlike the rows beside it, which are of
-the other field, and like the rows two away. Strong differences only are counted, so that a small
-target in a noisy picture is enough. Of two frames in a row the later field of the first is more
-like the earlier field of the second than the other way around. While the order is not known yet
-both fields are measured, and their mean belongs to the middle moment in either order.
+What moved between them stands in it like a comb: rows are unlike their neighbours.
+Only strong differences count, so that a small target in a noisy picture is enough.
+The later field of one frame is more like the earlier field of the next than the reverse.
+Until the order is known the mean of both fields' corners is taken.
 """
 
 from __future__ import annotations
@@ -69,9 +68,8 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """Return the pictures that are in a picture (h, w): the top and the bottom field at full height
-    where it holds two of different times, else itself. What is at row y in the picture is there in
-    either field."""
+    """Return the top and the bottom field, each (h, w), of a picture that holds two of different
+    times, else the picture itself."""
     if not is_combed(image):
         return (image,)
     return field_picture(image, 0), field_picture(image, 1)
@@ -164,7 +162,6 @@ def _voted(state: FieldState, frame: Frame) -> FieldState:
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
-        # Rows are compared with the mean of their two neighbours of the other field.
         rows = (len(before) - 2) // 2 * 2
         tops = [image[0:rows:2] for image in (before, frame.image)]
         bottoms = [image[1 : rows + 1 : 2] for image in (before, frame.image)]

@@ -4,10 +4,8 @@ State order as in the paper: yaw, yaw rate, then position and velocity of x, y, 
 The time step is the real one: with 15 % late frames a fixed step gave 0.63 cm RMS,
 the real one 0.19 cm.
 
-The paper's constants are the same for every frame (`kalman.noise: fixed`). By default each pose
-brings its own covariance, and the process noise is what accelerates: the vehicle in the level
-frame, the state estimate's drift in the world (`measured`). Constant errors (the vehicle's roll and
-pitch, the print's size and curl) are consider terms: they change no gain, only what is claimed.
+Constant errors (the vehicle's roll and pitch, the print's size and curl) are consider terms: they
+change no gain, only what is claimed.
 """
 
 from __future__ import annotations
@@ -219,10 +217,7 @@ def step_track(
 
 
 def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Return the state and covariance after a measurement, in Joseph's form, and the gain (8, 4).
-
-    filterpy's `update` does the same and takes four times as long: equation 2's H only picks rows.
-    """
+    """Return state and covariance after a measurement, in Joseph's form, and the gain (8, 4)."""
     off = z - x[MEASURED]
     off[0] = wrap_rad(float(off[0]))  # the yaw nearest to the prediction
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)

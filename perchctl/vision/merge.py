@@ -68,7 +68,6 @@ def measure_markers(
     poses: dict[str, MarkerPose] = {} if joint is None else {"joint": joint}
     singles: dict[str, MarkerPose] = {}
     if not enough or setup.config.each_marker:
-        # The joint tilt is the surest: the single markers of its frame start from it.
         start = near if joint is None else PoseCandidate(joint.rvec_rad, joint.tvec_m)
         for each in seen:
             pose = estimate_pose([each], t_s, attitude, setup, normal_cam, start)
@@ -137,9 +136,8 @@ def merge_tracks(
 
 
 # --- Corners of a rolling shutter at one moment -----------------------
-# Its rows are exposed one after the other within the read-out time, and a frame's time is its
-# middle row's: each corner is moved back along its own motion, by the time that its row was
-# exposed later.
+# Its rows are exposed one after the other within the read-out time: each corner is moved back
+# along its own motion to the middle row's moment, the frame's time.
 
 
 UNKNOWN_READOUT_S = 0.012

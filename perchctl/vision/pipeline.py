@@ -1,8 +1,8 @@
 """THE pipeline: one frame through detection, pose, filter and merge.
 
 `step` is the only way from a picture to a pose, and `estimate` carries its result to any later
-moment. Neither keeps a memory of its own: what must be remembered is in `PipelineState`, which
-goes in and comes out. Matrices of a few numbers are multiplied by `dot`: `@` takes twice as long.
+moment. All memory is in `PipelineState`, which goes in and comes out.
+Matrices of a few numbers are multiplied by `dot`: `@` takes twice as long.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class Pipeline:
 def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
-    """Return the profile's pipeline for a calibrated camera. It is never changed: several streams
-    may share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds in
-    the camera's own pictures, else that is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
+    """Return the profile's pipeline for a calibrated camera; several streams may share it.
+    `covered` is what `camera.mask` holds in the camera's own pictures, else that is read.
+    Errors: NotFound, InvalidValue (`camera.mask`)."""
     pose = PoseSetup(
         config=profile.pose,
         target=profile.target,
@@ -123,8 +123,7 @@ def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """Return the new memory and what a stream's frame holds, each for a `step` of its own: one
-    picture, or the two fields of an interlaced camera in their order of time, each with its own
-    time."""
+    picture, or the two fields of an interlaced camera in their order of time."""
     fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
@@ -136,8 +135,7 @@ def step(
     frame's time, None without one.
 
     Without an attitude the vehicle counts as level and at rest: the filter then works
-    in the level frame, whatever `kalman.frame` says. The frame is one picture of what
-    `pictures` makes of a stream's; one that was not looked at there is looked at here.
+    in the level frame, whatever `kalman.frame` says.
     """
     frame = classify_fields(frame)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
@@ -218,10 +216,9 @@ def estimate(
 ) -> TargetEstimate | None:
     """Return the target at a moment after the newest frame, for the vehicle's attitude of then.
 
-    A tracked target is predicted by its filter, and carried to where the vehicle is now by
-    the vehicle's own motion since the frame. One that is no longer tracked stays in the
-    world where it was last. None when none was seen yet. Nothing steers by the spread: without
-    `spread` it is left as it was at the newest frame, which takes half the time.
+    A tracked target is predicted by its filter and carried on by the vehicle's motion. One that
+    is no longer tracked stays in the world where it was last. None when none was seen yet.
+    Without `spread` that is left as it was at the newest frame: nothing steers by it.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:
@@ -286,8 +283,7 @@ def _placed(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> dict[str, Any]:
-    """Return place, motion and, on request, spread of merged tracks in the world or in the level
-    frame, as a `TargetEstimate` has them for the vehicle at `attitude`."""
+    """Return the fields of a `TargetEstimate` for merged tracks, the vehicle at `attitude`."""
     place_m, yaw_rad = merged.vector[:3], float(merged.vector[3])
     cov_m2, bias_m = merged.cov_m2, merged.bias_m
     seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}

@@ -352,10 +352,8 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
 
 
 # --- Where the target should be in the next picture -------------------
-# The state estimate gives the vehicle's motion twice: as the difference of two positions, which
-# step by millimetres with each fix from outside, and as speed times time, whose noise adds up.
-# Which is better is learned from the target's own pictures: each is weighted by how little it was
-# off of late.
+# The state estimate gives the vehicle's motion twice: by two positions and by speed times time.
+# Each is weighted by how little it was off of late in the target's own pictures.
 
 
 _FORGOTTEN = 0.1  # of what was learned, with each picture

@@ -296,8 +296,8 @@ class Stranger:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """What one frame's corners gave: poses by ``joint``, ``large``, ``small``, in this order; which
-    track each that counts goes into; and whether the two markers exclude each other."""
+    """What one frame's corners gave: poses by ``joint``, ``large``, ``small``, in this order; the
+    track that each which counts goes into; and whether the two markers exclude each other."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     fed: dict[str, MarkerPose] = field(default_factory=dict)
@@ -312,9 +312,8 @@ class MeasuredMarkers:
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """What is known of a stream's fields: the kind of the last frame that was looked at, `skipped`
-    frames ago; votes for the top field being the earlier one, None until that is known; the periods
-    of the last frames, the newest of which came at `last_s`; the last picture that was combed."""
+    """What is known of a stream's fields. `top_first` is None until the votes decide, `kind` is of
+    the last frame that was looked at, `skipped` frames ago; `previous` is the last combed one."""
 
     kind: PictureKind | None = None
     skipped: int = 0

@@ -101,8 +101,7 @@ def _best(
 
 
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the expected corners moved to where the marker's drawing goes best with the
-    picture."""
+    """Return the corners moved to where the marker's drawing goes best with the picture."""
     side_px = mean_side_px(corners_px)
     # Large markers are found on a picture reduced to what the search needs.
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))

@@ -122,10 +122,8 @@ NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothi
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread of a
-    shift that all sides share (outwards), the edges' blur, px, the shift that was taken out,
-    perhaps a covariance (8, 8) as of a `Detection`, the spread of rows that shake, and the sharpest
-    side's blur."""
+    """A marker's corners as they were refined; spreads and covariance as of a `Detection`, blurs in
+    px. `edge_shift` is what was taken out."""
 
     corners_px: Array
     sigma_px: float

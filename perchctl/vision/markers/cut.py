@@ -207,9 +207,8 @@ _LEAST_NODES = 200  # that show paper
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on; how far
-    from the axis the picture `reaches`, beyond which a lens model may fold back; where a node's
-    samples are read in the reduced picture of `size` (width, height); and which nodes are in it."""
+    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on.
+    Beyond `reach` a lens model may fold back; `size` is the reduced picture's (width, height)."""
 
     first: Array
     step: float
@@ -401,8 +400,7 @@ def texture_of(drawing: Drawing) -> Texture:
 def _edges(
     cells: Array, half: float, places: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
-    """Return the sides at which cells differ: places along each and its normal, as an `Outline` has
-    them, a name for its line, and the width of the cells."""
+    """Return the sides at which cells differ, as an `Outline` has them."""
     width = 2.0 * half / len(cells)
     s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
     for across in (0, 1):

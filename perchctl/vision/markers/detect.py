@@ -132,9 +132,7 @@ def detect_markers(
 
 
 def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
-    """Return how to search this frame. After a loss the place where the target should be and the
-    whole picture take turns, and there the search and the fits of a blurred target do; later a
-    sharp target and a blurred one. The first frame without it has both."""
+    """Return how to search this frame. After a loss the ways take turns."""
     if empty_frames is None:
         return "all"
     if not by_lines or (expected and empty_frames % 2):

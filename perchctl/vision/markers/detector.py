@@ -37,10 +37,8 @@ _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
     """What `detect_markers` needs, made once by `make_aruco_detector`. `dictionaries` are the large
-    and the small marker's, each with the marker and, behind it (`MIRROR_INDEX`), perhaps its mirror
-    image; `patterns` is how each marker looks, `ratio` the small marker's side over the large
-    one's, `mask` what the vehicle covers. `by_lines`: lines are fitted to the sides; else there are
-    no other fits either, and no place is looked at first."""
+    and the small marker's; `ratio` is the small marker's side over the large one's, `mask` what
+    the vehicle covers. Without `by_lines` there are no fits, and no place is looked at first."""
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]

@@ -348,8 +348,6 @@ def _accepted(
 def _sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
-    """Return the spread of a marker's corners, by the variance of its sides' ends and the tolerance
-    of the print, in cells."""
     blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
     bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
@@ -362,8 +360,7 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Return the spread of a marker's corners by what shakes a picture's rows: it moves upright
-    sides and not lying ones."""
+    """Return the spread of corners by what shakes rows: it moves upright sides only."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0

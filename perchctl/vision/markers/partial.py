@@ -141,9 +141,8 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 def _corners(
     H: Array, seen: SeenEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners of the square H (3, 3), unit to pinhole px, with a covariance by what is
-    left over of its edges, px (rows, n), and its normal matrix (9, 9); None where these are
-    vague."""
+    """Return the corners of the square H (3, 3) with their covariance by what is left over of the
+    edges, px (rows, n), and the normal matrix (9, 9); None where these are vague."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -151,7 +150,6 @@ def _corners(
         return None
     if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
         return None
-    # What is left within rows; and by how much rows contradict each other beyond it.
     mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)
     scatter = float((w * (left - mean[:, None]) ** 2).sum() / w.sum())
     chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
@@ -366,8 +364,7 @@ def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> 
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return which of the free profiles (rows, n) begin black and end white, and how white the
-    paper is; None without contrast."""
+    """Return which profiles (rows, n) go from black to white, and how white the paper is."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

@@ -182,8 +182,8 @@ def align(
 
 
 def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
-    """Return the normal equations of the next increment, of shape, blur and light; None without
-    contrast. `total` (8,) is the sum of the increments so far."""
+    """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
+    the increments so far."""
     rows, products = seen.light
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
@@ -282,8 +282,7 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 
 
 def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
-    """Return the changes (9, n * n) of grey with the homography's increment and the blur's
-    square."""
+    """Return the changes (9, n * n) of grey with increment and the blur's square."""
     gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
     bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)

@@ -1,6 +1,4 @@
-"""The search for both markers: in a window around where they are expected, then in the
-whole picture; and the choice among what it finds.
-"""
+"""The search for both markers: in a window, then in the whole picture; the choice among them."""
 
 from __future__ import annotations
 
@@ -158,9 +156,8 @@ def choose(
     own: AsideOf | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one of each marker. A small marker in the centre of a large one, of the right
-    size and turn, verifies both; of several such pairs the one counts that is nearest to the last
-    detections. What goes on from these counts more than a pair elsewhere. Of several lone ones that
-    counts which `own` has nearest."""
+    size and turn, verifies both. What goes on from the last detections counts more than a pair
+    elsewhere; of lone ones that counts which `own` has nearest."""
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
