@@ -163,8 +163,7 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
 
 
 # --- Writing ----------------------------------------------------------
-# ROS wants camera_info keys; FileStorage wants ``dt: d`` in each matrix and a first line
-# ``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and reads ``1e-05`` as a string.
+# FileStorage wants ``dt: d`` and a first line ``%YAML 1.0``; PyYAML reads ``1e-05`` as a string.
 
 
 def calibration_text(

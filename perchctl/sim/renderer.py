@@ -299,9 +299,8 @@ def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
 
 
 # --- A camera that does not move --------------------------------------
-# On the floor and under the magnet the vehicle stirs by less than any picture shows. Where the
-# picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that a vehicle
-# at rest sees the same picture again and again but for the noise.
+# Where the picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that
+# a vehicle at rest sees the same picture again and again but for the noise.
 
 
 STILL_PX = 0.005

@@ -3,8 +3,7 @@
 An interlaced frame is two pictures, half a frame's period apart, each in every second row.
 What moved between them stands in it like a comb: rows are unlike their neighbours.
 Only strong differences count, so that a small target in a noisy picture is enough.
-The later field of a frame is more like the earlier
-field of the next. Until the order is known the mean of both fields' corners is taken.
+The later field of a frame is more like the earlier field of the next.
 """
 
 from __future__ import annotations

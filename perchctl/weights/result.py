@@ -147,8 +147,7 @@ def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> Non
 
 
 # --- The report, for a terminal of 80 columns, the verdict first ---
-# Lengths are in micrometres and angles in thousandths of a degree, as that is the size of the
-# errors of good corners.
+# Lengths are in micrometres and angles in thousandths of a degree.
 
 
 WIDTH = 80
