@@ -151,52 +151,44 @@ def test_a_suspended_computer_lands_and_does_not_catch_up() -> None:
 HANGS = (0.0, 0.0, 2.1)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"supervisor": READY | LOCKED}, "locked"),
-        ({"supervisor": READY | CRASHED}, "crash"),
-        ({"supervisor": READY | TUMBLED}, "upside down"),
-        ({"supervisor": READY | DECK_FAULT}, "deck"),
-        ({"supervisor": READY | FLYING}, "flying already"),
-        ({"supervisor": READY | 1 << 13}, "unknown bits .0x200E"),
-        ({"battery_v": 3.4}, r"3\.40 V.*3\.80 V.*charge"),
-        ({"battery_v": 3.797}, r"rests at 3\.797 V, at least 3\.800 V"),
-        ({"position_m": HANGS}, r"at 2\.10 m.*hangs.*take it down.*safety\.ground_z_m"),
-        ({"position_m": (0.0, 0.0, 0.3)}, r"at 0\.30 m"),
-        ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
-    ],
-)
-def test_a_vehicle_that_may_not_fly_is_refused(changes: dict[str, Any], words: str) -> None:
-    rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
-    rig.refused(SafetyAbort, words)
-    assert rig.link.now_s < 0.1  # at once
-
-
+AT_ONCE: list[tuple[dict[str, Any], str]] = [
+    ({"supervisor": READY | LOCKED}, "locked"),
+    ({"supervisor": READY | CRASHED}, "crash"),
+    ({"supervisor": READY | TUMBLED}, "upside down"),
+    ({"supervisor": READY | DECK_FAULT}, "deck"),
+    ({"supervisor": READY | FLYING}, "flying already"),
+    ({"supervisor": READY | 1 << 13}, "unknown bits .0x200E"),
+    ({"battery_v": 3.4}, r"3\.40 V.*3\.80 V.*charge"),
+    ({"battery_v": 3.797}, r"rests at 3\.797 V, at least 3\.800 V"),
+    ({"position_m": HANGS}, r"at 2\.10 m.*hangs.*take it down.*safety\.ground_z_m"),
+    ({"position_m": (0.0, 0.0, 0.3)}, r"at 0\.30 m"),
+    ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
+]
+IN_TIME: list[tuple[dict[str, Any], str]] = [
+    ({"position_variance_m2": 0.5}, r"settle.*variance 0\.5.*positioning"),
+    ({"position_variance_m2": 0.0103}, r"variance 0\.0103 .*at most 0\.0100"),
+    ({"position_variance_m2": math.nan}, "settle"),
+    ({"position_variance_m2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
+    ({"supervisor": 0x06}, "0x0006"),
+    ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
+    ({"roll_rad": math.radians(10.2)}, r"by 10\.2 deg, at most 10\.0"),
+    ({"pitch_rad": -0.2}, "tilted by 11 deg"),
+    ({"acc_z_g": 0.7}, r"stand still .*0\.70 g"),
+    ({"acc_z_g": 1.2}, r"1\.20 g"),
+]
 NO_PICTURE = Camera(lambda frame: None)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"position_variance_m2": 0.5}, r"settle.*variance 0\.5.*positioning"),
-        ({"position_variance_m2": 0.0103}, r"variance 0\.0103 .*at most 0\.0100"),
-        ({"position_variance_m2": math.nan}, "settle"),
-        ({"position_variance_m2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
-        ({"supervisor": 0x06}, "0x0006"),
-        ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
-        ({"roll_rad": math.radians(10.2)}, r"by 10\.2 deg, at most 10\.0"),
-        ({"pitch_rad": -0.2}, "tilted by 11 deg"),
-        ({"acc_z_g": 0.7}, r"stand still .*0\.70 g"),
-        ({"acc_z_g": 1.2}, r"1\.20 g"),
-    ],
-)
-def test_a_vehicle_that_is_not_ready_in_time_is_refused(
-    changes: dict[str, Any], words: str
+@pytest.mark.parametrize(("changes", "words", "waits"), [
+    *((*each, False) for each in AT_ONCE), *((*each, True) for each in IN_TIME),
+])  # fmt: skip
+def test_a_vehicle_that_may_not_fly_or_is_not_ready_in_time_is_refused(
+    changes: dict[str, Any], words: str, waits: bool
 ) -> None:
     rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
-    rig.refused(TimedOut, words)
-    assert rig.link.now_s == pytest.approx(PROFILE.safety.estimator_wait_s, abs=0.2)
+    rig.refused(TimedOut if waits else SafetyAbort, words)
+    limit_s = PROFILE.safety.estimator_wait_s if waits else 0.0
+    assert rig.link.now_s == pytest.approx(limit_s, abs=0.2 if waits else 0.1)
 
 
 @pytest.mark.parametrize(

@@ -41,16 +41,3 @@ def wait_for(sim: SimProcess, seconds: float) -> None:
     while sim.truth()["t_s"] < until_s:
         assert time.monotonic() < end_s
         time.sleep(0.02)
-
-
-class Borrowed:
-    """A simulated vehicle that goes on when it is left."""
-
-    def __init__(self, sim: SimProcess) -> None:
-        self.sim = sim
-
-    def __enter__(self) -> SimProcess:
-        return self.sim
-
-    def __exit__(self, *_: object) -> None:
-        return None

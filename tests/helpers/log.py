@@ -28,6 +28,7 @@ from perchctl.vehicle import (
 )
 from perchctl.vision import MarkerPose, PipelineOutput, TargetEstimate
 from perchctl.vision.types import Detection, Detections, Stage
+from tests.helpers import mission
 from tests.helpers.mission import note
 
 PERIOD_S = 0.02
@@ -51,41 +52,23 @@ def header(**changes: Any) -> dict[str, Any]:
 
 
 def telemetry(t_s: float = 0.0, z_m: float = 0.0) -> Telemetry:
-    return Telemetry(
-        t_s=t_s,
-        position_m=(0.3, -0.2, z_m),
-        velocity_mps=(0.01, 0.02, 0.03),
-        roll_rad=0.01,
-        pitch_rad=-0.02,
-        yaw_rad=0.5,
-        acc_z_g=1.0,
-        thrust=42000.0,
-        battery_v=3.9 - 0.01 * t_s,
+    return mission.telemetry(
+        t_s, position_m=(0.3, -0.2, z_m), velocity_mps=(0.01, 0.02, 0.03), roll_rad=0.01,
+        pitch_rad=-0.02, yaw_rad=0.5, acc_x_g=0.0, thrust=42000.0, battery_v=3.9 - 0.01 * t_s,
         supervisor=0x1A,
-    )
+    )  # fmt: skip
 
 
 def target(
     t_s: float, z_m: float, measured: bool = True, stage: Stage = Stage.BOTH
 ) -> TargetEstimate:
     decay = math.exp(-t_s / 4.0)
-    e_m = np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)])
-    return TargetEstimate(
-        t_s=t_s,
+    return mission.target_at(
+        t_s, (0.6, -0.4, 2.2), stage=stage, measured=measured, unseen=0 if measured else 4,
         measured_s=t_s if measured else t_s - 0.13,
-        small_measured_s=t_s,
-        stage=stage,
-        tracked=True,
-        e_m=e_m,
-        e_yaw_rad=2.0 * decay,
-        velocity_mps=np.zeros(3),
-        measured=measured,
-        unseen=0 if measured else 4,
-        sigma_m=np.full(3, 0.004),
-        sigma_yaw_rad=0.02,
-        world_m=np.array([0.6, -0.4, 2.2]),
-        world_yaw_rad=2.5,
-    )
+        e_m=np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)]), e_yaw_rad=2.0 * decay,
+        sigma_m=np.full(3, 0.004), sigma_yaw_rad=0.02, world_yaw_rad=2.5,
+    )  # fmt: skip
 
 
 def output(index: int, truth: TargetEstimate, rng: np.random.Generator) -> PipelineOutput:

@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.battery import (
-    charge_at,
-    fit_battery,
     left_s,
     outlook,
     read_battery,
-    resting_v,
     update_energy,
 )
 from perchctl.mission.context import Context
@@ -96,12 +93,6 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
 
 
-@pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
-def test_the_sag_is_found_within_seconds(ohm: float) -> None:
-    *_, last = hovering(4.1, {"ohm": ohm}, 5.0)
-    assert fit_battery(last.energy)[0] == pytest.approx(4.4 * ohm, rel=0.05)
-
-
 def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
@@ -114,11 +105,6 @@ def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert left_s(energy, PROFILE, HOVER) is None
     assert energy.unknown_s == pytest.approx(10.0)
-
-
-@given(st.floats(3.0, 4.2))
-def test_charge_and_voltage_are_each_other_s(volts: float) -> None:
-    assert resting_v(charge_at(volts)) == pytest.approx(volts, abs=1e-6)
 
 
 @settings(max_examples=60)

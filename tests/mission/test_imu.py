@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -140,6 +141,20 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
         assert (new.unsure_s == after.t_s) is unsure
         assert new.below_m == (z_m if kept else math.inf)
         assert add_sight(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).nearest_m == z_m
+
+
+def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
+    """It fell by 5 cm, and the setpoint that catches it is a metre above."""
+    falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
+    motion = flown(falls[:1])
+    reckoning = add_sight(Reckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
+    late = telemetry(falls[-1].t_s + 1.5)
+    for last, new in pairwise([*falls, late]):
+        assert new is not late or 0.02 < reckoning.nearest_m < 0.1
+        motion = motion.with_sample(last, new)
+        reckoning = advance_reckoning(reckoning, motion, new, believed=False)
+    assert motion.fell_s > 1.0
+    assert reckoning.unsure_s == late.t_s
 
 
 def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:

@@ -300,6 +300,17 @@ def test_level_is_what_pictures_show_to_be_level() -> None:
     assert tilts[0] < tilts[1] < tilts[2] == 0.0
 
 
+def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
+    c = context("imu", reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
+    motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
+    obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
+    state = lander.observe(Context(c.state, obs, c.profile)).state
+    assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
+    later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
+    moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
+    assert lander.observe(Context(moved, later, c.profile)).state.reckoning.velocity_mps[0] < 0.2
+
+
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""

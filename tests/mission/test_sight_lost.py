@@ -13,7 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import ImuMotion, Observation, Phase, PlannerState
+from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.guidance import LOWEST_M, MOST_BRAKED_MPS, POSITION_GAIN_PER_S
 from perchctl.mission.imu import Reckoning
@@ -158,6 +158,16 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
         assert flight.command.roll_rad * aside_g >= -1e-3
+
+
+def test_a_landing_that_loses_it_goes_on_blindly() -> None:
+    ordered = at(obs={"operator": Operator.LAND})
+    state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
+    assert state.phase is Phase.LANDING
+    assert state.blind_s is None
+    state, command = step_mission(state, unseen(0.9, for_s=LAND_S + 0.1)(BEGIN_S + 2.0), PROFILE)
+    assert state.blind_s is not None
+    assert isinstance(command, RawThrust)
 
 
 @given(x_mps=st.floats(-2.0, 2.0), y_mps=st.floats(-2.0, 2.0))

@@ -103,6 +103,19 @@ def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) 
         assert "too heavy" in state.reason
 
 
+@pytest.mark.parametrize(("hover", "lasts_s", "row"), [
+    # It hovers below its setpoint on all the thrust there is, as before on nearly all.
+    (62500.0, 1.9, ""), (62500.0, 2.5, "too-weak"), (56000.0, 1.0, "blocked"),
+])  # fmt: skip
+def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
+    hover: float, lasts_s: float, row: str
+) -> None:
+    start = replace(state_in(Phase.ALIGN), hover_thrust=hover)
+    state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
+    assert state.row == row
+    assert row != "too-weak" or "battery too low" in state.reason
+
+
 @pytest.mark.parametrize(
     ("raw_order", "reads", "known"),
     [
