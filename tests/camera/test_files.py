@@ -11,7 +11,6 @@ import pytest
 from perchctl.camera import (
     FrameSource,
     Recording,
-    check_size,
     open_camera,
     parse_source,
     profile_record,
@@ -19,7 +18,7 @@ from perchctl.camera import (
 )
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig, Profile
-from perchctl.vision import CameraModel, Frame
+from perchctl.vision import Frame
 
 
 def clock() -> float:
@@ -198,13 +197,6 @@ def test_videos_that_are_none(tmp_path: Path, capfd: pytest.CaptureFixture[str])
     with pytest.raises(InvalidValue, match="no readable frame"):
         open_camera(f"video:{tmp_path}/flight.avi", clock)
     assert capfd.readouterr().err == ""
-
-
-def test_the_wrong_size_names_both() -> None:
-    camera = CameraModel((640, 480), np.eye(3), np.zeros(5))
-    check_size((640, 480), camera, "camera:0")
-    with pytest.raises(InvalidValue, match=r"720x576.*640x480"):
-        check_size((720, 576), camera, "camera:0")
 
 
 def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(

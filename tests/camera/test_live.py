@@ -64,19 +64,11 @@ def test_the_newest_frame_is_stamped_at_arrival_less_the_latency_and_given_once(
     assert source.problem(clock.t_s) is None
 
 
-def test_a_damaged_picture_costs_no_connection(
-    server: MjpegServer, opened: list[LiveSource]
-) -> None:
-    server.scripts.put([part(jpeg(60)[:300]), part(jpeg(160)), threading.Event()])
-    source = stream(server, Clock(), opened)
-    assert level(next_frame(source)) == 160
-    assert source.connections == 1
-    assert source.problem(100.0) is None
-
-
-@pytest.mark.parametrize("size_px", [(40_000, 40_000), (4097, 4096), (0, 64)])
-def test_a_picture_of_no_size_or_above_the_largest_is_not_decoded(
-    size_px: tuple[int, int],
+@pytest.mark.parametrize("bad", [
+    jpeg(60)[:300], *(resized(jpeg(60), *px) for px in ((40_000, 40_000), (4097, 4096), (0, 64))),
+])  # fmt: skip
+def test_a_picture_that_is_cut_or_of_no_size_or_above_the_largest_is_not_decoded(
+    bad: bytes,
     server: MjpegServer,
     opened: list[LiveSource],
     monkeypatch: pytest.MonkeyPatch,
@@ -89,7 +81,7 @@ def test_a_picture_of_no_size_or_above_the_largest_is_not_decoded(
         return grey_pixels(data)
 
     monkeypatch.setattr(network, "grey_pixels", decode)
-    server.scripts.put([part(resized(jpeg(60), *size_px)), part(whole), threading.Event()])
+    server.scripts.put([part(bad), part(whole), threading.Event()])
     source = stream(server, Clock(), opened)
     assert level(next_frame(source)) == 160
     assert (tried, source.connections) == ([whole], 1)

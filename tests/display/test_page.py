@@ -28,17 +28,6 @@ def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
     assert "default-src 'none'" in headers["Content-Security-Policy"]
 
 
-def test_the_state_is_the_newest(page: LivePage) -> None:
-    page.set_state(lambda: {"rows": [["a", "1"]], "note": ""})
-    page.set_state(lambda: {"rows": [["a", "2"]], "note": "mirrored"})
-    state = json.loads(ask(page.url, "/state")[1])
-    assert state["rows"] == [["a", "2"]]
-    assert state["note"] == "mirrored"
-    assert state["title"] == "perchctl test"
-    assert state["stop"] == "ready"
-    assert state["fresh"] is False
-
-
 @contextmanager
 def streaming(page: LivePage) -> Iterator[http.client.HTTPResponse]:
     """The page's multipart answer."""

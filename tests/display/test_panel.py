@@ -6,7 +6,6 @@ import io
 import math
 import re
 import threading
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,8 +14,7 @@ from rich.text import Text
 
 from perchctl.display import FlightPanel
 from perchctl.display.panel import panel, status_rows
-from perchctl.mission import ExternalPositions, Phase
-from perchctl.mission.state import BatteryOutlook
+from perchctl.mission import Phase
 from tests.helpers.live_page import tick
 from tests.helpers.mission import entered, held, note
 from tests.helpers.waiting import until
@@ -158,41 +156,3 @@ def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
     lines = stream.getvalue().splitlines()
     assert lines[-1] == "[  99.98 s] event 4999"
     assert len(lines) <= 1001
-
-
-def test_the_rows_of_a_moment() -> None:
-    rows = dict(status_rows(tick()))
-    assert rows["phase"] == "ALIGN  1.2 s"
-    assert rows["error"] == "x -12.3  y +4.5  z +123.4 cm   yaw -166.2 deg"
-    assert rows["markers"] == "both   attempts 1"
-    assert rows["height"].startswith("0.82 m")
-    assert rows["ages"] == "link 12 ms   camera 50 ms   loop late 1 ms"
-    assert "outside" not in rows
-    outside = ExternalPositions(0.012, None, 300, 99.6, None)
-    assert dict(status_rows(tick(outside=outside)))["outside"] == "position 100 Hz   12 ms"
-    wrong = replace(outside, age_s=math.inf, problem="the rigid body 'cf2' is not seen")
-    assert dict(status_rows(tick(outside=wrong)))["outside"] == wrong.problem
-    rows = dict(status_rows(tick(tracked=False, e_yaw_rad=math.nan)))
-    assert rows["error"].endswith("yaw - deg   (not seen)")
-    rows = dict(status_rows(tick(e_m=None, camera_age_s=math.inf)))
-    assert (rows["error"], rows["markers"]) == ("no target seen yet", "none   attempts 1")
-    assert rows["ages"].startswith("link 12 ms   camera none")
-
-
-@pytest.mark.parametrize(
-    ("volts", "battery", "text"),
-    [
-        (3.71, BatteryOutlook(60.0, 2), "3.71 V, enough for 2 attempts"),
-        (3.71, BatteryOutlook(40.0, 1), "3.71 V, enough for 1 attempt"),
-        (3.3, BatteryOutlook(10.0, 0), "3.30 V, not enough for an attempt"),
-        (3.71, BatteryOutlook(60.0), "3.71 V, 60 s left"),
-        (3.71, BatteryOutlook(150.0), "3.71 V, 2 min left"),
-        (3.71, BatteryOutlook(), "3.71 V"),
-        (0.0, BatteryOutlook(), "unknown"),
-        (math.nan, BatteryOutlook(), "unknown"),
-    ],
-)
-def test_what_the_battery_is_enough_for(volts: float, battery: BatteryOutlook, text: str) -> None:
-    rows = dict(status_rows(tick(battery_v=volts, battery=battery)))
-    assert rows["height"] == f"0.82 m   battery {text}"
-    assert len(rows["height"]) < 70

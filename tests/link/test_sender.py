@@ -258,10 +258,20 @@ def test_no_error_ends_a_thread(library: Library) -> None:
 
 
 def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(library: Library) -> None:
+    """A log that fails stops nothing, and of the loop's commands it hears nothing."""
     told: list[SentCommand] = []
-    library.sender(guard=EmergencyStop, on_sent=told.append)
+
+    def tell(each: SentCommand) -> None:
+        told.append(each)
+        raise OSError("the log's")
+
+    sender = library.sender(guard=EmergencyStop, on_sent=tell)
+    sender.put(PLACES[0])
+    assert sender.drain(LIMIT_S)
     until(lambda: len(told) >= 3)
-    assert set(library.taken) == {STOP}
+    assert set(library.taken) == {PLACES[0], STOP}
+    assert sender.problem is None
+    assert {sent.command for sent in told} == {STOP}
     assert {sent.by for sent in told} == {"watchdog"}
 
 

@@ -17,9 +17,10 @@ import pytest
 from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions
-from perchctl.mission import FlightReport, Outcome, Phase
+from perchctl.mission import FlightReport, Outcome, Phase, SentCommand
 from perchctl.profile import changed_profile, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
+from perchctl.vehicle import EmergencyStop
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
 
@@ -159,15 +160,16 @@ def test_a_disk_that_hangs_holds_up_nobody(hung: tuple[LogWatcher, Disk]) -> Non
     began_s = time.monotonic()
     for i in range(80):
         writer.write({"t_s": 0.02 * i})
+        writer.sent(SentCommand(0.02 * i, "watchdog", EmergencyStop()))
     assert time.monotonic() - began_s < 1.0
     assert "does not keep up" in (writer.problem or "")
-    assert writer.lost_records == 30
+    assert writer.lost_records == 110
     disk.gate.set()
     writer.end(synthetic.SUMMARY)
     log = read_log(writer.path)
-    assert len(log.records) == 50
+    assert (len(log.records), len(log.sent)) == (25, 25)
     assert log.summary is not None
-    assert (log.summary["lost_records"], log.summary["problem"]) == (30, writer.problem)
+    assert (log.summary["lost_records"], log.summary["problem"]) == (110, writer.problem)
 
 
 def test_closing_does_not_wait_for_ever(hung: tuple[LogWatcher, Disk]) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -13,16 +10,14 @@ from perchctl.analysis import FlightAnalysis, show_record, show_text
 from perchctl.analysis.story import story_of
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
-from perchctl.link.sender import Sender
 from perchctl.mission import Operator, SentCommand
 from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
-from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
+from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers import log as synthetic
 from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, hung_rig
 from tests.helpers.mission import telemetry
 from tests.helpers.scripted_link import ScriptedLink
-from tests.helpers.waiting import until
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
 TOLD = (
@@ -87,44 +82,3 @@ def test_a_rescue_s_orders_are_told() -> None:
     assert told
     assert [(each.t_s, each.command) for each in told] == link.sent
     assert {each.by for each in told} == {"rescue"}
-
-
-def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
-    """A log that fails stops nothing: the next one goes out all the same."""
-    sent: list[Command] = []
-    told: list[SentCommand] = []
-
-    def tell(each: SentCommand) -> None:
-        told.append(each)
-        raise OSError("the log's")
-
-    sender = Sender(sent.append, guard=EmergencyStop, on_sent=tell)
-    sender.put(HOLD)
-    assert sender.drain(20.0)
-    until(lambda: len(told) >= 3)
-    sender.put(LAND, "reconnect")
-    assert sender.drain(20.0)
-    sender.stop()
-    assert sender.problem is None
-    assert HOLD in sent
-    assert [each.command for each in told] == [command for command in sent if command != HOLD]
-    assert ("reconnect", LAND) in {(each.by, each.command) for each in told}
-
-
-# --- never in the flight's way ----------------------------------------------------------------
-
-
-def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    watcher = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    watcher.sent(TOLD[0])
-    gate, real = threading.Event(), os.write
-    monkeypatch.setattr(os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
-    spent_s = time.thread_time()
-    began_s = time.monotonic()
-    for _ in range(50):
-        watcher.sent(TOLD[1])
-    assert time.monotonic() - began_s < 5.0  # a disk that were waited for takes 20
-    assert time.thread_time() - spent_s < 1.0
-    gate.set()
-    watcher.close()
-    assert len(read_log(watcher.path).sent) == 51

@@ -140,17 +140,6 @@ def test_stills_give_one_line_a_picture_and_the_truth(pictures: Path) -> None:
                 assert np.abs(np.array(line[marker]["corners_px"]) - true_px).max() < limit_px
 
 
-def test_both_in_sight_are_merged_as_the_profile_says(pictures: Path) -> None:
-    """By the joint pose, or by the paper's weights, which put the target between the markers."""
-    (line,) = lines(pictures / "both.png")
-    assert line["target"]["tvec_m"] not in [line[name]["tvec_m"] for name in ("large", "small")]
-    (line,) = lines(pictures / "both.png", "-p", "paper")
-    large, small, merged = (np.array(line[name]["tvec_m"]) for name in ("large", "small", "target"))
-    weights = load_profile("paper").merge.weights
-    w = np.array([weights.x, weights.y, weights.z])
-    assert merged == pytest.approx(w * large + (1.0 - w) * small, abs=1e-9)
-
-
 def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
     tracked = track(f"video:{video}")
     assert [line["frame"] for line in tracked.lines] == list(range(MOVING))
@@ -162,15 +151,6 @@ def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
         assert line["target"]["yaw_rad"] == pytest.approx(yaw_of(R), abs=1e-9)
     assert lines(video) == tracked.lines
     assert "interlaced" not in tracked.stderr
-
-
-def test_the_filter_bridges_a_lost_frame(tmp_path: Path) -> None:
-    images = [picture(moving(i), i) for i in range(8)]
-    images[5] = picture(VIEWS["away"])
-    lost = lines(write_video(tmp_path / "lost.mp4", images))[5]
-    assert lost["stage"] == "none"
-    assert lost["large"] is None
-    assert np.abs(np.array(lost["target"]["tvec_m"]) - true_pose(moving(5))[1]).max() < 0.02
 
 
 def test_each_picture_file_is_measured_alone(pictures: Path) -> None:
