@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -101,8 +102,12 @@ def test_what_nothing_on_board_can_know_is_allowed_on_top() -> None:
     push = partial(e.push, force_n=(0.042, 0.0, 1.0), for_s=2.0)  # 1 m/s^2 at 42 g
     assert drifted(push, after_s=1.0) == pytest.approx(0.5)
     assert drifted(push, SLIDE, after_s=60.0) == pytest.approx(4.0)
-    lost = partial(e.external_positions, how="silent", for_s=e.FOR_EVER)
-    assert drifted(lost, partial(e.camera_fault, kind="covered", for_s=9.0), after_s=60.0) == 0.0
+    assert (
+        drifted(
+            positions("silent"), partial(e.camera_fault, kind="covered", for_s=9.0), after_s=60.0
+        )
+        == 0.0
+    )
 
 
 def test_a_slide_of_before_is_forgotten_once_it_is_under_the_target() -> None:
@@ -122,6 +127,24 @@ def lost(for_s: float, up: bool, down: str, delay_s: float = math.inf) -> e.Effe
     return partial(e.radio_loss, for_s=for_s, up=up, down=down, delay_s=delay_s)
 
 
+def blind(kind: str) -> e.Effect:
+    return partial(e.camera_fault, kind=kind, for_s=EVER)
+
+
+def positions(how: str) -> e.Effect:
+    return partial(e.external_positions, how=how, for_s=EVER)
+
+
+def befallen(
+    effect: e.Effect, profile: Profile = SIM, phase: Phase = P.ALIGN
+) -> Callable[..., bool]:
+    """By the time since the effect befell it, and by what is not so of a vehicle that hovers on:
+    is it overdue?"""
+    made = DescentBound((effect,), profile)
+    made.begin(0.0, phase)
+    return partial(made.is_overdue, height_m=1.5, vz_mps=0.0, touching=False, uplink=True)
+
+
 @pytest.mark.parametrize(
     ("effect", "profile", "phase", "limit_s"),
     [
@@ -134,23 +157,13 @@ def lost(for_s: float, up: bool, down: str, delay_s: float = math.inf) -> e.Effe
         (lost(EVER, False, "all", 1.5), SIM, P.ASCEND, SAFETY.telemetry_land_s),
         (lost(EVER, False, "all", 0.5), SIM, P.ASCEND, NEVER),
         (partial(e.hung, for_s=5.0), SIM, P.ALIGN, SAFETY.loop_late_land_s),
-        (partial(e.camera_fault, kind="silent", for_s=EVER), SIM, P.ALIGN, SAFETY.camera_land_s),
-        (partial(e.camera_fault, kind="silent", for_s=EVER), SIM, P.APPROACH, NEVER),
-        (partial(e.camera_fault, kind="covered", for_s=EVER), SIM, P.ALIGN, NEVER),
-        (
-            partial(e.camera_fault, kind="covered", for_s=EVER),
-            TARGET_ONLY,
-            P.ALIGN,
-            TARGET_ONLY.positioning.land_s,
-        ),
-        (
-            partial(e.external_positions, how="silent", for_s=EVER),
-            SIM,
-            P.APPROACH,
-            SIM.positioning.land_s,
-        ),
+        (blind("silent"), SIM, P.ALIGN, SAFETY.camera_land_s),
+        (blind("silent"), SIM, P.APPROACH, NEVER),
+        (blind("covered"), SIM, P.ALIGN, NEVER),
+        (blind("covered"), TARGET_ONLY, P.ALIGN, TARGET_ONLY.positioning.land_s),
+        (positions("silent"), SIM, P.APPROACH, SIM.positioning.land_s),
+        (positions("late"), SIM, P.ALIGN, NEVER),
         (partial(e.deck_silent, for_s=EVER, acc_z_mps2=0.05), SIM, P.ALIGN, SIM.positioning.land_s),
-        (partial(e.external_positions, how="late", for_s=EVER), SIM, P.ALIGN, NEVER),
         (partial(e.suspended, for_s=1.9), SIM, P.ALIGN, SAFETY.loop_late_land_s),
         (partial(e.raises), SIM, P.ALIGN, 0.0),
         (partial(e.operator, presses_s=(0.0, 4.0)), SIM, P.ALIGN, 0.0),
@@ -161,60 +174,29 @@ def test_after_what_loss_it_comes_down_and_when(
     effect: e.Effect, profile: Profile, phase: Phase, limit_s: float
 ) -> None:
     late_s = limit_s + REACTION_S + WATCHED_S
-    assert overdue_s(effect, profile, phase) == pytest.approx(late_s, abs=0.011)
-
-
-def overdue_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
-    """How long after the fault's beginning a vehicle that hovers on is overdue."""
-    made = DescentBound((effect,), profile)
-    made.begin(10.0, phase)
-    for k in range(2000):
-        t_s = 10.0 + 0.01 * k
-        if made.is_overdue(t_s, 1.5, 0.0, touching=False, uplink=True):
-            return t_s - 10.0
-    return math.inf
-
-
-class Lost:
-    """A vehicle at 1.5 m in the alignment that the effect befalls at 0 s."""
-
-    def __init__(self, effect: e.Effect) -> None:
-        self._bound = DescentBound((effect,), SIM)
-        self._bound.begin(0.0, P.ALIGN)
-
-    def is_overdue(
-        self,
-        t_s: float,
-        height_m: float = 1.5,
-        vz_mps: float = 0.0,
-        touching: bool = False,
-        uplink: bool = True,
-        lands: bool = False,
-    ) -> bool:
-        return self._bound.is_overdue(
-            t_s, height_m, vz_mps, touching=touching, uplink=uplink, lands=lands
-        )
+    is_overdue = befallen(effect, profile, phase)
+    overdue_s = (0.01 * k for k in range(2000) if is_overdue(0.01 * k))
+    assert next(overdue_s, math.inf) == pytest.approx(late_s, abs=0.011)
 
 
 def test_what_touches_the_ceiling_before_it_has_to_come_down_is_not_overdue() -> None:
     """And what rises to it instead of coming down is."""
-    hangs = Lost(partial(e.hung, for_s=EVER))
-    assert not any(hangs.is_overdue(0.1 * k, touching=True) for k in range(200))
-    rises = Lost(partial(e.hung, for_s=EVER))
-    assert not rises.is_overdue(2.01)
-    assert not rises.is_overdue(3.0, 2.0, touching=True)
-    assert rises.is_overdue(4.1, 2.0, touching=True)
+    hangs = befallen(partial(e.hung, for_s=EVER))
+    assert not any(hangs(0.1 * k, touching=True) for k in range(200))
+    rises = befallen(partial(e.hung, for_s=EVER))
+    assert not rises(2.01)
+    assert not rises(3.0, height_m=2.0, touching=True)
+    assert rises(4.1, height_m=2.0, touching=True)
 
 
 @pytest.mark.parametrize("effect", [partial(e.suspended, for_s=1.9), lost(1.9, True, "all")])
 def test_what_hears_nothing_is_overdue_once_it_hears_again(effect: e.Effect) -> None:
     """As a program that was suspended for 1.9 s is, or a link that was silent for so long."""
-    vehicle = Lost(effect)
-    assert not vehicle.is_overdue(1.9, uplink=False)
-    assert not vehicle.is_overdue(1.9 + REACTION_S + 0.01)
+    is_overdue = befallen(effect)
+    assert not is_overdue(1.9, uplink=False)
     late_s = 1.9 + REACTION_S + WATCHED_S + 0.02
-    assert not vehicle.is_overdue(late_s - 0.1)
-    assert vehicle.is_overdue(late_s)
+    ages_s = (1.9 + REACTION_S + 0.01, late_s - 0.1, late_s)
+    assert [is_overdue(age_s) for age_s in ages_s] == [False, False, True]
 
 
 @pytest.mark.parametrize(
@@ -234,6 +216,6 @@ def test_what_is_on_its_way_down_is_not_overdue(
     height_m: float, vz_mps: float, lands: bool, late: bool
 ) -> None:
     """Also in a landing of its own, whose curve starts from rest; one that climbs is none."""
-    vehicle = Lost(partial(e.hung, for_s=EVER))
-    assert not vehicle.is_overdue(2.0 + 1e-6)
-    assert vehicle.is_overdue(4.1, height_m, vz_mps, lands=lands) is late
+    is_overdue = befallen(partial(e.hung, for_s=EVER))
+    assert not is_overdue(2.0 + 1e-6)
+    assert is_overdue(4.1, height_m=height_m, vz_mps=vz_mps, lands=lands) is late

@@ -18,6 +18,7 @@ from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import CUT_S, FactsRecorder, WatchedVehicle, sample_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sim import Scenario
+from tests.faults.test_oracle import HANGING
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, no_target=True)
@@ -68,11 +69,6 @@ def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehi
 
 # --- facts ------------------------------------------------------------------------------
 
-HANGING = Sample(
-    t_s=0.0, x_m=0.0, y_m=0.0, height_m=2.0, vz_mps=0.0, up_z=1.0, acc_g=1.0, motors_on=False,
-    pressing=False, floor=False, hanging=True, hold_ratio=2.0, locked=False,
-    ended_by_vehicle=False,
-)  # fmt: skip
 HOVER = HANGING._replace(hanging=False, motors_on=True)
 
 

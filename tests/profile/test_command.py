@@ -100,10 +100,6 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
     assert one.link.uri.startswith("radio://")
 
 
-def test_any_key_can_be_given(tmp_path: Path) -> None:
-    assert made(tmp_path / "m.yaml", planner__attempts="3").planner.attempts == 3
-
-
 @pytest.mark.parametrize("front", sorted(PICTURE_EDGES))
 def test_a_mirrored_picture_is_named(front: str, tmp_path: Path) -> None:
     plain, mirrored = edges_beside(front)
@@ -182,14 +178,19 @@ def test_a_latency_that_flights_measure_may_be_answered(tmp_path: Path, given: b
     assert re.search(r"ceiling +2.4m\n", done.stderr)
 
 
-def test_a_calibration_that_lies_there_is_offered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("file", "given"), [
+    ("camera_640x480.yaml", {}), ("mine.yaml", {"camera__calibration": "calib/mine.yaml"}),
+])  # fmt: skip
+def test_a_calibration_that_lies_there_is_offered_and_found_from_where_the_profile_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, given: dict[str, str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    own = tmp_path / "calib" / "camera_640x480.yaml"
+    own = tmp_path / "calib" / file
     own.parent.mkdir()
     own.write_bytes(find_calibration("example_640x480").read_bytes())
-    assert Path(made(tmp_path / "m.yaml").camera.calibration).samefile(own)
+    mine = made(tmp_path / "elsewhere" / "m.yaml", planner__attempts="3", **given)
+    assert Path(mine.camera.calibration).samefile(own)
+    assert mine.planner.attempts == 3, "any key can be given"
 
 
 @pytest.mark.parametrize(("name", "text", "allowed"), [
@@ -231,14 +232,6 @@ def test_a_file_that_exists_is_kept_without_force(tmp_path: Path) -> None:
     assert new(tmp_path / "m.txt").exit_code == 30
 
 
-def test_a_calibration_is_found_from_where_the_profile_is(tmp_path: Path) -> None:
-    own = tmp_path / "calib" / "mine.yaml"
-    own.parent.mkdir()
-    own.write_bytes(find_calibration("example_640x480").read_bytes())
-    mine = made(tmp_path / "elsewhere" / "m.yaml", camera__calibration=str(own))
-    assert Path(mine.camera.calibration).samefile(own)
-
-
 def test_an_aideck_gets_its_size_and_what_late_pictures_need(tmp_path: Path) -> None:
     mine = made(tmp_path / "m.yaml", link__uri="usb://0", camera__source="aideck://192.168.4.1")
     shipped = load_profile("aideck")
@@ -265,11 +258,6 @@ def test_profile_prints_what_is_flown(tmp_path: Path) -> None:
     record = json.loads(shown("-p", "crazyflie", "--json").stdout)
     assert record["profile"]["name"] == "crazyflie"
     assert record["check"][0]["verdict"] == "warn"
-
-
-def test_profile_prints_a_schema_for_editors() -> None:
-    schema = json.loads(shown("schema").stdout)
-    assert set(schema["properties"]) == {"extends", *type(load_profile("sim")).model_fields}
 
 
 @pytest.mark.parametrize("options", [[], ["--json"]])

@@ -92,13 +92,6 @@ def test_weights_that_do_not_help_are_not_written(tmp_path: Path) -> None:
     assert run(data, "-o", tmp_path / "w.yaml", "--anyway").exit_code == 0
 
 
-def test_the_report_fits_a_terminal_with_the_verdict_first(tmp_path: Path) -> None:
-    other = write(independent(8), tmp_path / "other.csv")
-    text = run(write(known(1), tmp_path / "good.csv"), "--test", other).stdout
-    assert max(len(line) for line in text.splitlines() if str(tmp_path) not in line) <= 80
-    assert text.split("\n\n")[1].startswith("recommended")
-
-
 # --- files that will not do ------------------------------------------------------------------
 
 
