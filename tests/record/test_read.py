@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from perchctl import __version__
 from perchctl.errors import InvalidValue
 from perchctl.record import read_log
 from tests.helpers.log import run_python, small_log
@@ -85,7 +86,9 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "packed other": (gzip.compress(b"\x00\x01" * 900, mtime=0), (NO_LOG,)),
     "cut header": (lambda good: good[:700], (NO_LOG, "cut off in its header")),
     "newer": (
-        lambda good: good.replace(b'"version":4', b'"version":9').replace(b"0.2.0", b"9.1", 1),
+        lambda good: good.replace(b'"version":4', b'"version":9').replace(
+            __version__.encode(), b"9.1", 1
+        ),
         ("schema version 9, this perchctl reads 1 to 4", "perchctl 9.1", "update it"),
     ),
     "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "take the original")),
