@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.live import TOKEN_HEADER, draw_sketch, is_loopback
+from perchctl.display.live import TOKEN_HEADER, draw_sketch
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.recording import camera
 
@@ -26,17 +26,6 @@ def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
     for foreign in ("http://", "https://", "{{nonce}}", page.token):  # which is in the address only
         assert foreign not in html
     assert "default-src 'none'" in headers["Content-Security-Policy"]
-
-
-def test_the_state_is_the_newest(page: LivePage) -> None:
-    page.set_state(lambda: {"rows": [["a", "1"]], "note": ""})
-    page.set_state(lambda: {"rows": [["a", "2"]], "note": "mirrored"})
-    state = json.loads(ask(page.url, "/state")[1])
-    assert state["rows"] == [["a", "2"]]
-    assert state["note"] == "mirrored"
-    assert state["title"] == "perchctl test"
-    assert state["stop"] == "ready"
-    assert state["fresh"] is False
 
 
 @contextmanager
@@ -121,7 +110,10 @@ def test_stop_needs_the_token(page: LivePage, stops: list[str]) -> None:
     assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
 
 
-@pytest.mark.parametrize("host", ["evil.example:80", "127.0.0.1.evil.example", ""])
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1.evil.example", "127.0.0.1@evil.example", "127.0.0.2", "[", ""],
+)
 def test_a_foreign_host_is_refused(page: LivePage, host: str) -> None:
     for path in ("/", "/state", "/stream"):
         status, body, _ = ask(page.url, path, Host=host)
@@ -135,10 +127,3 @@ def test_stop_refuses_a_foreign_host_and_origin(page: LivePage, stops: list[str]
     assert stop(page.url, page.token, Origin="null") == 403
     assert stops == []
     assert stop(page.url, page.token, Origin="http://localhost:9", Host="localhost:9") == 200
-
-
-def test_the_names_of_this_machine() -> None:
-    for host in ("127.0.0.1:80", "localhost", "LOCALHOST:8080", "[::1]:80", "user@127.0.0.1"):
-        assert is_loopback(host)
-    for host in ("127.0.0.1@evil.example", "127.0.0.2", "[", None):
-        assert not is_loopback(host)

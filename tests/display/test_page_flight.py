@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +25,7 @@ from perchctl.mission import (
     Watcher,
 )
 from perchctl.profile import load_profile
-from perchctl.record import FlightSummary, LogWatcher
+from perchctl.record import LogWatcher
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.live_page import CORNERS, ask, stop, tick
@@ -154,24 +153,6 @@ def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) ->
 
 # --- how it ended ----------------------------------------------------------------------------
 
-SUMMARY = FlightSummary(
-    "perched", "hanging still with the motors off", "perched", 24.5, 2, 0.0017, 3.31
-)
-
-
-def test_the_card_tells_outcome_reason_miss_and_where_to_look(
-    page: LivePage, tmp_path: Path
-) -> None:
-    log = tmp_path / "my flights" / "flight.jsonl"
-    FlightPage(page, 0.15, 0.03).end(SUMMARY, log)
-    card = state_of(page)["card"]
-    assert (card["outcome"], card["good"]) == ("PERCHED", True)
-    assert card["reason"] == SUMMARY.reason
-    rows = dict(card["rows"])
-    assert rows["miss"] == "1.7 mm"
-    assert rows["log"] == str(log)
-    assert rows["report"] == f"perchctl log report '{log}'"
-
 
 def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     page: LivePage, tmp_path: Path
@@ -186,19 +167,6 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     rows = state_of(page)["card"]["rows"]
     assert rows[0][1].endswith("the motors are off")
     assert "report" in dict(rows)
-
-
-def test_only_who_looks_is_waited_for(page: LivePage) -> None:
-    page.end({"outcome": "LANDED"})  # returns at once
-    state = state_of(page)
-    assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
-    thread = threading.Thread(target=page.end, args=({"outcome": "ABORTED"},))
-    thread.start()
-    while state_of(page)["card"] != {"outcome": "ABORTED"}:
-        pass
-    assert thread.is_alive()
-    thread.join(5.0)
-    assert not thread.is_alive()
 
 
 @pytest.fixture
