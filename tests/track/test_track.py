@@ -140,17 +140,6 @@ def test_stills_give_one_line_a_picture_and_the_truth(pictures: Path) -> None:
                 assert np.abs(np.array(line[marker]["corners_px"]) - true_px).max() < limit_px
 
 
-def test_both_in_sight_are_merged_as_the_profile_says(pictures: Path) -> None:
-    """By the joint pose, or by the paper's weights, which put the target between the markers."""
-    (line,) = lines(pictures / "both.png")
-    assert line["target"]["tvec_m"] not in [line[name]["tvec_m"] for name in ("large", "small")]
-    (line,) = lines(pictures / "both.png", "-p", "paper")
-    large, small, merged = (np.array(line[name]["tvec_m"]) for name in ("large", "small", "target"))
-    weights = load_profile("paper").merge.weights
-    w = np.array([weights.x, weights.y, weights.z])
-    assert merged == pytest.approx(w * large + (1.0 - w) * small, abs=1e-9)
-
-
 def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
     tracked = track(f"video:{video}")
     assert [line["frame"] for line in tracked.lines] == list(range(MOVING))
@@ -382,13 +371,11 @@ def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch)
     ("words", "code", "expected"),
     [
         (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
-        (["video:nowhere.mp4"], 20, "nowhere.mp4 was not found"),
         (["images:*.nothing"], 20, "names pictures"),
         (["nonsense:1"], 30, "camera:N"),
         (["."], 20, "holds no pictures"),
         (["BROKEN"], 30, "cannot be read as a picture"),
         (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
-        (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
     ],
 )
 def test_bad_input_is_one_sentence(
@@ -396,7 +383,6 @@ def test_bad_input_is_one_sentence(
     code: int,
     expected: str,
     pictures: Path,
-    video: Path,
     tmp_path: Path,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
@@ -404,7 +390,7 @@ def test_bad_input_is_one_sentence(
     monkeypatch.chdir(tmp_path)
     broken = tmp_path_factory.mktemp("broken") / "a.png"
     broken.write_bytes(b"no picture")
-    places = {"PICTURES": str(pictures), "VIDEO": str(video), "BROKEN": str(broken)}
+    places = {"PICTURES": str(pictures), "BROKEN": str(broken)}
     said = run("track", *(places.get(word, word) for word in words))
     assert (said.code, said.stdout) == (code, "")
     assert expected in said.stderr
