@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from perchctl.display import LivePage, Sketch
-from perchctl.display.live import TOKEN_HEADER, draw_sketch, is_loopback
+from perchctl.display.live import TOKEN_HEADER, draw_sketch
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.recording import camera
 
@@ -110,7 +110,10 @@ def test_stop_needs_the_token(page: LivePage, stops: list[str]) -> None:
     assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
 
 
-@pytest.mark.parametrize("host", ["evil.example:80", "127.0.0.1.evil.example", ""])
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1.evil.example", "127.0.0.1@evil.example", "127.0.0.2", "[", ""],
+)
 def test_a_foreign_host_is_refused(page: LivePage, host: str) -> None:
     for path in ("/", "/state", "/stream"):
         status, body, _ = ask(page.url, path, Host=host)
@@ -124,10 +127,3 @@ def test_stop_refuses_a_foreign_host_and_origin(page: LivePage, stops: list[str]
     assert stop(page.url, page.token, Origin="null") == 403
     assert stops == []
     assert stop(page.url, page.token, Origin="http://localhost:9", Host="localhost:9") == 200
-
-
-def test_the_names_of_this_machine() -> None:
-    for host in ("127.0.0.1:80", "localhost", "LOCALHOST:8080", "[::1]:80", "user@127.0.0.1"):
-        assert is_loopback(host)
-    for host in ("127.0.0.1@evil.example", "127.0.0.2", "[", None):
-        assert not is_loopback(host)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -168,19 +167,6 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     rows = state_of(page)["card"]["rows"]
     assert rows[0][1].endswith("the motors are off")
     assert "report" in dict(rows)
-
-
-def test_only_who_looks_is_waited_for(page: LivePage) -> None:
-    page.end({"outcome": "LANDED"})  # returns at once
-    state = state_of(page)
-    assert (state["card"], state["stop"], state["age_s"]) == ({"outcome": "LANDED"}, "over", None)
-    thread = threading.Thread(target=page.end, args=({"outcome": "ABORTED"},))
-    thread.start()
-    while state_of(page)["card"] != {"outcome": "ABORTED"}:
-        pass
-    assert thread.is_alive()
-    thread.join(5.0)
-    assert not thread.is_alive()
 
 
 @pytest.fixture

@@ -62,18 +62,6 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
         assert (ago(seconds, passes).objection(NOW) is None) is allowed
 
 
-@pytest.mark.parametrize(("record", "words"), [
-    (Comparison(set_up={}), "was never compared with this vehicle: run perchctl check --lift"),
-    (ago(30 * 3600.0), "by hand on 21 Nov 2026 09:00, 30 h ago (24 h at most)"),
-    (ago(3000.0, False, SWAPPED), f"{SWAPPED} (compared by hand on 22 Nov 2026 14:10): mend"),
-])  # fmt: skip
-def test_each_objection_says_what_is_and_what_to_do(record: Comparison, words: str) -> None:
-    said = record.objection(NOW)
-    assert said is not None
-    assert words in ": ".join(said)
-    assert "check --lift" in said[1]
-
-
 # --- The record --------------------------------------------------------------------------
 
 

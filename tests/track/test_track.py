@@ -362,13 +362,11 @@ def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch)
     ("words", "code", "expected"),
     [
         (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
-        (["video:nowhere.mp4"], 20, "nowhere.mp4 was not found"),
         (["images:*.nothing"], 20, "names pictures"),
         (["nonsense:1"], 30, "camera:N"),
         (["."], 20, "holds no pictures"),
         (["BROKEN"], 30, "cannot be read as a picture"),
         (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml"),
-        (["PICTURES", "-p", "nobody"], 20, "'nobody'"),
     ],
 )
 def test_bad_input_is_one_sentence(
@@ -376,7 +374,6 @@ def test_bad_input_is_one_sentence(
     code: int,
     expected: str,
     pictures: Path,
-    video: Path,
     tmp_path: Path,
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
@@ -384,7 +381,7 @@ def test_bad_input_is_one_sentence(
     monkeypatch.chdir(tmp_path)
     broken = tmp_path_factory.mktemp("broken") / "a.png"
     broken.write_bytes(b"no picture")
-    places = {"PICTURES": str(pictures), "VIDEO": str(video), "BROKEN": str(broken)}
+    places = {"PICTURES": str(pictures), "BROKEN": str(broken)}
     said = run("track", *(places.get(word, word) for word in words))
     assert (said.code, said.stdout) == (code, "")
     assert expected in said.stderr

@@ -25,8 +25,6 @@ from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
-PAL_S = 0.04
-
 Build = Callable[..., Pipeline]
 
 
@@ -159,16 +157,6 @@ def test_each_field_is_measured_at_its_own_time(build: Build, first: str) -> Non
     # Taken as a moment 10 ms off, the target would be 2 mm aside.
     assert (np.median(np.abs(errors), axis=0) < [0.03, 0.03, 0.08]).all()
     assert np.sqrt(np.mean(np.square(errors[6:]), axis=0)).max() < 0.1
-
-
-def test_a_single_woven_picture_gives_the_middle_moment(build: Build) -> None:
-    """In either order, of which one picture knows nothing."""
-    for first in ("top", "bottom"):
-        scene, (frame,) = woven_frames(1, first)
-        _, output = step(PipelineState(), frame, None, build())
-        assert output.fields == "woven"
-        pose = output.poses["joint"]
-        assert np.abs(pose.tvec_m - scene.target_m(frame.t_s)).max() < 1e-4
 
 
 @pytest.mark.parametrize("kind", ["top", "bottom"])

@@ -27,8 +27,6 @@ from perchctl.vision.filter import (
     TILTS,
     VELOCITY,
     VX,
-    VY,
-    VZ,
     YAW,
     YAW_RATE,
     Measurement,
@@ -36,10 +34,8 @@ from perchctl.vision.filter import (
     Y,
     Z,
     make_filter,
-    predict_track,
     start_track,
     step_track,
-    transition,
 )
 from perchctl.vision.pipeline import follow
 from perchctl.vision.target_selection import measurement
@@ -49,18 +45,6 @@ from tests.helpers.seen import seen_from
 CONFIG = KalmanConfig(noise="fixed")
 SETUP = make_filter(CONFIG)
 H = np.eye(8)[MEASURED]
-
-
-def test_state_order_is_the_papers() -> None:
-    assert tuple(range(8)) == (YAW, YAW_RATE, X, VX, Y, VY, Z, VZ)
-    F = np.eye(8)
-    for i in (0, 2, 4, 6):
-        F[i, i + 1] = 0.04
-    assert np.array_equal(transition(0.04), F)  # equation 1
-    expected = np.zeros((4, 8))
-    for row, i in enumerate((0, 2, 4, 6)):
-        expected[row, i] = 1.0
-    assert np.array_equal(H, expected)  # equation 2
 
 
 def test_gains_are_the_papers_units_in_si() -> None:
@@ -163,14 +147,6 @@ def test_a_long_gap_starts_afresh(t_s: float) -> None:
     assert np.allclose(track.x[[YAW, X, Y, Z]], 1.0)
     assert np.array_equal(track.P, SETUP.P0)
     assert step_track(start, None, t_s, SETUP) is None
-
-
-def test_without_the_spread_a_prediction_is_at_the_same_place() -> None:
-    start = MarkerTrack(0.0, np.arange(8) / 10.0, np.eye(8) * 1e-4, 0)
-    setup = make_filter(KalmanConfig(), in_world=True)
-    whole, bare = (predict_track(start, 0.3, setup, spread=each) for each in (True, False))
-    assert np.array_equal(bare.x, whole.x)
-    assert bare.t_s == whole.t_s
 
 
 # --- What the filter claims is what it errs by, and it errs no more than each frame alone ------

@@ -22,7 +22,6 @@ from perchctl.vision import (
 from perchctl.vision.merge import (
     disagree,
     merge_pair,
-    weight_matrix,
 )
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
@@ -50,25 +49,11 @@ def pose(
     )
 
 
-def test_w_is_equation_9() -> None:
-    w = WeightsConfig(x=0.275, y=0.306, z=0.728, yaw=0.469)
-    W = weight_matrix(w)
-    expected = np.array(
-        [
-            [0.275, 0.725, 0, 0, 0, 0, 0, 0],
-            [0, 0, 0.306, 0.694, 0, 0, 0, 0],
-            [0, 0, 0, 0, 0.728, 0.272, 0, 0],
-            [0, 0, 0, 0, 0, 0, 0.469, 0.531],
-        ]
-    )
-    assert np.allclose(W, expected)
-
-
 @given(w=weights, a=vector, b=vector)
 def test_position_is_w_times_the_pair_and_lies_between(w, a, b) -> None:
     merged = merge_pair(a, b, w)
-    pairs = np.array([a[0], b[0], a[1], b[1], a[2], b[2], a[3], b[3]])  # equation 7
-    assert np.allclose(merged[:3], (weight_matrix(w) @ pairs)[:3])
+    of_large = np.array([w.x, w.y, w.z])  # equation 9
+    assert np.allclose(merged[:3], of_large * a[:3] + (1.0 - of_large) * b[:3])
     assert (merged[:3] >= np.minimum(a, b)[:3] - 1e-12).all()
     assert (merged[:3] <= np.maximum(a, b)[:3] + 1e-12).all()
 

@@ -143,27 +143,6 @@ def test_while_unseen_the_target_coasts_in_the_world_and_is_then_given_up(
     assert all(output.target is None for output in outputs[4 + n_max :])
 
 
-def test_without_an_attitude_the_camera_counts_as_level(build: Build) -> None:
-    setup = build(mount=MOUNT, gear_body_m=GEAR)
-    rvec, tvec = pose_of(0.03, 0.02, 0.5, 0.3)
-    state, output = step(PipelineState(), Frame(0, 0.0, render(rvec, tvec)), None, setup)
-    T = MOUNT.T_body_cam
-    expected = T[:3, :3] @ tvec + T[:3, 3] - GEAR
-    assert np.abs(output.target.e_m - expected).max() < 0.001
-    assert output.target.world_m is None
-    assert not state.in_world
-
-
-def test_the_same_frames_give_the_same_bytes(build: Build) -> None:
-    def bytes_of(output: PipelineOutput) -> bytes:
-        return output.target.e_m.tobytes() + output.target.velocity_mps.tobytes()
-
-    first = [bytes_of(o) for o in run(build(), 5)]
-    setup = build()
-    assert [bytes_of(o) for o in run(setup, 5)] == first
-    assert [bytes_of(o) for o in run(setup, 5)] == first  # a used setup holds no memory
-
-
 @pytest.mark.parametrize(
     ("seen", "stage"),
     [(("large",), Stage.LARGE), (("small",), Stage.SMALL), (("large", "small"), Stage.BOTH)],
@@ -249,12 +228,6 @@ def test_a_lost_target_is_remembered_in_the_world(build: Build, frame: str) -> N
     assert target.stage is Stage.NONE
     limit_m = 0.01 if frame == "world" else 0.15  # level: the vehicle's own way while it coasts
     assert np.abs(target.e_m - true_e(attitude)[0]).max() < limit_m
-
-
-def test_nothing_seen_is_no_estimate(build: Build) -> None:
-    setup = build()
-    state, _ = step(PipelineState(), Frame(0, 0.0, EMPTY), None, setup)
-    assert estimate(state, 0.1, fly(0), setup) is None
 
 
 def test_a_stream_without_the_target_is_looked_at_thoroughly_every_nth_frame(build: Build) -> None:

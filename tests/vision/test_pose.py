@@ -185,18 +185,6 @@ def test_attitude_or_the_frame_before_decides_the_tilt() -> None:
     assert levelled.mean() < 0.7 * alone.mean()
 
 
-def test_the_position_is_usable_even_with_the_wrong_tilt() -> None:
-    rng = np.random.default_rng(1)
-    roll, pitch = 0.1, -0.1
-    rvec, tvec = pose_of(0.02, -0.03, 1.1, 0.5, roll, pitch)
-    expected = rotation_from_rpy(roll, pitch, 0.0) @ tvec
-    for _ in range(30):
-        detection = marker("large", rvec, tvec, 0.1, rng, 0.1)
-        pose = posed([detection], Attitude(0.0, roll, pitch, 0.0))
-        assert np.abs(pose.e_m - expected)[:2].max() < 0.002
-        assert abs(pose.e_m[2] - expected[2]) < 0.02
-
-
 @pytest.mark.parametrize("seen", [["large"], ["large", "small"]])
 def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     """Mean squared error in units of the covariance: its degrees of freedom, within 20 %."""

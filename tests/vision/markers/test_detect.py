@@ -14,7 +14,7 @@ from perchctl.vision.markers.detect import (
     detect_markers,
     follow,
 )
-from perchctl.vision.markers.detector import MIRROR_INDEX, Picture, make_aruco_detector
+from perchctl.vision.markers.detector import Picture, make_aruco_detector
 from perchctl.vision.markers.search import misfit
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste
@@ -44,16 +44,6 @@ def test_a_mirrored_picture_is_recognised_and_not_measured(
     assert found.small is None
 
 
-def test_tracks_in_a_window_and_falls_back_within_the_same_frame() -> None:
-    first = detect_markers(frame(render(*pose_of(0.0, 0.0, 0.5))), None, SETUP, CAMERA)
-    near = detect_markers(frame(render(*pose_of(0.01, 0.0, 0.5)), 1), first, SETUP, CAMERA)
-    assert near.large is not None
-    assert near.flow_px_s["large"][:, 0].mean() == pytest.approx(0.01 / 0.5 * 400 * 30, rel=0.05)
-    far = detect_markers(frame(render(*pose_of(-0.25, 0.15, 0.5)), 2), near, SETUP, CAMERA)
-    assert far.large is not None
-    assert far.small is not None
-
-
 def test_a_decoy_of_either_marker_is_dropped() -> None:
     image = render(*pose_of(-0.15, 0.0, 0.5))
     true_large = project(square_corners(0.150), *pose_of(-0.15, 0.0, 0.5), CAMERA)
@@ -62,18 +52,6 @@ def test_a_decoy_of_either_marker_is_dropped() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert np.abs(found.large.corners_px - true_large).max() < 0.2
     assert misfit(found.large.corners_px, found.small.corners_px, SETUP.ratio) < 0.5
-
-
-def test_a_marker_like_its_own_mirror_image_gives_no_hint() -> None:
-    target = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=0, side_m=0.025))
-    usual = make_aruco_detector(DetectorConfig(), TargetConfig())
-    assert [len(d.bytesList) for d in usual.dictionaries] == [1 + MIRROR_INDEX, 1 + MIRROR_INDEX]
-    setup = make_aruco_detector(DetectorConfig(), target)
-    bits = aruco_dictionary("DICT_ARUCO_ORIGINAL")
-    grid = cv2.aruco.Dictionary.getBitsFromByteList(np.ascontiguousarray(bits.bytesList[0:1]), 5)
-    symmetric = any(np.array_equal(np.rot90(grid, k), grid[:, ::-1]) for k in range(4))
-    assert symmetric
-    assert [len(d.bytesList) for d in setup.dictionaries] == [1 + MIRROR_INDEX, 1]
 
 
 def test_one_wrong_cell_of_the_small_marker_is_corrected_and_no_more() -> None:

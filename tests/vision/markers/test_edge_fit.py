@@ -20,7 +20,6 @@ from perchctl.vision.markers.edge_fit import (
 )
 from perchctl.vision.markers.pattern import (
     cells_agree,
-    cells_mostly_agree,
     rim_of_bits,
 )
 from tests.helpers.markers import POSE, SETUP, corners
@@ -141,17 +140,6 @@ def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
     assert abs(np.mean(biases)) < 0.03
 
 
-def test_an_occluded_part_of_a_side_is_left_out() -> None:
-    rvec, tvec = pose_of(*POSES[3])
-    image = render(rvec, tvec)
-    true = true_corners(rvec, tvec, 0.150)
-    spot = (0.7 * true[0] + 0.3 * true[1]).astype(int)
-    image[spot[1] - 5 : spot[1] + 6, spot[0] - 9 : spot[0] + 10] = 220
-    result = refine_lines(image, true[None] + 0.4, [RIMS[6]], CAMERA)[0]
-    assert result.refined
-    assert np.abs(result.corners_px - true).max() < 0.1
-
-
 def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corners() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
     raw = np.array([[200.0, 200.0], [260.0, 205.0], [255.0, 262.0], [198.0, 258.0]])
@@ -186,13 +174,3 @@ def test_every_single_cell_counts() -> None:
             grey = int(image[tuple(np.rint(quad.mean(axis=0)[::-1]).astype(int))])
             cv2.fillConvexPoly(spoilt, np.rint(quad).astype(np.int32), 30 if grey > 120 else 205)
             assert not cells_agree(spoilt, corners("large"), pattern), (row, column)
-
-
-def test_some_covered_cells_are_allowed_for_where_the_place_is_known() -> None:
-    pattern, quad = SETUP.patterns["large"], corners("large")
-    image = render(*POSE)
-    x, y = np.rint(0.92 * quad[1] + 0.08 * quad[3]).astype(int)
-    image[y - 14 : y + 15, x - 14 : x + 15] = 200
-    assert not cells_agree(image, quad, pattern)
-    assert cells_mostly_agree(image, quad, pattern)
-    assert not cells_mostly_agree(image, quad + 30.0, pattern)

@@ -145,15 +145,6 @@ def test_a_cut_marker_is_verified_where_it_is_expected(share: float) -> None:
     assert "large" not in followed(other, near)
 
 
-def test_a_marker_that_leaves_the_picture_is_followed_out_of_it() -> None:
-    poses = [pose_of(-x, 0.03, 0.4, 0.3) for x in np.linspace(0.24, 0.3, 7)]
-    assert beyond(poses[0]) < 0.0 < beyond(poses[-1]) < 0.15
-    before: Detections | None = None
-    for k, pose in enumerate(poses):
-        before = detect_markers(frame(render(*pose, noise=2.0), k), before, SETUP, CAMERA)
-        assert np.abs(before.large.corners_px - corners("large", pose)).max() < 0.3
-
-
 @pytest.mark.parametrize("radius", [0.12, 0.2, 0.3])
 @pytest.mark.parametrize("corner", range(4))
 def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) -> None:

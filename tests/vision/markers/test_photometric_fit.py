@@ -103,11 +103,9 @@ def test_no_light_moves_the_corners(tone: str) -> None:
     ("name", "dictionary", "index"),
     [
         ("large", "DICT_4X4_1000", 16),
-        ("large", "DICT_4X4_1000", 45),
         ("large", "DICT_4X4_1000", 314),
         ("small", "DICT_ARUCO_ORIGINAL", 320),  # its mirror image
         ("small", "DICT_ARUCO_ORIGINAL", 1),
-        ("small", "DICT_ARUCO_ORIGINAL", 21),
     ],
 )
 @pytest.mark.parametrize(("side_px", "blur_px"), [(16.0, 1.0), (24.0, 3.0), (40.0, 4.0)])
@@ -129,7 +127,6 @@ def test_other_markers_are_not_verified(
     [
         np.full((4, 2), np.nan),
         np.full((4, 2), 100.0),
-        np.array([[-200.0, 0.0], [-160.0, 0.0], [-160.0, 40.0], [-200.0, 40.0]]),
         np.array([[630.0, 0.0], [670.0, 0.0], [670.0, 40.0], [630.0, 40.0]]),
     ],
 )
