@@ -96,7 +96,7 @@ MOST_NAMES = {
     "link": 11,
     "record": 12,
     "mission": 26,
-    "perception": 6,
+    "perception": 5,
     "positioning": 10,
     "profile": 33,
     "sim": 13,
