@@ -20,7 +20,7 @@ from perchctl.record.recorder import Recorder
 from perchctl.vision import Frame
 from tests.helpers import log as synthetic
 from tests.helpers.commands import elsewhere, run  # noqa: F401 - a fixture
-from tests.helpers.told import Change, made, written
+from tests.helpers.told import Change, made
 
 VOID = {"meta", "img", "br"}
 LOADS = {"src", "href", "xlink:href", "action", "data", "srcset"}
@@ -159,7 +159,7 @@ def grey(number: int) -> np.ndarray:
 
 
 def test_a_report_shows_the_picture_of_each_decision(tmp_path: Path) -> None:
-    path = written(tmp_path / "flight.jsonl")
+    path = synthetic.write(tmp_path / "flight.jsonl", summary=synthetic.SUMMARY)
     recorder = Recorder.open(
         path.with_suffix(".mcap"), synthetic.header(), Profile(name="sim"), False
     )
@@ -182,7 +182,7 @@ def test_a_report_shows_the_picture_of_each_decision(tmp_path: Path) -> None:
 
 
 def test_a_recording_that_is_none_costs_the_pictures_only(tmp_path: Path) -> None:
-    path = written(tmp_path / "flight.jsonl")
+    path = synthetic.write(tmp_path / "flight.jsonl", summary=synthetic.SUMMARY)
     path.with_suffix(".mcap").write_bytes(b"no recording at all")
     flight = reported_flight(path)
     assert flight.pictures == ()
@@ -196,7 +196,7 @@ def test_a_recording_that_is_none_costs_the_pictures_only(tmp_path: Path) -> Non
 
 @words_only
 def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) -> None:
-    log = written(tmp_path / "deep" / "flight.jsonl")
+    log = synthetic.write(tmp_path / "deep" / "flight.jsonl", summary=synthetic.SUMMARY)
     said = run("log", "report", str(log))
     html = log.with_suffix(".html").read_text(encoding="utf-8")
     assert "deep" not in html  # no folder of the computer is on it
@@ -205,7 +205,7 @@ def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) 
     assert again.code == 30
     assert "already" in again.complaint
     assert run("log", "report", str(log), "-o", "page.pdf").code == 30
-    other = written(tmp_path / "other.jsonl")
+    other = synthetic.write(tmp_path / "other.jsonl", summary=synthetic.SUMMARY)
     said = run("log", "report", str(log), str(other), "-o", "both.html", "--json")
     answer = json.loads(said.stdout)
     assert answer["report"] == "both.html"

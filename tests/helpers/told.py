@@ -1,4 +1,4 @@
-"""Logs for the tests of the report: the made-up flight on the disk, changed where a test asks."""
+"""Logs for the tests of the report: the made-up flight, changed where a test asks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.mission import Event, EventKind, Phase
-from perchctl.record import FlightLog, LogWatcher
+from perchctl.record import FlightLog
 from perchctl.record.exact import to_plain
 from perchctl.record.fields import event_record
 from tests.helpers import log as synthetic
@@ -21,32 +21,14 @@ START_S = 1.1
 """The made-up flight's first tick, on the loop's clock."""
 
 
-def written(
-    path: Path,
-    change: Change = NO_CHANGE,
-    summary: Mapping[str, Any] | None = SUMMARY,
-    events: tuple[Event, ...] = (),
-    **header: Any,
-) -> Path:
-    """The flight of `tests.helpers.log.PLAN` as a file; `change` is given each tick's record."""
-    writer = LogWatcher.open(path, synthetic.header() | header)
-    for record in synthetic.ticks():
-        change(record)
-        writer.write(record)
-    for event in events:
-        writer.event(event)
-    writer.end(summary)
-    assert writer.problem is None
-    return writer.path
-
-
 def made(
     change: Change = NO_CHANGE,
     summary: Mapping[str, Any] | None = SUMMARY,
     events: tuple[Event, ...] = (),
     **header: Any,
 ) -> FlightLog:
-    """As `written` and read back, without a file."""
+    """The flight of `tests.helpers.log.PLAN` as it is read back, without a file; `change` is given
+    each tick's record."""
     records = [record.copy() for record in _flown()]
     for record in records:
         change(record)
