@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from perchctl.commands import app
 from perchctl.commands import check as command
 from perchctl.commands.check import exit_code, report, table
 from perchctl.sim import SimProcess
-from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options
+from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, options
 from tests.helpers.flights import ROOT
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -83,7 +84,7 @@ def test_ctrl_c_ends_with_what_was_found(
         if text.startswith(stage):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
+    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: nullcontext(sim))
     rows = check(options("sim://", "sim:"), CheckScope(**QUICK, tell=tell))
     code = report(rows, as_json=False)
     printed = capsys.readouterr()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.sim import SimProcess
-from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
+from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, options, wait_for
 from tests.helpers.flights import short_profile
 from tests.helpers.relay import Relay
 
@@ -77,7 +78,7 @@ def test_pictures_of_another_size_fail_their_row(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cv2.imwrite(str(tmp_path / "small.png"), np.full((240, 320), 99, np.uint8))
-    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
+    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: nullcontext(sim))
     simulated = options("sim://", f"images:{tmp_path}")
     rows = {row.name: row for row in check(simulated, CheckScope(**QUICK))}
     assert rows["size"].verdict is Verdict.FAIL

@@ -41,14 +41,6 @@ class Rig:
             heights.append(self.world.z_m)
         return heights
 
-    def run_until(self, condition: Any, limit_s: float) -> float:
-        """Seconds until `condition()` holds; fails past the limit."""
-        for i in range(round(limit_s / CONTROL_PERIOD_S)):
-            if condition():
-                return i * CONTROL_PERIOD_S
-            self.firmware.step()
-        raise AssertionError(f"did not happen within {limit_s} s")
-
     @property
     def info(self) -> int:
         return self.firmware.supervisor_info

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -182,10 +180,3 @@ def small_log(path: Path, ticks: int = 5) -> Path:
     writer.end(SUMMARY)
     assert writer.problem is None
     return writer.path
-
-
-def run_python(code: str, path: Path) -> subprocess.CompletedProcess[str]:
-    """Run the code in a process of its own, with the path as its argument."""
-    root = Path(__file__).resolve().parents[2]
-    command = [sys.executable, "-c", code, str(path)]
-    return subprocess.run(command, cwd=root, check=False, capture_output=True, text=True)
