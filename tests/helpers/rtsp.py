@@ -33,7 +33,6 @@ class RtspServer:
 
     path: str = "/live"
     who: tuple[str, str] | None = None
-    status: str = ""
     scripts: queue.Queue[list[Step]] = field(default_factory=queue.Queue)
     plays: int = 0
     asked: list[str] = field(default_factory=list)
@@ -79,9 +78,7 @@ class RtspServer:
         method, url, _ = line.split(" ", 2)
         self.asked.append(f"{method} {headers.get('authorization', '')[:6]}".strip())
         status, more, body = "200 OK", "", ""
-        if self.status:
-            status = self.status
-        elif method == "OPTIONS":
+        if method == "OPTIONS":
             more = "Public: DESCRIBE, SETUP, PLAY, TEARDOWN\r\n"
         elif not self._may(method, headers.get("authorization", "")):
             status = "401 Unauthorized"
