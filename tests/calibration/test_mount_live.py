@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from perchctl.sim import Scenario, SimProcess
 from perchctl.vision import Frame
 from tests.helpers.calibrating import calibrate
 from tests.helpers.mounting import hand, seen
-from tests.helpers.relay import relayed
+from tests.helpers.relay import Relay
 
 RPY_RAD = (0.1, 0.2, 0.5)
 STILL = Scenario(ceiling_z_m=1.4)
@@ -71,7 +72,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(calibrate_mount, "guide", press_after(10))
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
-    with relayed(sim.uri) as relay:
+    with closing(Relay(sim.uri)) as relay:
         words = ["-p", "mine.yaml", "-u", relay.uri, "--source", sim.stream_url, "--part", "carry"]
         said = calibrate("mount", *words)
         assert relay.up

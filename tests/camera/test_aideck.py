@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -24,7 +25,6 @@ from perchctl.sim import Renderer, Scenario
 from tests.helpers.aideck import (
     AiDeck,
     Pause,
-    aideck,
     bayer,
     console,
     header,
@@ -45,7 +45,7 @@ NEVER = threading.Event()
 
 @pytest.fixture
 def deck(opened: list[LiveSource]) -> Iterator[AiDeck]:
-    with aideck() as deck:
+    with closing(AiDeck()) as deck:
         yield deck
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +38,7 @@ def sim() -> Iterator[SimProcess]:
 
 @pytest.fixture
 def relay(sim: SimProcess) -> Iterator[Relay]:
-    from tests.helpers.relay import relayed
+    from tests.helpers.relay import Relay
 
-    with relayed(sim.uri) as wire:
+    with closing(Relay(sim.uri)) as wire:
         yield wire

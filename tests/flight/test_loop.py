@@ -93,7 +93,7 @@ def test_a_recording_that_ends_in_flight_lands() -> None:
 
 def test_a_lost_link_lands() -> None:
     rig = Rig()
-    rig.link._dies_at_s = BAD_S
+    rig.link.dies_at_s = BAD_S
     landed_for(rig, "the script ended the link")
     assert rig.link.said(Land)[0] == pytest.approx(BAD_S, abs=0.05)
 

@@ -21,7 +21,8 @@ from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, touchdown_of
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
-from tests.helpers.loop_rig import PROFILE, Broken, Guarded, Rig, Vehicle, hanging_camera
+from tests.helpers.hangs import hang_in_the_camera
+from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Broken, Guarded, Rig, Vehicle
 from tests.helpers.mission import observation, state_in
 
 HARD = Touchdown(0.9, 3.1)
@@ -129,7 +130,7 @@ def test_the_report_has_it_whether_the_planner_or_the_watchdog_brought_it_down(h
     link = Guarded(striking())
     rig = Rig(link)
     if hung:
-        rig.camera = hanging_camera(link, 12.0)
+        hang_in_the_camera(link, rig.camera, HANG_AT_S, 12.0)
     else:
         rig.operator = lambda: Operator.LAND if link.now_s > 4.0 else Operator.NONE
     report = rig.fly()

@@ -7,8 +7,7 @@ import select
 import socket
 import struct
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -143,12 +142,3 @@ class AiDeck:
                 self.closed.wait(step.length_s)
             else:
                 client.sendall(step)
-
-
-@contextmanager
-def aideck() -> Iterator[AiDeck]:
-    deck = AiDeck()
-    try:
-        yield deck
-    finally:
-        deck.close()

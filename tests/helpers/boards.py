@@ -151,19 +151,13 @@ class BoardRenderer:
         return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
-def render_folder(
-    folder: Path, camera: CameraModel, board: Board, views: int, seed: int, max_tilt_deg: float = 45
-) -> list[Path]:
+def render_folder(folder: Path, camera: CameraModel, board: Board, views: int, seed: int) -> None:
     """A folder of rendered pictures."""
     rng = np.random.default_rng(seed)
     renderer = BoardRenderer(camera, board)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for i, pose in enumerate(draw_poses(rng, camera, board, views, max_tilt_deg)):
-        path = folder / f"board_{i:02d}.png"
-        cv2.imwrite(str(path), renderer.render(pose, rng))
-        paths.append(path)
-    return paths
+    for i, pose in enumerate(draw_poses(rng, camera, board, views)):
+        cv2.imwrite(str(folder / f"board_{i:02d}.png"), renderer.render(pose, rng))
 
 
 def _drawn(board: Board) -> Grey:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from perchctl.profile import Profile, find_profile, load_profile
 from perchctl.sim import SimProcess
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import READY, telemetry
+from tests.helpers.waiting import until
 
 PROFILE = load_profile("sim")
 NOWHERE = "udp://127.0.0.1:9"
@@ -36,8 +36,5 @@ def options(uri: str, source: str = NO_CAMERA, profile: Profile = PROFILE) -> Fl
 def wait_for(sim: SimProcess, seconds: float) -> None:
     """Of simulated time from now. A vehicle that was just replaced has its estimator to settle,
     however long the process has run."""
-    end_s = time.monotonic() + 20.0 + seconds
     until_s = sim.truth()["t_s"] + seconds
-    while sim.truth()["t_s"] < until_s:
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+    until(lambda: sim.truth()["t_s"] >= until_s, 20.0 + seconds)

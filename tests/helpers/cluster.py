@@ -8,16 +8,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from perchctl.campaign import FlightResult
 from perchctl.campaign.flights import fly_seed
 from perchctl.flight import fly_lockstep
-from perchctl.mission import Event, Phase, Tick
+from perchctl.mission import Event, Phase, Watcher
 from perchctl.profile import Profile
 from tests.helpers.flights import ROOT
+from tests.helpers.waiting import until
 
 UP_S = 60.0
 
@@ -28,15 +28,14 @@ def scheduler(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     file = folder / "scheduler.json"
     words = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
     with started(folder, *words, "--dashboard-address", ":0", "--scheduler-file", file) as process:
-        end_s = time.monotonic() + UP_S
-        while True:
-            with contextlib.suppress(OSError, ValueError):
-                address = json.loads(file.read_text())["address"]
-                break
+
+        def address() -> str | None:
             assert process.poll() is None, "the scheduler has ended"
-            assert time.monotonic() < end_s
-            time.sleep(0.02)
-        yield address, process
+            with contextlib.suppress(OSError, ValueError):
+                return str(json.loads(file.read_text())["address"])
+            return None
+
+        yield until(address, UP_S), process
 
 
 @contextlib.contextmanager
@@ -69,12 +68,7 @@ def started(
         process.wait()
 
 
-class _Killer:
-    problem: str | None = None
-
-    def tick(self, tick: Tick) -> None:
-        return None
-
+class _Killer(Watcher):
     def event(self, event: Event) -> None:
         if event.phase is Phase.ASCEND:
             os.kill(os.getpid(), signal.SIGKILL)

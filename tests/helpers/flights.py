@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,13 +30,10 @@ SEED = 3
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight's end, the true height of its last tick, how far aside it ever was, and what each
-    slip from the release cost until it was caught."""
+    """A flight's end, and the true height of its last tick."""
 
     flight: LockstepFlight
     z_m: float
-    farthest_m: float = 0.0
-    slips_m: tuple[float, ...] = ()
 
     @property
     def report(self) -> FlightReport:
@@ -49,13 +45,14 @@ class Flown:
         return [event.phase.value for event in self.report.history if event.phase]
 
 
-class NoLog(LogWatcher):
-    """Takes a log's place, and writes none."""
+class _Heights(LogWatcher):
+    """Takes a log's place, writes none, and keeps how high the vehicle truly was."""
 
     problem: str | None = None
 
     def __init__(self) -> None:
         self.truth: Callable[[], Truth] | None = None
+        self.z_m = 0.0
 
     def watched(self, source: FrameSource) -> FrameSource:
         return source
@@ -64,34 +61,14 @@ class NoLog(LogWatcher):
         return []
 
     def tick(self, tick: Tick) -> None:
-        return None
+        assert self.truth is not None
+        (_, _, self.z_m), _ = self.truth()
 
     def turn(self, turn: Turn) -> None:
         return None
 
     def event(self, event: Event) -> None:
         return None
-
-
-class _Heights(NoLog):
-    """Keeps where the vehicle truly was."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.z_m = self.farthest_m = 0.0
-        self.slips_m: list[float] = []
-        self._hung_m: float | None = None
-
-    def tick(self, tick: Tick) -> None:
-        assert self.truth is not None
-        before_m = self.z_m
-        (x_m, y_m, self.z_m), _ = self.truth()
-        self.farthest_m = max(self.farthest_m, math.hypot(x_m, y_m))
-        if tick.state.phase is Phase.COMPLETE:
-            self._hung_m = max(self._hung_m or 0.0, self.z_m)
-        elif self._hung_m is not None and self.z_m >= before_m:
-            self.slips_m.append(self._hung_m - before_m)
-            self._hung_m = None
 
 
 def short_profile(changes: Mapping[str, Any] | None = None, base: str = SHORT) -> Profile:
@@ -148,4 +125,4 @@ def fly_short(
     flight = fly_lockstep(
         profile, log=heights, scenario=drawn, capture=settings, **ordered(operator_at or {})
     )
-    return Flown(flight, heights.z_m, heights.farthest_m, tuple(heights.slips_m))
+    return Flown(flight, heights.z_m)

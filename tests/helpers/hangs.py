@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 
-from perchctl.link import MockLink
 from perchctl.mission import Observation, PlannerState, step_mission
 from perchctl.vision import Frame
-from tests.helpers.scripted_link import ScriptedLink
 
 
 def plan_by(monkeypatch: pytest.MonkeyPatch, step: Callable[..., Any]) -> None:
@@ -20,22 +18,20 @@ def plan_by(monkeypatch: pytest.MonkeyPatch, step: Callable[..., Any]) -> None:
         monkeypatch.setattr(f"{module}.step_mission", step)
 
 
-def hang_in_the_camera(link: ScriptedLink | MockLink, camera: Any, at_s: float) -> None:
+def hang_in_the_camera(link: Any, camera: Any, at_s: float, for_s: float = 0.4) -> None:
     poll, left = camera.poll, [True]
 
     def hang(now_s: float) -> Frame | None:
         frame = poll(now_s)
         if left and now_s > at_s:
             left.clear()
-            link.advance_to(now_s + 0.4)
+            link.advance_to(now_s + for_s)
         return frame
 
     camera.poll = hang
 
 
-def hang_in_the_planner(
-    link: ScriptedLink | MockLink, monkeypatch: pytest.MonkeyPatch, at_s: float
-) -> None:
+def hang_in_the_planner(link: Any, monkeypatch: pytest.MonkeyPatch, at_s: float) -> None:
     left = [True]
 
     def hang(state: PlannerState, obs: Observation, *more: Any) -> Any:

@@ -38,16 +38,8 @@ def begun(source: S, opened: list[LiveSource] | None = None, **timing: float) ->
 
 
 def next_frame(source: LiveSource) -> Frame:
-    found: list[Frame] = []
-
-    def ready() -> bool:
-        frame = source.poll(0.0)
-        if frame is not None:
-            found.append(frame)
-        return bool(found)
-
-    until(ready)
-    return found[0]
+    frame: Frame = until(lambda: source.poll(0.0))
+    return frame
 
 
 def level(frame: Frame) -> int:
@@ -55,7 +47,7 @@ def level(frame: Frame) -> int:
     return 20 * round(float(frame.image.mean()) / 20.0)
 
 
-def jpeg(level: int, size: tuple[int, int] = (48, 64), **options: int) -> bytes:
+def jpeg(level: int, size: tuple[int, ...] = (48, 64), **options: int) -> bytes:
     rng = np.random.default_rng(level)
     image = np.clip(rng.normal(level, 4.0, size), 0, 255).astype(np.uint8)
     flags = [x for pair in options.items() for x in (getattr(cv2, pair[0]), pair[1])]

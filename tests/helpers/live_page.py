@@ -35,18 +35,10 @@ def tick(
         phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
         ground_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
     )  # fmt: skip
-    values: dict[str, Any] = {
-        "t_s": t_s,
-        "telemetry": replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v),
-        "output": None,
-        "target": seen,
-        "state": state,
-        "command": PositionSetpoint(1.0, 2.0, 0.5, 0.0),
-        "loop_late_s": 0.001,
-        "camera_age_s": 0.05,
-        "telemetry_age_s": 0.012,
-    }
-    return Tick(**(values | changes))
+    sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v)
+    command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)
+    known = Tick(t_s, sample, None, seen, state, command, 0.001, 0.05, 0.012)
+    return replace(known, **changes)
 
 
 def ask(

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -21,7 +18,6 @@ from perchctl.record.header import make_header
 from perchctl.vehicle import (
     Command,
     Idle,
-    Land,
     PositionSetpoint,
     StopMotors,
     Telemetry,
@@ -29,7 +25,6 @@ from perchctl.vehicle import (
 from perchctl.vision import MarkerPose, PipelineOutput, TargetEstimate
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers import mission
-from tests.helpers.mission import note
 
 PERIOD_S = 0.02
 PLAN: tuple[tuple[str, float, str], ...] = (
@@ -52,11 +47,8 @@ def header(**changes: Any) -> dict[str, Any]:
 
 
 def telemetry(t_s: float = 0.0, z_m: float = 0.0) -> Telemetry:
-    return mission.telemetry(
-        t_s, position_m=(0.3, -0.2, z_m), velocity_mps=(0.01, 0.02, 0.03), roll_rad=0.01,
-        pitch_rad=-0.02, yaw_rad=0.5, acc_x_g=0.0, thrust=42000.0, battery_v=3.9 - 0.01 * t_s,
-        supervisor=0x1A,
-    )  # fmt: skip
+    place_m, battery_v = (0.3, -0.2, z_m), 3.9 - 0.01 * t_s
+    return mission.telemetry(t_s, position_m=place_m, yaw_rad=0.5, battery_v=battery_v)
 
 
 def target(
@@ -64,43 +56,36 @@ def target(
 ) -> TargetEstimate:
     decay = math.exp(-t_s / 4.0)
     return mission.target_at(
-        t_s, (0.6, -0.4, 2.2), stage=stage, measured=measured, unseen=0 if measured else 4,
+        t_s,
+        (0.6, -0.4, 2.2),
         measured_s=t_s if measured else t_s - 0.13,
-        e_m=np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)]), e_yaw_rad=2.0 * decay,
-        sigma_m=np.full(3, 0.004), sigma_yaw_rad=0.02, world_yaw_rad=2.5,
-    )  # fmt: skip
+        measured=measured,
+        unseen=0 if measured else 4,
+        stage=stage,
+        e_m=np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)]),
+        e_yaw_rad=2.0 * decay,
+    )
 
 
 def output(index: int, truth: TargetEstimate, rng: np.random.Generator) -> PipelineOutput:
     """Noisy poses of the large marker far away, of the small one near by."""
+    corners_px = np.array([[100.1234, 90.0], [200.0, 90.0], [200.0, 190.0], [100.0, 190.0]])
     poses: dict[str, MarkerPose] = {}
-    detections = Detections(frame_index=index, t_s=truth.t_s)
-    if truth.e_m[2] > 0.12:
-        poses["large"] = _pose("large", truth, 0.01, rng)
-        detections = replace(detections, large=_detection("large"))
-    if truth.e_m[2] < 0.5:
-        poses["small"] = _pose("small", truth, 0.004, rng)
-        detections = replace(detections, small=_detection("small"))
+    found: dict[str, Detection] = {}
+    for marker, is_seen, sigma in (
+        ("large", truth.e_m[2] > 0.12, 0.01),
+        ("small", truth.e_m[2] < 0.5, 0.004),
+    ):
+        if is_seen:
+            e_m = truth.e_m + rng.normal(0.0, sigma, 3)
+            e_yaw_rad = truth.e_yaw_rad + float(rng.normal(0.0, 3.0 * sigma))
+            poses[marker] = MarkerPose(
+                marker, truth.t_s, np.zeros(3), np.zeros(3), e_m, e_yaw_rad, np.full(3, sigma),
+                sigma, 0.4,
+            )  # fmt: skip
+            found[marker] = Detection(marker, corners_px, 0.1, refined=True)
+    detections = Detections(index, truth.t_s, **found)
     return PipelineOutput(detections=detections, poses=poses, target=truth, stage=truth.stage)
-
-
-def _detection(marker: Any) -> Detection:
-    corners = np.array([[100.1234, 90.0], [200.0, 90.0], [200.0, 190.0], [100.0, 190.0]])
-    return Detection(marker=marker, corners_px=corners, sigma_px=0.1, refined=True)
-
-
-def _pose(source: Any, truth: TargetEstimate, sigma: float, rng: np.random.Generator) -> MarkerPose:
-    return MarkerPose(
-        source=source,
-        t_s=truth.t_s,
-        rvec_rad=np.zeros(3),
-        tvec_m=np.zeros(3),
-        e_m=truth.e_m + rng.normal(0.0, sigma, 3),
-        e_yaw_rad=truth.e_yaw_rad + float(rng.normal(0.0, 3.0 * sigma)),
-        sigma_m=np.full(3, sigma),
-        sigma_yaw_rad=sigma,
-        reprojection_px=0.4,
-    )
 
 
 def ticks(seed: int = 7) -> Iterator[dict[str, Any]]:
@@ -153,8 +138,6 @@ def _command(phase: str, z_m: float) -> Command:
             return StopMotors()
         case "PERCHED":
             return Idle()
-        case "LANDING":
-            return Land(-0.05, 2.0)
     return PositionSetpoint(0.6, -0.4, z_m + 0.05, 0.5)
 
 
@@ -193,14 +176,7 @@ def small_log(path: Path, ticks: int = 5) -> Path:
     writer = LogWatcher.open(path, header())
     for i in range(ticks):
         writer.write({"t_s": 0.02 * i, "phase": "SEARCH", "z_m": 0.1 * i})
-        writer.event(note(0.02 * i, f"event {i}"))
+        writer.event(mission.note(0.02 * i, f"event {i}"))
     writer.end(SUMMARY)
     assert writer.problem is None
     return writer.path
-
-
-def run_python(code: str, path: Path) -> subprocess.CompletedProcess[str]:
-    """Run the code in a process of its own, with the path as its argument."""
-    root = Path(__file__).resolve().parents[2]
-    command = [sys.executable, "-c", code, str(path)]
-    return subprocess.run(command, cwd=root, check=False, capture_output=True, text=True)

@@ -13,6 +13,7 @@ import pytest
 from perchctl.flight import FlightParts, fly
 from perchctl.flight.loop import GivesPositions
 from perchctl.flight.watchdog import rescue
+from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.mission import (
     Event,
     FlightReport,
@@ -28,6 +29,7 @@ from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
     Command,
+    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -35,8 +37,8 @@ from perchctl.vehicle import (
     Telemetry,
 )
 from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
+from tests.helpers.hangs import hang_in_the_camera
 from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
-from tests.helpers.scripted_link import ScriptedLink
 
 SIZE_PX = (64, 48)
 CAMERA = CameraModel(
@@ -51,8 +53,8 @@ class Broken(RuntimeError):
     pass
 
 
-class Vehicle(ScriptedLink):
-    """A scripted link that also does as it is told: takes off, lands, stops.
+class Vehicle:
+    """A link to a vehicle that does as it is told: takes off, lands, stops; it records commands.
 
     `changed` alters each sample; None leaves it out. `delay_s` later it has arrived.
     """
@@ -62,7 +64,10 @@ class Vehicle(ScriptedLink):
         changed: Callable[[Telemetry], Telemetry | None] = lambda sample: sample,
         delay_s: float = 0.01,
     ) -> None:
-        super().__init__([])
+        self.now_s, self.dies_at_s = 0.0, math.inf
+        self.sent: list[tuple[float, Command]] = []
+        self.places: list[tuple[float, ExternalPosition]] = []
+        self.closed = False
         self._changed = changed
         self._delay_s = delay_s
         self._samples: list[Telemetry] = []
@@ -84,7 +89,7 @@ class Vehicle(ScriptedLink):
         return arrived
 
     def send(self, command: Command) -> None:
-        super().send(command)
+        self.sent.append((self.now_s, command))
         match command:
             case PositionSetpoint(z_m=height):
                 self._goal_m, self.motors, self.by_itself = height, True, False
@@ -92,6 +97,25 @@ class Vehicle(ScriptedLink):
                 self._goal_m, self.motors, self.by_itself = height, True, True
             case StopMotors():
                 self._stop()
+
+    def connect(self) -> None:
+        return None
+
+    def decks(self) -> tuple[str, ...]:
+        return ("bcFlow2",)
+
+    def problem(self, now_s: float) -> str | None:
+        return "the script ended the link" if now_s >= self.dies_at_s else None
+
+    def external(self, place: ExternalPosition) -> bool:
+        self.places.append((self.now_s, place))
+        return True
+
+    def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
+        self.watchdog, self.told = guard, on_sent
+
+    def close(self) -> None:
+        self.closed = True
 
     def _live(self, dt_s: float) -> None:
         if self._goal_m is not None and self.motors:
@@ -151,7 +175,7 @@ class Guarded(Vehicle):
 
 
 class Clock:
-    def __init__(self, link: ScriptedLink) -> None:
+    def __init__(self, link: Vehicle) -> None:
         self._link = link
 
     def now(self) -> float:
@@ -164,7 +188,7 @@ class Clock:
 class SleepyClock(Clock):
     """A computer that is suspended once, at `at_s`, for `for_s`."""
 
-    def __init__(self, link: ScriptedLink, at_s: float, for_s: float) -> None:
+    def __init__(self, link: Vehicle, at_s: float, for_s: float) -> None:
         super().__init__(link)
         self._at_s, self._for_s = at_s, for_s
         self._slept = False
@@ -210,19 +234,6 @@ class Camera:
 
     def close(self) -> None:
         return None
-
-
-def hanging_camera(link: Vehicle, for_s: float) -> Camera:
-    """One that takes `for_s` for one of its pictures."""
-    hung: list[bool] = []
-
-    def hang(frame: Frame) -> Frame:
-        if not hung and frame.t_arrival_s > HANG_AT_S:
-            hung.append(True)
-            link.advance_to(link.now_s + for_s)
-        return frame
-
-    return Camera(hang)
 
 
 @dataclass
@@ -295,6 +306,7 @@ class Rig:
 def hung_rig(for_s: float) -> tuple[Rig, Guarded]:
     """A loop whose camera hangs at `HANG_AT_S`, and whose operator lands two seconds later."""
     link = Guarded()
-    rig = Rig(link, hanging_camera(link, for_s))
+    rig = Rig(link)
+    hang_in_the_camera(link, rig.camera, HANG_AT_S, for_s)
     rig.operator = lambda: Operator.LAND if link.now_s > HANG_AT_S + 2.0 + for_s else Operator.NONE
     return rig, link

@@ -124,14 +124,10 @@ class Dongle(Crazyradio):  # type: ignore[misc]
     def set_arc(self, arc: int) -> None:
         self.arc = arc
 
-    def set_channel(self, channel: int) -> None:
-        self.current_channel = channel
+    def ignore(self, value: Any) -> None:
+        return None
 
-    def set_address(self, address: Any) -> None:
-        self.current_address = address
-
-    def set_data_rate(self, datarate: int) -> None:
-        self.current_datarate = datarate
+    set_channel = set_address = set_data_rate = ignore
 
     def close(self) -> None:
         self._gone = True

@@ -6,8 +6,7 @@ from __future__ import annotations
 import select
 import socket
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 from perchctl.link import Packet, Port
 
@@ -59,15 +58,6 @@ class Relay:
                         self._far.sendto(datagram, self._vehicle)
                     elif client is not None:
                         self._near.sendto(datagram, client)
-
-
-@contextmanager
-def relayed(uri: str) -> Iterator[Relay]:
-    relay = Relay(uri)
-    try:
-        yield relay
-    finally:
-        relay.close()
 
 
 def _commands(packet: Packet) -> bool:

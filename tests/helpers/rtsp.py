@@ -14,10 +14,9 @@ import threading
 from dataclasses import dataclass, field
 from hashlib import md5
 
-import cv2
-import numpy as np
+from tests.helpers import live
+from tests.helpers.live import WAIT_S
 
-WAIT_S = 10.0
 _NONCE = "5ca1ab1e"
 _SDP = (
     "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nt=0 0\r\n"
@@ -34,7 +33,6 @@ class RtspServer:
 
     path: str = "/live"
     who: tuple[str, str] | None = None
-    status: str = ""
     scripts: queue.Queue[list[Step]] = field(default_factory=queue.Queue)
     plays: int = 0
     asked: list[str] = field(default_factory=list)
@@ -80,9 +78,7 @@ class RtspServer:
         method, url, _ = line.split(" ", 2)
         self.asked.append(f"{method} {headers.get('authorization', '')[:6]}".strip())
         status, more, body = "200 OK", "", ""
-        if self.status:
-            status = self.status
-        elif method == "OPTIONS":
+        if method == "OPTIONS":
             more = "Public: DESCRIBE, SETUP, PLAY, TEARDOWN\r\n"
         elif not self._may(method, headers.get("authorization", "")):
             status = "401 Unauthorized"
@@ -142,9 +138,7 @@ def _request(lines: object) -> tuple[str, dict[str, str]] | None:
 
 def packets(t_s: float, level: int, number: int) -> list[bytes]:
     """A picture of that grey level in RTP, each packet behind the header of the connection."""
-    rng = np.random.default_rng(level)
-    image = np.clip(rng.normal(level, 3.0, (48, 64, 1)), 0, 255).repeat(3, axis=2)
-    jpeg = cv2.imencode(".jpg", image.astype(np.uint8))[1].tobytes()
+    jpeg = live.jpeg(level, (48, 64, 3))
     tables = b"".join(jpeg[m + 5 : m + 69] for m in _segments(jpeg, 0xDB))
     (scan,) = _segments(jpeg, 0xDA)
     data = jpeg[scan + 2 + int.from_bytes(jpeg[scan + 2 : scan + 4], "big") : -2]

@@ -10,9 +10,9 @@ import numpy as np
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z
 from perchctl.vision import MARKERS, project, square_corners
 from perchctl.vision.types import Detection, Detections
+from tests.helpers.markers import SIDES_M
 from tests.helpers.target_picture import CAMERA
 
-SIDES_M = {"large": 0.150, "small": 0.025}
 LEAST_SIDE_PX = 12.0
 
 

@@ -27,8 +27,8 @@ def made(
     events: tuple[Event, ...] = (),
     **header: Any,
 ) -> FlightLog:
-    """The flight of `tests.helpers.log.PLAN` as read back, without a file; `change` is given each
-    tick's record."""
+    """The flight of `tests.helpers.log.PLAN` as it is read back, without a file; `change` is given
+    each tick's record."""
     records = [record.copy() for record in _flown()]
     for record in records:
         change(record)

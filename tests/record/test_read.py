@@ -12,7 +12,8 @@ import pytest
 from perchctl import __version__
 from perchctl.errors import InvalidValue
 from perchctl.record import read_log
-from tests.helpers.log import run_python, small_log
+from tests.helpers.commands import run_apart
+from tests.helpers.log import small_log
 
 
 def test_any_cut_of_the_file_is_readable_behind_its_header(tmp_path: Path) -> None:
@@ -51,7 +52,7 @@ def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
         "    while n == 150 and Path(sys.argv[1]).read_bytes().count(b'\\n') < 152: pass\n"
         "    if n == 150: os.kill(os.getpid(), 9)\n"
     )
-    assert run_python(code, path).returncode == -signal.SIGKILL
+    assert run_apart(str(path), before=code).code == -signal.SIGKILL
     log = read_log(path)
     assert len(log.records) == 151
     assert log.truncated

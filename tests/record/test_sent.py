@@ -15,9 +15,8 @@ from perchctl.perception import History
 from perchctl.record import LogWatcher, read_log
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers import log as synthetic
-from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, hung_rig
+from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Clock, Vehicle, hung_rig
 from tests.helpers.mission import telemetry
-from tests.helpers.scripted_link import ScriptedLink
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
 TOLD = (
@@ -76,7 +75,7 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
 
 
 def test_a_rescue_s_orders_are_told() -> None:
-    link, told = ScriptedLink([]), []
+    link, told = Vehicle(), []
     flown = History((telemetry(0.0, 1.0),))
     rescue(link, Clock(link), PROFILE, lambda: Operator.NONE, None, flown, told=told.append)
     assert told
