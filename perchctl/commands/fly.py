@@ -122,7 +122,7 @@ def fly(
         return 0
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
-    options.require_comparison()
+    options.require_lift_check()
     asks = not (yes or options.simulated)
     if asks and not sys.stdin.isatty():
         raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")

@@ -51,9 +51,9 @@ class FlyOptions:
         """True if the URI is that of the simulated vehicle."""
         return self.uri.startswith("sim://")
 
-    def require_comparison(self) -> None:
+    def require_lift_check(self) -> None:
         """As the function of this name, for this flight."""
-        require_comparison(self.profile.positioning, self.uri, simulated=self.simulated)
+        require_lift_check(self.profile.positioning, self.uri, simulated=self.simulated)
 
 
 def check_options(options: FlyOptions) -> None:
@@ -95,7 +95,7 @@ def fly_session(
     at its frames. `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera
     have answered; what it raises ends the session on the ground.
     """
-    options.require_comparison()
+    options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()
     camera = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, camera)
@@ -169,7 +169,7 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
 # --- External positions for one flight in real time: capture, feed, and the thread between ---
 
 
-def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
+def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
     """Raises SafetyAbort unless somebody has lately compared this vehicle with the motion capture
     by hand (`perchctl check --lift`): swapped axes do not show at rest. The simulator's room is
     right."""

@@ -107,7 +107,7 @@ class MockLink:
                 if block_due_s <= due_s + 1e-9:
                     self._send_down(name)
                     self._due_s[name] = block_due_s + self._periods_s[name]
-            self._ask_guard()
+            self._run_guard()
             if self._call_due_s <= due_s + 1e-9:
                 self._call_due_s += self._call_period_s
                 self._call(self.now_s)
@@ -136,7 +136,7 @@ class MockLink:
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
 
-    def _ask_guard(self) -> None:
+    def _run_guard(self) -> None:
         if self._guard is None or self.now_s < self._watched_s + WATCH_PERIOD_S - 1e-9:
             return
         self._watched_s = self.now_s

@@ -244,7 +244,7 @@ class Sender:
                 self._ready.wait_for(lambda: not self._running, GUARD_PERIOD_S)
                 if not self._running:
                     return
-            for part in (self._look_after_worker, self._ask_guard):
+            for part in (self._look_after_worker, self._run_guard):
                 try:
                     part()
                 except BaseException as error:  # this thread goes on, whatever it is
@@ -263,7 +263,7 @@ class Sender:
                 if self._running and hangs and self._called_s == called_s:
                     self._start_worker()
 
-    def _ask_guard(self) -> None:
+    def _run_guard(self) -> None:
         if self.stuck_s() > GUARD_PERIOD_S:
             return
         command = self._guard()

@@ -87,8 +87,8 @@ def contact_error(c: Context) -> ContactError:
 
 
 def touched_error(c: Context) -> ContactError | None:
-    """The `contact_error` of the moment in which the gear touched something at the target's
-    height; None after it left, and where a sight of now or a motion capture gives the place."""
+    """In RECOVER the `contact_error` that was kept from the touch, if any; None with a fresh sight,
+    or once motion capture shows the vehicle away from there."""
     state = c.state
     if state.phase is not Phase.RECOVER or state.contact is None or c.fresh:
         return None

@@ -307,7 +307,7 @@ def _search(c: Context) -> Acted:
 def _not_far(
     mount: MountWatch, start: tuple[float, float], goal: tuple[float, float]
 ) -> tuple[float, float]:
-    """The goal, or as far towards it from the last sight as a wrong mounting may lead."""
+    """The goal, world x and y (m), cut to `WARY_M` from the last sight, else from `start`."""
     if mount.sights:
         start = (mount.sights[-1].vehicle.real, mount.sights[-1].vehicle.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]

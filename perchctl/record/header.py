@@ -103,7 +103,7 @@ def arithmetic_fingerprint() -> str:
     single-threaded results are the same to the bit: they stand for the kernels that may be chosen,
     and for the results of some small calculations."""
     bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
-    for part in (_of_libm(), *_of_numpy(), *_of_opencv()):
+    for part in (_libm_probe(), *_numpy_probes(), *_opencv_probes()):
         bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)
     return f"{bits:08x}"
 
@@ -117,13 +117,13 @@ def _grid() -> Any:
     return np.arange(1, 257) * (math.pi / 97.0)
 
 
-def _of_libm() -> Any:
+def _libm_probe() -> Any:
     functions = (math.sin, math.cos, math.atan, math.exp, math.log, math.sqrt)
     values = [f(x) for x in _grid().tolist() for f in functions]
     return np.array(values + [math.hypot(x, 1.0 / x, 0.3) for x in _grid().tolist()])
 
 
-def _of_numpy() -> list[Any]:
+def _numpy_probes() -> list[Any]:
     x = _grid()
     found = [np.sin(x), np.cos(x), np.exp(-x), np.arctan2(x, 2.0), x.sum(), np.dot(x, x)]
     for n in _SIDES:
@@ -134,7 +134,7 @@ def _of_numpy() -> list[Any]:
     return found
 
 
-def _of_opencv() -> list[Any]:
+def _opencv_probes() -> list[Any]:
     y, x = np.mgrid[0:64, 0:96]
     image = np.asarray(128 + 90 * np.sign((x - 40) * (y - 30)) + (7 * x + 13 * y) % 29, np.uint8)
     corners = np.array([[[40.3, 30.4]]], np.float32)

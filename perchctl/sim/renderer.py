@@ -162,7 +162,7 @@ class Renderer:
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
         """Return what falls onto the sensor in one shot, before noise."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
-        motion_px = self._motion_px(rows[len(rows) // 2])
+        motion_px = self._paths_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         if length_px < STILL_PX and len(rows) == 1:
@@ -247,7 +247,7 @@ class Renderer:
 
     # -- motion -------------------------------------------------------------
 
-    def _motion_px(self, poses: Array) -> Array:
+    def _paths_px(self, poses: Array) -> Array:
         """Return the ceiling's path in the image during the exposure at five places, (5, n, 2) px,
         of poses (n, 4, 4)."""
         if len(poses) == 1:

@@ -287,13 +287,13 @@ class Experiment:
                 f"position {number} of {positions}: place the camera so that both markers are "
                 f"whole in the picture, at another height, place and heading"
             )
-            fault = self._take(number, frames)
+            fault = self._try_position(number, frames)
             if fault is None:
                 self.say(f"position {number} is kept in {self.session.path}")
             else:
                 self.say(f"position {number} is refused, take it again: {fault}")
 
-    def _take(self, number: int, frames: int) -> str | None:
+    def _try_position(self, number: int, frames: int) -> str | None:
         """Take one position into the file; return a sentence if it must be taken again."""
         try:
             actual, attitude = self.truth.actual(self._answer)

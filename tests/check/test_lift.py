@@ -20,7 +20,7 @@ from perchctl.check import CheckScope, Row, Verdict, check
 from perchctl.check.capture import COMPARED, HOW_TO_TURN
 from perchctl.check.vehicle import LIFTED
 from perchctl.errors import SafetyAbort
-from perchctl.flight.session import require_comparison
+from perchctl.flight.session import require_lift_check
 from perchctl.profile import Profile
 from perchctl.sim import CaptureFault, CaptureSettings, SimProcess, draw_scenario
 from tests.helpers.capture import SWAPPED_XY, Y_UP
@@ -93,7 +93,7 @@ class Lab:
 
     def may_fly(self) -> None:
         """Raises SafetyAbort."""
-        require_comparison(self.profile.positioning, self.sim.uri, simulated=False)
+        require_lift_check(self.profile.positioning, self.sim.uri, simulated=False)
 
 
 def lab(sim: SimProcess, **changes: Any) -> Lab:

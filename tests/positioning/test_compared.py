@@ -46,7 +46,7 @@ def ago(seconds: float, passes: bool = True, found: str = "fine") -> Comparison:
 
 def require(config: PositioningConfig = CONFIG, uri: str = URI) -> None:
     """What a flight asks first."""
-    session.require_comparison(config, uri, simulated=False)
+    session.require_lift_check(config, uri, simulated=False)
 
 
 # --- The judgement -----------------------------------------------------------------------

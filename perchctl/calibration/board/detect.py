@@ -214,7 +214,7 @@ def fit_saddles(
     uv = np.stack(np.meshgrid(t, t), axis=-1).reshape(1, -1, 2) * reach[:, None, None]
     offsets = np.einsum("nij,nmj->nmi", axes_px, uv)
     grey, inside = _sample(image, start[:, None] + offsets)
-    weight = inside * _unprinted(uv, grey, white, size_px)
+    weight = inside * _is_blank(uv, grey, white, size_px)
     # Lines: along u and along v, by their normals. State: x, y, angle 1, 2, ln w1, ln w2.
     state = np.zeros((len(start), 6))
     state[:, 2:4] = np.arctan2(axes_px[:, 0], -axes_px[:, 1])
@@ -251,7 +251,7 @@ def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.
     return np.asarray(grey, dtype=np.float64), inside
 
 
-def _unprinted(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
+def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
     """Return 0 in what is printed in the white squares, and in its blur, else 1, (n, m)."""
     if white >= REACH:
         return np.ones(grey.shape)

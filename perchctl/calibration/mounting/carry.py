@@ -360,8 +360,8 @@ class Rows:
         return replace(self, misfit=misfit, counted=_weights(_distance2(misfit, self.inverse)))
 
     def covariance(self) -> Array:
-        """Return the covariance (p, p) at the minimum, also where the errors of neighbouring
-        pictures go together."""
+        """Return the parameters' covariance (p, p), by a jackknife of blocks: the errors of
+        neighbouring pictures may correlate."""
         blocks = [
             self.normal_equations(k) for k in np.array_split(np.arange(len(self.misfit)), BLOCKS)
         ]

@@ -419,7 +419,7 @@ class Rendered:
         """Each sheet at the nodes (n * n,), and its changes (9, n * n) with the eight terms of a
         homography's increment and with the blur's square."""
         sharp = sheets(self.drawing, self.grid.n)
-        return tuple(_blurred(each, self.sigma, self.grid.axis) for each in sharp)
+        return tuple(_blurred_with_slope(each, self.sigma, self.grid.axis) for each in sharp)
 
     @cached_property
     def light(self) -> tuple[Array, Array]:
@@ -454,7 +454,9 @@ def rendered(drawing: Drawing, n: int, step: int) -> Rendered:
     return Rendered(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 
-def _blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> tuple[Array, Array]:
+def _blurred_with_slope(
+    sharp: NDArray[np.float32], sigma: float, axis: Array
+) -> tuple[Array, Array]:
     """Return a sheet blurred by sigma nodes, and its changes."""
     soft = softened(sharp, sigma)
     step = float(axis[1] - axis[0])
