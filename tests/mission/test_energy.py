@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.battery import (
     charge_at,
-    fit_battery,
     left_s,
     outlook,
     read_battery,
@@ -94,12 +93,6 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
             assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
         if ahead_s > 70.0:  # and one that is safe three times over is
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
-
-
-@pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
-def test_the_sag_is_found_within_seconds(ohm: float) -> None:
-    *_, last = hovering(4.1, {"ohm": ohm}, 5.0)
-    assert fit_battery(last.energy)[0] == pytest.approx(4.4 * ohm, rel=0.05)
 
 
 def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
