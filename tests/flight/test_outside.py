@@ -23,10 +23,9 @@ from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition, PositionSetpoint
 from tests.helpers.capture import TURNS, named_up
-from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
+from tests.helpers.loop_rig import Rig, Vehicle
 from tests.helpers.mission import MOCAP, READY, changed, telemetry
 
-WITH_OWN_DECK = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
 REST = telemetry(1.0, 0.02, thrust=0.0, supervisor=READY)
 HIDDEN = "motion capture vicon:lab does not see the rigid body 'cf2'"
 
@@ -97,21 +96,6 @@ def test_another_axis_up_is_named_by_the_attitude(
 ])  # fmt: skip
 def test_the_estimate_has_to_agree(place: ExternalPosition, agrees: bool) -> None:
     assert (apart(place, REST) is None) is agrees
-
-
-@pytest.mark.parametrize(("decks", "profile", "words"), [
-    (("labUwb",), WITH_OWN_DECK, None),
-    (("bcLedRing",), WITH_OWN_DECK, "if bcLedRing measures it, name"),
-    (("bcLedRing", "bcLighthouse4"), PROFILE, None),
-    ((), MOCAP, None),
-    ((), PROFILE, "no positioning deck"),
-])  # fmt: skip
-def test_something_tells_the_vehicle_where_it_is(
-    decks: tuple[str, ...], profile: Profile, words: str | None
-) -> None:
-    problem = GroundCriteria.unmeasured(decks, profile)
-    assert (problem is None) is (words is None)
-    assert problem is None or (words is not None and words in problem.sentence)
 
 
 # --- The loop -------------------------------------------------------------------------------

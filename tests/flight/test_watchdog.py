@@ -233,32 +233,17 @@ def test_the_operators_stop_cuts_while_the_loop_is_silent() -> None:
     assert rig.after(0.15) == EmergencyStop()
 
 
-def release_in_vain(rig: Rig, from_s: float, to_s: float, **changes: object) -> list[Command]:
-    """What is sent while it stays where it is, and its thrust follows the orders."""
+def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
+    """A loop that fell silent as it peeled off in vain, and hangs for ever, would else leave it
+    there with turning motors. It stays where it is, and its thrust follows the orders."""
+    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
+    rig = Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
     sent: list[Command] = []
     thrust = 20000.0
-    for i in range(round((to_s - from_s) / 0.02)):
-        command = rig.after(from_s + 0.02 * i, **({"thrust": thrust} | changes))
-        match command:
-            case RawThrust(raw):
-                thrust = float(raw)
-            case StopMotors():
-                thrust = 0.0
-        if command is not None:
-            sent.append(command)
-    return sent
-
-
-def in_vain() -> Rig:
-    """A loop that fell silent as it peeled off in vain: what hangs is let go, monitored."""
-    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    return Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
-
-
-def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
-    """A loop that hangs for ever would else leave it there with turning motors."""
-    rig = in_vain()
-    sent = release_in_vain(rig, 1.1, 9.0)
+    for i in range(395):
+        command = rig.after(1.1 + 0.02 * i, thrust=thrust)
+        thrust = float(getattr(command, "thrust", 0.0 if command == StopMotors() else thrust))
+        sent += [command] if command is not None else []
     raw = [c.thrust for c in sent if isinstance(c, RawThrust)]
     assert raw == sorted(raw, reverse=True)
     assert raw[-1] == STILL_THRUST

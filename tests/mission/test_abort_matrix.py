@@ -288,13 +288,6 @@ def test_no_motor_stops_without_fresh_proof(
     assert not any(isinstance(c, StopMotors | EmergencyStop) for c in flight.commands)
 
 
-def test_a_landing_at_the_ceiling_peels_off_first() -> None:
-    """The setpoint goes below, and the thrust with it, before anything is concluded."""
-    flight = fly(hanging(Phase.LANDING, released_s=None), at(HANG_Z_M), 1.18)
-    assert all(is_setpoint(c, below_m=HANG_Z_M + 1e-9) for c in flight.commands)
-    assert is_setpoint(flight.command, below_m=HANG_Z_M - 0.2)
-
-
 @pytest.mark.parametrize(
     ("released_s", "falls", "ticks", "above_m"),
     [

@@ -8,7 +8,6 @@ import pytest
 
 from perchctl.mission import Findings
 from perchctl.profile import CameraConfig
-from perchctl.record import FlightSummary
 from perchctl.vision import Consistency
 
 
@@ -48,12 +47,3 @@ def test_only_what_is_surely_beyond_its_gate_is_an_advice(
     assert found.latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)
     assert bool(found.advice) is bool(words)
     assert words in "".join(found.advice)
-
-
-def test_the_summary_tells_them_with_intervals() -> None:
-    found = Findings.of(_seen(0.032, turn_deg=(0.2, -0.1, 0.4)), CAMERA)
-    lines = FlightSummary("perched", "hanging", findings=found).text().splitlines()
-    assert "latency:   92 +- 6 ms" in lines
-    assert "mounting:  turned by 0.2 +- 0.8, -0.1 +- 0.8, 0.4 +- 0.8 deg (x, y, z)" in lines
-    assert f"advice:    {found.advice[0]}" in lines
-    assert max(map(len, lines)) <= 80

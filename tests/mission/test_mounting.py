@@ -98,12 +98,6 @@ def test_a_landing_for_the_mounting_stops_at_once() -> None:
     assert math.hypot(flight.command.x_m, flight.command.y_m) < 0.02
 
 
-def test_a_target_that_stands_still_ends_the_watch() -> None:
-    watch, _ = flown(turned(0.0))
-    assert watch.fits
-    assert update_watch(watch, Sight(9.0, 0j, 5.0 + 0j)) is watch
-
-
 @given(st.floats(0.3, 2.0), st.floats(0.0, 2 * math.pi), st.sampled_from([0, 2, 5]))
 def test_a_target_that_is_moved_is_no_turned_mounting(
     at_s: float, way_rad: float, frames: int

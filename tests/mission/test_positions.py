@@ -73,17 +73,6 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
         assert isinstance(tick.command, PositionSetpoint)
 
 
-@pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
-def test_a_lasting_occlusion_lands_and_says_why(phase: Phase) -> None:
-    def look(t_s: float) -> Observation:
-        return observation(t_s, new_frame=False, **hidden(t_s - BEGIN_S))
-
-    flight = fly(state_in(phase), look, 2.0, MOCAP, one_phase=True)
-    assert (flight.state.phase, flight.state.row, flight.state.outcome) == LOST
-    assert HIDDEN in flight.state.reason
-    assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(LAND_S, abs=0.03)
-
-
 @pytest.mark.parametrize("lost_s", [0.0, 0.06])
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
