@@ -133,14 +133,6 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     assert "gave no picture in 5 attempts: the stream ended" in str(source.problem(100.0))
 
 
-def test_closing_waits_no_longer_than_a_read(server: MjpegServer) -> None:
-    server.scripts.put([part(jpeg(60)), threading.Event()])
-    source = begun(MjpegSource(server.url, 0.0, Clock()))
-    next_frame(source)
-    source.close()
-    assert not source._thread.is_alive()
-
-
 def test_no_first_frame_in_time(server: MjpegServer) -> None:
     quiet = threading.Event()
     server.scripts.put([b"--frame\r\n", quiet])

@@ -1,13 +1,11 @@
-"""The simulated motion capture: what its cameras see, when it arrives, what can go wrong, and its
-server, read by the library that reads a lab's."""
+"""The simulated motion capture: what its cameras see, when it arrives, and what can go wrong.
+tests/flight/test_positions.py reads its server with the library that reads a lab's."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
 import statistics
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,12 +13,10 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.positioning import BodyPose, CaptureFrame, Placed, open_capture
+from perchctl.positioning import CaptureFrame, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
+from perchctl.sim import CaptureFault, CaptureSettings
 from perchctl.sim.capture import SimCapture
-from tests.helpers.capture import Y_UP
-from tests.helpers.waiting import until
 
 STEP_S = 0.002
 EXACT = CaptureSettings(position_noise_m=0.0, attitude_noise_rad=0.0, jitter_s=0.0)
@@ -48,11 +44,6 @@ def watched(
         capture.advance(room)
         frames += capture.take()
     return frames
-
-
-def during(since_s: float, to_s: float, **fault: Any) -> CaptureSettings:
-    """Settings with something wrong for a time."""
-    return replace(EXACT, faults=((since_s, to_s, CaptureFault(**fault)),))
 
 
 def test_frames_come_at_the_cameras_rate_and_late() -> None:
@@ -90,27 +81,22 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "fault", "at_m"),
-    [
-        ({}, {}, AT),
-        ({"heading_rad": math.pi / 2, "origin_m": (1.0, 0.0, 0.0)}, {}, (1.2, 0.3, 0.5)),
-        ({}, {"axes": Y_UP}, (0.3, 0.5, 0.2)),
-        ({}, {"scale": 1000.0}, (300.0, -200.0, 500.0)),
-        ({}, {"mirrored": True}, (0.3, 0.2, 0.5)),
-        ({}, {"swapped": True}, (1.2, -0.9, 0.05)),
-    ],
+    ("fault", "at_m"),
+    [({}, (1.2, 0.3, 0.5)), ({"mirrored": True}, (1.2, -0.3, 0.5))],
 )
 def test_a_body_is_where_the_capture_s_world_and_the_fault_put_it(
-    settings: dict[str, Any], fault: dict[str, Any], at_m: tuple[float, ...]
+    fault: dict[str, Any], at_m: tuple[float, ...]
 ) -> None:
-    wrong = replace(during(0.0, math.inf, **fault), **settings)
+    faults = ((0.0, math.inf, CaptureFault(**fault)),)
+    wrong = replace(EXACT, heading_rad=math.pi / 2, origin_m=(1.0, 0.0, 0.0), faults=faults)
     frames = watched(SimCapture(wrong), 0.5, Room())
     assert frames[-1].bodies["crazyflie"].position_m == pytest.approx(at_m)
 
 
 def test_an_occluded_body_is_missing_for_its_time_only() -> None:
     """All other frames are as without the fault."""
-    noisy = replace(during(0.5, 0.8, occluded=True), position_noise_m=0.001)
+    fault = (0.5, 0.8, CaptureFault(occluded=True))
+    noisy = replace(EXACT, position_noise_m=0.001, faults=(fault,))
     frames, free = (
         watched(SimCapture(each), 1.0, Room()) for each in (noisy, replace(noisy, faults=()))
     )
@@ -129,48 +115,3 @@ def test_frozen_bodies_stay_to_the_last_digit_until_they_are_healed() -> None:
     assert len({frame.bodies["crazyflie"].position_m for frame in frozen}) == 1
     capture.heal()
     assert watched(capture, 0.3, room)[-1].bodies["crazyflie"].position_m[0] > 0.9
-
-
-def test_frames_that_are_gone_or_late_leave_a_gap_and_never_overtake() -> None:
-    gone, late = (
-        [frame.t_s for frame in watched(SimCapture(during(0.5, 1.0, **fault)), 1.5, Room())]
-        for fault in ({"gone": True}, {"late_s": 0.1})
-    )
-    assert not [t_s for t_s in gone if 0.515 < t_s < 1.0]
-    assert late == sorted(late)
-    assert not [t_s for t_s in late if 0.52 < t_s < 0.6]
-
-
-# --- The server -----------------------------------------------------------------------------------
-
-
-CONFIG = PositioningConfig(by="mocap", body="crazyflie", connect_timeout_s=10.0)
-
-
-def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:
-    pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
-    scenario, here_m = Scenario(extra={"external_position": 1.0}), (0.2, 0.1, 0.6)
-    with SimProcess.start(scenario, "realtime", capture=CaptureSettings()) as sim:
-        assert sim.capture is not None
-        system, host = sim.capture
-        config = CONFIG.model_copy(update={"system": system, "host": host})
-        with contextlib.closing(open_capture(config)) as capture:
-
-            def bodies() -> dict[str, BodyPose]:
-                frame = capture.poll(time.monotonic())
-                return {} if frame is None else frame.bodies
-
-            def seen_at(name: str, place_m: tuple[float, float, float]) -> BodyPose | None:
-                pose = bodies().get(name)
-                near = pose is not None and math.dist(pose.position_m, place_m) < 0.01
-                return pose if near else None
-
-            sim.set_pose(here_m, (0.0, 0.0, 1.0), hold=True)
-            pose = until(lambda: seen_at("crazyflie", here_m))
-            turned = (math.cos(0.5), 0.0, 0.0, math.sin(0.5))
-            assert pose.quaternion == pytest.approx(turned, abs=0.02)
-            until(lambda: seen_at("wand", (1.2, -0.9, 0.05)))
-            sim.lay(CaptureFault(occluded=True))
-            until(lambda: set(bodies()) == {"wand"})
-            sim.heal()
-            until(lambda: set(bodies()) == {"crazyflie", "wand"})

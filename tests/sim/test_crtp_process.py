@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,26 +29,17 @@ def alive(pid: int) -> bool:
     return stat.rsplit(")", 1)[1].split()[0] != "Z"
 
 
-@pytest.fixture(scope="module")
-def stepped() -> Iterator[SimProcess]:
-    """A process for the tests that leave it running."""
+def test_stepped_time_passes_only_by_advance_and_no_ctrl_c_reaches_the_vehicle() -> None:
+    """Neither SIGINT itself nor one to the terminal's process group ends it."""
     with SimProcess.start(pace="stepped") as sim:
-        assert sim.truth()["t_s"] == 0.0
-        yield sim
-
-
-# --- Handle -----------------------------------------------------------------------
-
-
-def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
-    assert stepped.uri.startswith("udp://127.0.0.1:")
-    assert stepped.stream_url == ""
-    start_s = stepped.truth()["t_s"]
-    assert stepped.truth()["t_s"] == start_s
-    assert stepped.advance(0.5) == pytest.approx(start_s + 0.5)
-    assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
-    with pytest.raises(InvalidValue, match="no_such_request"):
-        stepped.no_such_request()
+        assert sim.stream_url == ""
+        assert os.getsid(sim.pid) != os.getsid(0)
+        os.kill(sim.pid, signal.SIGINT)
+        assert sim.truth()["t_s"] == sim.truth()["t_s"] == 0.0
+        assert sim.advance(0.5) == sim.truth()["t_s"] == pytest.approx(0.5)
+        assert alive(sim.pid)
+        with pytest.raises(InvalidValue, match="no_such_request"):
+            sim.no_such_request()
 
 
 def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
@@ -72,9 +62,6 @@ def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
         SimProcess.start(pace="stepped")
 
 
-# --- Video ---------------------------------------------------------------------------
-
-
 def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> None:
     path = data_file("calib", "example_640x480")
     assert path is not None
@@ -91,9 +78,6 @@ def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> No
         sim.advance(0.3)
         first, again = (pictures_of(sim.stream_url, 1)[0] for _ in range(2))
         assert np.array_equal(first, again)
-
-
-# --- Parent and terminal -----------------------------------------------------------
 
 
 _PARENT = """
@@ -116,12 +100,3 @@ def test_it_ends_when_its_parent_is_killed() -> None:
         assert all(map(alive, pids))
         parent.kill()
     until(lambda: not any(map(alive, pids)))
-
-
-def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:
-    """Neither SIGINT itself nor one to the terminal's process group ends it."""
-    assert os.getsid(stepped.pid) != os.getsid(0)
-    os.kill(stepped.pid, signal.SIGINT)
-    before_s = stepped.truth()["t_s"]
-    assert stepped.advance(0.1) == pytest.approx(before_s + 0.1)
-    assert alive(stepped.pid)

@@ -3,47 +3,32 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
+from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.sim.firmware import Firmware
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.vehicle import CRASHED
 from tests.helpers.firmware_rig import PERFECT, Rig, at_height, make_rig, raw_thrust
 
 HERE = at_height(0.8)
-FULL_RAW = raw_thrust(60000)
-
-
-def flying(**conditions: float) -> Rig:
-    """Holding 0.8 m on low-level position setpoints."""
-    rig = make_rig(**conditions)
-    rig.take_off()
-    rig.hold()
-    return rig
-
-
-def test_a_landing_of_a_landing_and_a_take_off_in_flight_are_refused() -> None:
-    rig = make_rig()
-    rig.take_off()
-    planner, t_s = rig.firmware.planner, rig.firmware.t_s
-    assert not planner.take_off(1.0, 1.0, None, t_s)
-    assert [planner.land(0.0, duration_s, None, t_s) for duration_s in (3.0, 1.0)] == [True, False]
 
 
 @pytest.mark.parametrize(("roll_rad", "after_s"), [(1.2, 1.0), (2.5, 0.1)])
 def test_tumble_rule(roll_rad: float, after_s: float) -> None:
     """Row "acc.z < 0.5 g for 1 s or < -0.2 g for 0.1 s"."""
-    rig = flying()
+    rig = make_rig()
+    rig.take_off()
+    rig.hold()
     rig.world.set_pose((0.0, 0.0, 0.8), (roll_rad, 0.0, 0.0), hold=True)
     seen_s = 0.0
     while not rig.info & CRASHED and seen_s < 2.0:
         rig.run(0.02, HERE)
         seen_s += 0.02
     assert seen_s == pytest.approx(after_s + 0.05, abs=0.07)
-
-
-# --- Log variables and parameters ----------------------------------------------------------------
 
 
 def test_log_units() -> None:
@@ -69,11 +54,8 @@ def test_a_reboot_keeps_no_parameter_and_no_unlock() -> None:
     assert firmware.t_s == 0.0
     assert firmware.get_parameter("posCtlPid.thrustBase") == 36000
     rig.run(0.3)
-    rig.run(0.1, FULL_RAW)
+    rig.run(0.1, raw_thrust(60000))
     assert rig.motors_off
-
-
-# --- The state estimate of a deck ----------------------------------------------------------------
 
 
 def test_attitude_is_what_the_gyroscope_integrates_to() -> None:
@@ -101,14 +83,87 @@ def test_drift_runs_from_the_first_take_off_and_moves_the_vehicle() -> None:
     assert rig.world.y_m > 0.07
 
 
-def test_variance_falls_after_a_reset_and_outside_positions_count_for_nothing() -> None:
+def test_with_a_deck_external_positions_count_for_nothing() -> None:
     rig = make_rig()
-    rig.run(2.0)
-    assert rig.firmware.log_value("kalman.varPX") < 1e-3
-    rig.firmware.set_parameter("kalman.resetEstimation", 1)
-    assert rig.firmware.log_value("kalman.varPX") > 1.0
-    rig.firmware.set_parameter("kalman.resetEstimation", 0)
     rig.firmware.external((5.0, 5.0, 5.0), (1.0, 0.0, 0.0, 0.0))
     rig.run(2.0)
     assert rig.firmware.log_value("kalman.varPX") < 1e-3
     assert abs(rig.firmware.log_value("stateEstimate.x")) < 0.02
+
+
+# --- Without a deck: external positions, and none -------------------------------------------------
+
+
+def deckless(**conditions: Any) -> Rig:
+    return make_rig(extra={"external_position": 1.0}, **conditions)
+
+
+def errors_m(rig: Rig) -> Array:
+    """The estimated position less the true one."""
+    now, world = rig.firmware.estimator.now, rig.world
+    return np.array((now.x_m - world.x_m, now.y_m - world.y_m, now.z_m - world.z_m))
+
+
+def feed(rig: Rig, seconds: float, scale: float = 1.0, stream: Setpoint | None = None) -> None:
+    """Send the true position, in units of `1 / scale` m, at 100 Hz."""
+    for i in range(round(seconds / 0.01)):
+        if stream is not None and i % 2 == 0:
+            rig.firmware.low_level(stream)
+        world = rig.world
+        rig.firmware.external((scale * world.x_m, scale * world.y_m, scale * world.z_m))
+        for _ in range(5):
+            rig.firmware.step()
+
+
+def hovering(**conditions: Any) -> Rig:
+    rig = deckless(**conditions)
+    feed(rig, 0.5)
+    for value in (1, 0):
+        rig.firmware.set_parameter("kalman.resetEstimation", value)
+    feed(rig, 1.0)
+    for tenth in range(10):
+        feed(rig, 0.25, stream=at_height(0.08 * (tenth + 1)))
+    feed(rig, 3.0, stream=HERE)
+    return rig
+
+
+def test_millimetres_reset_the_estimate_for_ever() -> None:
+    """Out of its bounds (`kalman.maxPos`) it begins again at its initial place."""
+    rig = deckless()
+    rig.world.set_pose((0.3, 0.0, 0.4), hold=True)
+    feed(rig, 1.0, scale=1000.0)
+    assert np.linalg.norm(errors_m(rig)) == pytest.approx(0.5, abs=0.05)
+    assert rig.firmware.log_value("kalman.varX") > 10.0
+    rig.world.set_pose((0.03, 0.0, 0.06), hold=True)  # within them it is believed
+    feed(rig, 1.0, scale=1000.0)
+    assert np.linalg.norm(errors_m(rig)) == pytest.approx(999.0 * math.hypot(0.03, 0.06), rel=0.05)
+
+
+def test_what_is_no_number_does_no_harm() -> None:
+    rig = deckless()
+    feed(rig, 0.5)
+    for number in (math.nan, math.inf):
+        rig.firmware.external((number, 0.0, 0.0))
+        rig.firmware.external((0.0, 0.0, number), (0.0, number, 0.0, 0.0))
+    feed(rig, 0.1)
+    assert np.linalg.norm(errors_m(rig)) < 0.01
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_bias_of_the_accelerometer_hurts_little_in_flight(axis: int) -> None:
+    """Row "the accelerometer along the thrust axis only, scaled to 1 g on the ground"."""
+    rig = hovering(acc_bias_mps2=tuple(0.02 * GRAVITY_MPS2 * np.eye(3)[axis]))
+    rig.run(2.0, HERE)
+    assert abs(errors_m(rig)[axis]) < 0.05  # 0.4 m, if it counted
+
+
+def test_a_tilt_that_is_wrong_slides() -> None:
+    """Row "errors of tilt hurt more": a gyroscope's bias grows with the third power of the time."""
+    rig = hovering(gyro_bias_radps=(0.0, math.radians(0.2), 0.0))
+    assert np.linalg.norm(errors_m(rig)) < 0.02
+    rig.run(2.0, HERE)
+    two_m = abs(errors_m(rig)[0])
+    rig.run(2.0, HERE)
+    four_m = abs(errors_m(rig)[0])
+    assert 0.2 < four_m < 0.6  # the bias alone: 0.36 m
+    assert four_m > 4.0 * two_m
