@@ -84,15 +84,6 @@ def test_the_text_fits_a_terminal_and_obeys_nothing(tmp_path: Path) -> None:
     assert record["whole"]
 
 
-def test_a_killed_flight_says_what_is_lost(tmp_path: Path) -> None:
-    path = synthetic.write(tmp_path / "f.jsonl", most=300)
-    path.write_bytes(path.read_bytes()[:-40])
-    text = show_text(FlightAnalysis(read_log(path)))
-    assert text.startswith("UNKNOWN: the log ends in ALIGN\n")
-    assert "its end: the program was killed" in text
-    assert "its tail, " in text
-
-
 def test_the_rows_that_were_taken_and_an_end_without_a_tick_are_told(tmp_path: Path) -> None:
     events = [
         Event(

@@ -40,16 +40,6 @@ def test_a_short_flight_without_a_target(log: FlightLog, count: int, tmp_path: P
     assert picture(short, tmp_path / "f.png").std() > 1.0
 
 
-def test_many_attempts_and_names_that_matplotlib_would_typeset(tmp_path: Path) -> None:
-    def change(record: dict[str, Any]) -> None:
-        phase = ("ALIGN", "ASCEND", "PERCH", "RECOVER")[round(record["t_s"] / 0.2) % 4]
-        record |= {"phase": phase, "reason": "50 $ and _more_ {"}
-
-    log = made(change, {"outcome": "landed", "reason": "a $ in {a} reason $ with \\frac"})
-    assert len(log.phases) > 50
-    assert picture(log, tmp_path / "f.png").std() > 1.0
-
-
 def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
     with pytest.raises(InvalidValue, match="no ticks"):
         plot_flight(replace(log, records=[]), tmp_path / "f.png")

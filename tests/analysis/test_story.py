@@ -106,16 +106,6 @@ def test_notes_and_what_the_simulation_did_are_told() -> None:
     assert only(told, "Something happened").t_s == pytest.approx(9.0)
 
 
-def test_a_killed_flight_has_no_end() -> None:
-    def change(record: dict[str, Any]) -> None:
-        if record["phase"] in ("COMPLETE", "PERCHED"):
-            record["phase"] = "PERCH"
-
-    last = story(change, summary=None)[-1]
-    assert last.grade == "bad"
-    assert "The log ends here, in PERCH at 1.87 m" in last.text
-
-
 def test_each_harm_of_the_end_is_told() -> None:
     harm = {"locked": True, "fell": True, "touchdown_mps": 1.4, "touchdown_g": 6.0}
     told = story(summary=SUMMARY | harm)

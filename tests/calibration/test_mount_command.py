@@ -210,16 +210,6 @@ def test_numbers_that_cannot_be_written_are_still_reported(
     assert Path("odd.yaml").read_text(encoding="utf-8") == odd
 
 
-def test_the_carry_alone_says_what_was_written() -> None:
-    turned = Mounting(rpy_deg=(0.0, 0.0, 90.0)).T_body_cam[:3, :3]
-    c = MountingReport(load_profile("crazyflie"), carried(turned), None)
-    lines = "\n".join(c.lines())
-    assert "0 0 90 +-" in lines
-    assert "you wrote 0 0 0: 90.0 deg away" in lines
-    assert "you wrote 80: within that" in lines
-    assert c.keys_text() == "camera.mount.rpy_deg: [0, 0, 90]\ncamera.latency_s: 0.0803"
-
-
 def test_a_latency_that_flights_measure_stays_so() -> None:
     profile = load_profile("crazyflie")
     camera = profile.camera.model_copy(update={"latency_s": "measured"})

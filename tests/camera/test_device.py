@@ -3,8 +3,6 @@ behind a stand-in."""
 
 from __future__ import annotations
 
-import json
-import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,20 +11,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
 
-from perchctl.camera import find_cameras
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
-    ConnectedCamera,
     DeviceSource,
     camera_number,
     open_capture,
     set_up,
 )
 from perchctl.camera.source import LiveSource
-from perchctl.commands import app, check
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
@@ -71,21 +64,6 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
             number(text)
     with pytest.raises(NotFound, match=r"camera:nix was not found; there are camera:0 \(HD W"):
         number("nix")
-
-
-def test_the_list_for_people(plugged: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    def said(*options: str) -> Result:
-        return CliRunner().invoke(app, ["check", "--cameras", *options])
-
-    devices = plugged({0: "USB Video"}, usb_grabber=0)
-    monkeypatch.setattr(check, "find_cameras", lambda: find_cameras(devices, devices))
-    for words in ("camera:0", "USB Video", "usb_grabber"):
-        assert words in said().stdout
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    assert "Permission denied" in said().stdout
-    monkeypatch.setattr(check, "find_cameras", list[ConnectedCamera])
-    done = said("--json")
-    assert done.exit_code == json.loads(done.stdout)["exit_code"] == NotFound.exit_code
 
 
 def test_a_missing_device_says_what_there_is() -> None:

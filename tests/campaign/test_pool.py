@@ -20,15 +20,11 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import defer_interrupts, flight_processes, fly_all
 from perchctl.campaign.flights import fly_seed
-from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate import (
     AGAIN_S,
-    executor_of,
-    fly_each,
-    say_where_logs_are,
     stop_handler,
 )
-from perchctl.errors import Interrupted, InvalidValue, PerchError
+from perchctl.errors import InvalidValue, PerchError
 from perchctl.profile import Profile
 from tests.helpers.ended import ended
 from tests.helpers.flights import SEED, short_profile
@@ -132,14 +128,6 @@ def test_a_signal_that_another_thread_takes_waits_too() -> None:
     assert done == [bytes([signal.SIGINT]), b"loaded"]
 
 
-def test_with_nothing_flown_there_is_nothing_to_report() -> None:
-    def flown(_executor: object, _note: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-
-    with signals_to(stop_handler()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
-        fly_each(flown, Reported(), 10, executor_of(None, None, [], 10))
-
-
 def test_a_second_press_ends_the_program_at_once() -> None:
     now_s = [0.0]
     left: list[int] = []
@@ -191,16 +179,6 @@ def test_a_program_that_is_ended_leaves_nothing_behind(number: signal.Signals) -
         assert it.code == 130
         assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
         assert it.err.endswith("perchctl: stopped: 1 of 6 flights were flown\n")
-
-
-def test_logs_that_lack_something_are_counted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    say_where_logs_are([Ended(0), Ended(1, log_problem="no space left")], tmp_path)
-    assert capsys.readouterr().err.splitlines() == [
-        f"perchctl: the flights' logs are in {tmp_path}",
-        "perchctl: 1 of 2 logs are incomplete: no space left",
-    ]
 
 
 # --- memory -------------------------------------------------------------------------------------

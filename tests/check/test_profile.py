@@ -64,11 +64,6 @@ def test_a_shipped_profile_is_above_doubt(name: str) -> None:
     assert {row.verdict for row in profile_rows(load_profile(name))} == {Verdict.PASS}
 
 
-def test_every_row_has_a_name_of_its_own() -> None:
-    names = [row.name for row in profile_rows(load_profile("sim"))]
-    assert len(set(names)) == len(names)
-
-
 def test_the_example_calibration_fits_no_camera_of_one_s_own(tmp_path: Path) -> None:
     crazyflie = load_profile("crazyflie")
     row = row_of(crazyflie, "calibration file")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
-from perchctl.check.camera import IN_VIEW, names_of, picture_rows
+from perchctl.check.camera import IN_VIEW, picture_rows
 from perchctl.check.rehearsal import Rehearsal, telemetry_for
 from perchctl.check.row import ask_all
 from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
@@ -54,13 +54,6 @@ def test_under_the_target_it_passes() -> None:
 def test_a_sight_makes_its_row(verdict: str, words: str, advice: str, done: Rehearsal) -> None:
     row = rows_of(done)["in view"]
     assert (row.verdict, words in row.found, advice in row.advice) == (verdict, True, True), row
-
-
-def test_what_measures_otherwise_has_no_such_rows() -> None:
-    assert rows_of(rehearsed(), PROFILE) == {}
-    assert set(names_of(TARGET)) - set(names_of(PROFILE)) == {IN_VIEW}
-    names = {row.name for row in profile_rows(PROFILE)}
-    assert {row.name for row in profile_rows(TARGET)} - names == {"latency"}
 
 
 def test_a_latency_that_is_written_down_is_doubted() -> None:

@@ -25,7 +25,6 @@ from perchctl.mission import (
     Watcher,
 )
 from perchctl.profile import load_profile
-from perchctl.record import LogWatcher
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers.live_page import CORNERS, ask, stop, tick
@@ -213,22 +212,3 @@ def test_the_page_of_a_flight_ends_with_its_card(
     rows = dict(card["rows"])
     assert (rows["log"], rows["report"]) == (str(log), f"perchctl log report '{log}'")
     assert last_state["phase"] == "ALIGN"  # what was shown last stays
-
-
-def test_the_page_of_a_flight_that_failed_says_so(
-    options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
-) -> None:
-    def session(*_: object) -> Any:
-        raise Interrupted("interrupted before take-off: nothing was started")
-
-    ended: list[str] = []
-    page_fail, abandon = FlightPage.fail, LogWatcher.abandon
-    monkeypatch.setattr(FlightPage, "fail", lambda *a: (ended.append("page"), page_fail(*a)))
-    monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
-    monkeypatch.setattr(fly, "_session", session)
-    with pytest.raises(Interrupted):
-        fly.fly_and_report(options, as_json=False, view=True)
-    assert last_state["card"]["outcome"] == "FAILED"
-    assert "nothing was started" in last_state["card"]["reason"]
-    assert last_state["card"]["rows"] == []  # no tick, no log
-    assert ended == ["page", "log"]  # the log's end may wait for a disk

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -297,7 +298,7 @@ def test_beside_another_vehicle_it_perches_on_its_own_target(seed: int, tmp_path
     """The other one's target is in its pictures, too."""
     bearing_rad, turn_rad = np.random.default_rng([seed, 14]).uniform(-math.pi, math.pi, 2).tolist()
     there_m = APART_M * math.cos(bearing_rad), APART_M * math.sin(bearing_rad)
-    scenario = dataclasses.replace(
+    scenario = replace(
         draw_scenario(short_profile(), seed), neighbours=(Neighbour(there_m, turn_rad),)
     )
     flight = fly_lockstep(short_profile(), log=tmp_path / "log", scenario=scenario)

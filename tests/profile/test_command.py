@@ -258,14 +258,3 @@ def test_profile_prints_what_is_flown(tmp_path: Path) -> None:
     record = json.loads(shown("-p", "crazyflie", "--json").stdout)
     assert record["profile"]["name"] == "crazyflie"
     assert record["check"][0]["verdict"] == "warn"
-
-
-@pytest.mark.parametrize("options", [[], ["--json"]])
-def test_the_command_shows_no_password(options: list[str], tmp_path: Path) -> None:
-    path = tmp_path / "own.yaml"
-    path.write_text(
-        'description: "at http://me:secret@h/s"\ncamera: {source: "http://me:secret@h/s"}\n'
-    )
-    result = shown("-p", str(path), *options)
-    assert "http://h/s" in result.stdout
-    assert "secret" not in result.output

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from perchctl.commands.profile import (
     PICTURE_EDGES,
@@ -49,11 +48,6 @@ def test_a_hostile_text_stays_a_text(tmp_path: Path) -> None:
     assert load_profile(str(tmp_path / "again.yaml")) == profile
 
 
-def test_only_the_named_keys_are_written() -> None:
-    values = yaml.safe_load(profile_text(Profile(), {"target.small.id", "link.uri"}))
-    assert values == {"target": {"small": {"id": 5}}, "link": {"uri": "sim://"}}
-
-
 def test_the_schema_holds_each_key_with_meaning_and_unit() -> None:
     schema = editor_schema()
     assert "extends" in schema["properties"]
@@ -87,8 +81,3 @@ def test_a_hand_over_the_vehicle_comes_in_where_it_was_said(front: str, mirrored
         assert z > 0
         np.testing.assert_allclose(seen, PICTURE_EDGES[edge], atol=1e-12)
     assert picture_edges(mount, mirrored) == (front, left)
-
-
-@pytest.mark.parametrize("rpy_deg", [(180, 0, 0), (0, 0, 45), (0, 90, 0)])
-def test_a_camera_that_fits_no_edges_has_none(rpy_deg: tuple[float, float, float]) -> None:
-    assert picture_edges(Mounting(rpy_deg=rpy_deg), False) is None

@@ -158,13 +158,6 @@ def test_whole_markers_are_lost_where_geometry_says(
     assert view_of(gear_m).whole_m == pytest.approx(nearest_m, abs=0.001)
 
 
-def test_a_blind_range_is_named() -> None:
-    assert view_of((0.28, 0.0, 0.0)).whole_m is None
-    assert "blind in all of the last 10 cm" in view_of((0.28, 0.0, 0.0)).words
-    assert "by whole markers alone: blind from 48 mm" in view_of((0.0, 0.03, 0.02)).words
-    assert "never blind" in view_of((0.0, 0.0, 0.025)).words
-
-
 # --- the designer against the renderer and the paper ---------------------------------------------
 
 ROOT = Path(__file__).resolve().parents[2]

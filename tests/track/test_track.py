@@ -17,14 +17,12 @@ import pytest
 
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.track import Tracker, TrackSummary, frames
-from perchctl.display import LivePage
 from perchctl.errors import InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, project, square_corners
 from tests.helpers.commands import run
 from tests.helpers.interlaced import Pass
-from tests.helpers.live_page import ask
 from tests.helpers.recording import (
     CALIBRATION,
     STAGE_OF,
@@ -317,30 +315,6 @@ def test_a_picture_of_another_size_is_named(number: int, tmp_path: Path) -> None
 
 
 # --- the page, the end, bad input -----------------------------------------------------------
-
-
-def test_the_live_page_has_the_newest_numbers(
-    pictures: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    states = []
-    tell = LivePage.set_state
-
-    def asked(self: LivePage, *describe: Any) -> None:
-        tell(self, *describe)
-        states.append(json.loads(ask(self.url, "/state")[1]))
-
-    monkeypatch.setattr(LivePage, "set_state", asked)
-    tracked = track(pictures, "--view")
-    shown = [dict(state["rows"]) for state in states]
-    assert [rows["markers"] for rows in shown] == [line["stage"] for line in tracked.lines]
-    for rows, line in zip(shown, tracked.lines, strict=True):
-        if line["target"] is None:
-            assert rows["target"] == "target not seen"
-        else:
-            assert f"{100.0 * line['target']['tvec_m'][0]:+.2f}" in rows["target"]
-    assert {state["stop"] for state in states} == {"none"}
-    assert "live page: http://127.0.0.1" in tracked.stderr
-    assert "failed" not in tracked.stderr
 
 
 def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
