@@ -6,8 +6,7 @@ has to be in the deck's GAP8; it sends raw or JPEG pictures of 324x244.
 The stream is packets of Bitcraze's CPX: 16 bits of length, which counts what follows them, then
 one byte of routing, one of function, and the data. A picture is a packet with its header,
 ``<BHHBBI``: magic 0xBC, width, height, depth, format, size; then packets of chunks until `size`
-bytes have come. cflib's own reader of these packets blocks for ever when the deck goes away, so it
-is not used.
+bytes have come.
 """
 
 from __future__ import annotations
@@ -113,7 +112,6 @@ class AiDeckSource(LiveSource):
         return "closed"
 
     def _take(self, data: bytes, came_s: float) -> None:
-        """Take the data of one of the streamer's packets: a picture's header, or a part of one."""
         header = _header_of(data, came_s)
         if header is not None:
             self._picture = header

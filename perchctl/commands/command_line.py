@@ -1,7 +1,6 @@
 """What the subcommands share: the application, its failures as sentences, common options.
 
-A subcommand is one file of `perchctl.commands`: options, work and words together. It is loaded
-only as it is used, so that the help is quick, and may import whatever it needs at its top.
+A subcommand is loaded only as it is used, so that the help is quick.
 """
 
 from __future__ import annotations
@@ -284,7 +283,6 @@ def _print_failure(sentence: str, code: int) -> None:
 
 @contextlib.contextmanager
 def _notes() -> Iterator[None]:
-    """Print each different `Note` of the block once; other warnings go where they went before."""
     printed: set[str] = set()
 
     with warnings.catch_warnings():

@@ -218,9 +218,7 @@ class SimCapture:
 
 
 # --- The server on loopback -------------------------------------------
-# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it. Of the systems
-# which that package reads without a vendor's machine this one hands a frame on the soonest: VRPN's
-# client looks only every 10 ms, Qualisys's binds one fixed port.
+# It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it.
 #
 # Little-endian; each message begins with its kind and the length of what follows. Of a frame only
 # the rigid bodies are filled in; a client steps over the empty lists.
@@ -281,14 +279,12 @@ def _message(kind: int, *parts: bytes) -> bytes:
 
 
 def _server_info(data_port: int) -> bytes:
-    """Return the answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
     name = b"perchctl".ljust(_NAME_BYTES, b"\0")
     where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
     return _message(SERVER_INFO, name, _VERSION, _VERSION, where)
 
 
 def _models(names: Sequence[str]) -> bytes:
-    """Return the answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
     parts = [struct.pack("<i", len(names))]
     for number, name in enumerate(names, 1):
         parts += [struct.pack("<i", _RIGID_BODY), name.encode() + b"\0"]

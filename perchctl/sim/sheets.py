@@ -173,8 +173,7 @@ class Placed:
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
         x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
         # How far each block's centre is from the sheet's, along the axis along which it is farther,
-        # and how far from there its pixels look at most: half a block to each side, by the distance
-        # of the nodes at both sides; the outermost pixels' centres lie an eighth less far out.
+        # and how far from there its pixels look at most: half a block to each side.
         off_m = cv2.max(np.abs(x[1:-1, 1:-1]), np.abs(y[1:-1, 1:-1]))
         reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / COARSE_PX)
         half_m = self.sheet.drawing.sheet_side_m / 2.0
@@ -193,7 +192,6 @@ class Placed:
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the distances between the nodes left and right, and above and below, in sum."""
     level = cv2.absdiff(x[1:-1, 2:], x[1:-1, :-2])
     return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
 

@@ -295,7 +295,6 @@ class Experiment:
                 self.say(f"position {number} is refused, take it again: {fault}")
 
     def _take(self, number: int, frames: int) -> str | None:
-        """Take one position into the file; return a sentence if it must be taken again."""
         try:
             actual, attitude = self.truth.actual(self._answer)
         except InvalidValue as error:
