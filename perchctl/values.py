@@ -36,7 +36,6 @@ else:
         return new
 
     def _copied(kind: type) -> tuple[str, ...]:
-        """Return the fields' names if copying them makes a whole value, else none."""
         own = fields(kind)
         plain = all(field.init for field in own) and not hasattr(kind, "__slots__")
         if not plain or hasattr(kind, "__post_init__"):

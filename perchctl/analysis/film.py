@@ -71,7 +71,6 @@ def write_film(
 def _film_pictures(
     flight: FlightAnalysis, recorded: Recorded, times_s: Array, width_px: int
 ) -> Iterator[Rgb]:
-    """Draw the newest tick at each time, with the newest recorded picture by then."""
     stage = _Stage(flight, width_px)
     coming, image, newest = next(recorded, None), None, flight.log.records[0]
     for t_s in times_s:

@@ -39,8 +39,6 @@ class Hold:
 
 
 def _number(label: str, unit: str = "", scale: float = 1.0, digits: int = 0) -> Any:
-    """Declare a number that may be unknown, and how people read it: `label`, and so many `digits`
-    of `scale` times it in `unit`."""
     shown = {"label": label, "unit": unit, "scale": scale, "digits": digits}
     return field(default=None, metadata=shown)
 

@@ -135,7 +135,6 @@ def _draw_raw_and_filtered(
 
 
 def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
-    """The estimated height, the setpoint's, and external and true ones where they are known."""
     log = flight.log
     is_setpoint = np.array([kind == "position" for kind in log.texts("cmd")])
     is_sent = np.array([not note for note in log.texts("pos_note")])
@@ -200,7 +199,6 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
 
 
 def _mark_lost(ax: Axes, flight: FlightAnalysis) -> None:
-    """Mark frames without the target, and times without any frame, at the panel's bottom."""
     unseen_s, bottom = flight.frames.unseen_s, ax.get_xaxis_transform()
     ax.vlines(unseen_s, 0.0, LOST_SHARE, transform=bottom, color=BLACK, linewidth=0.7)
     for start_s, end_s in flight.frames.gaps_s:

@@ -265,8 +265,6 @@ def _seen(
 def _differing(
     log: FlightLog, turns: Sequence[Turn], found: Iterable[Sensed]
 ) -> Iterator[Difference]:
-    """Yield the turns in which something else is seen than was: a pose, or what the planner
-    sees."""
     tick = -sum(turn.role == "waiting" for turn in turns)
     for each in found:
         was, seen = each.turn.observation, each.observation

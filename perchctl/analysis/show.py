@@ -40,7 +40,6 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
 
 
 def _times(part: Any) -> dict[str, Any]:
-    """Return a part of a flight with its duration, and times without the noise of differences."""
     start_s, end_s = (round(t_s, 6) + 0.0 for t_s in (part.start_s, part.end_s))
     times = {"start_s": start_s, "end_s": end_s, "duration_s": round(end_s - start_s, 6)}
     return {**asdict(part), **times}
@@ -73,7 +72,6 @@ def _why(stay: PhaseSpan) -> str:
 
 
 def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
-    """Yield the lines that `fly` ends with, but for the battery, which has a longer one."""
     log = flight.log
     end = replace(flight.summary, battery_min_v=None)
     first, *others = end.text().splitlines()

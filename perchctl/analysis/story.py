@@ -108,8 +108,6 @@ def _holds(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """Tell what was sent in the loop's place. The farewell, to a vehicle that is down, is not part
-    of the flight."""
     for go in flight.takeovers:
         if go.by in TOOK_OVER:
             text = f"{TOOK_OVER[go.by]} for {go.end_s - go.start_s:.1f} s: {go.text}"
@@ -127,7 +125,6 @@ def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """Tell what the vehicle needs after the flight, or where a log stops without its end."""
     end, phases, end_s = flight.summary, flight.log.phases, flight.log.end_s
     if flight.log.summary is None:
         text = f"The log ends here, in {phases[-1].phase if phases else '?'}"

@@ -110,7 +110,6 @@ class AiDeckSource(LiveSource):
         return "closed"
 
     def _take(self, data: bytes, came_s: float) -> None:
-        """Take the data of one of the streamer's packets: a picture's header, or a part of one."""
         header = _header_of(data, came_s)
         if header is not None:
             self._picture = header

@@ -138,7 +138,6 @@ def _video_numbers(paths: Iterable[Path]) -> list[int]:
 
 
 def _of_system(number: int, attribute: str, names: Path) -> str:
-    """Return an attribute of a camera by the system's own list; empty where it has none."""
     try:
         return (names / f"video{number}" / attribute).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):

@@ -121,8 +121,6 @@ def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Judge the pictures that a flight takes for no measurement: frozen, snow, uniform, dark,
-    mirrored, late."""
     late = sum(t < t0 for (_, t0), (_, t) in pairwise(rehearsal.arrivals))
     if late:
         found = f"{late} of {rehearsal.pictures} came after newer ones"

@@ -1,7 +1,6 @@
 """The motion capture that gives a vehicle its position: answers, body, rate, noise, axes.
 
-`listen` hears vehicle and capture for a while; `mocap_rows_at_rest` judges that at rest, and
-`hand_finding` what a hand that lifts, turns and tilts the vehicle shows. Pure.
+Pure.
 
 With R_own and R_seen the attitudes that vehicle and capture have of it, and A the capture's world,
 B the rigid body's axes, where they should be none:
@@ -126,7 +125,6 @@ def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
 
 
 def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
-    """Judge how often the body is seen, and how well, at rest; the noise is of the worst axis."""
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
@@ -344,7 +342,6 @@ def _world_finding(turns: Turns, moved: PairedMotion) -> Finding | None:
 
 
 def _body_finding(turns: Turns, moved: PairedMotion, config: PositioningConfig) -> Finding:
-    """Judge what is left of the body's turn beyond the profile's, and whether it was lifted."""
     off_deg = math.degrees(float(turns.body.magnitude()))
     if off_deg > BODY_WARN_DEG:
         profiled = rotation_from_rpy(*(math.radians(a) for a in config.body_rpy_deg))

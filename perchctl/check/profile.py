@@ -1,6 +1,6 @@
 """What a profile shows about a flight before anything is opened: the check's rows of it.
 
-Here is what is allowed, and was hardly meant. `fly` asks the same before it connects.
+`fly` asks the same before it connects.
 """
 
 from __future__ import annotations
@@ -154,8 +154,6 @@ def _limits(name: str, profile: Profile) -> Finding:
 
 
 def _latency(plan: _Plan) -> Finding:
-    """Judge the latency: a time that was written down is true for one camera, receiver and
-    computer."""
     latency_s = plan.profile.camera.latency_s
     if isinstance(latency_s, str):
         return passed("measured by each flight")

@@ -169,8 +169,6 @@ class VehicleSession:
         yield from compared
 
     def _lift_finding(self) -> Finding:
-        """Judge a lift by the vehicle's own position, or by a motion capture against its
-        attitude."""
         config, room, within_s = self.profile.positioning, self.room, self.scope.lift_s
         if config.by == "target":
             return skipped("only in flight it gets its position, by the target")

@@ -1,7 +1,6 @@
 """The vehicle at the other end of the link: what it answers, holds and reports at rest.
 
-`look` takes half a dozen seconds and sends nothing but questions; what it returns is judged by
-`VEHICLE`, pure. `lift_finding` judges a lift by hand.
+`look` takes half a dozen seconds and sends nothing but questions.
 """
 
 from __future__ import annotations
@@ -128,7 +127,6 @@ def _telemetry(vehicle: Vehicle, profile: Profile) -> Finding:
 
 
 def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
-    """Judge the protocol, the log variables that a flight needs, and the self-test at boot."""
     found, needed = f"protocol {vehicle.protocol}", ProbeLink.NEEDED_PROTOCOL
     if vehicle.protocol < needed:
         advice = f"update it: protocol {needed} or later is needed (release 2026.08)"

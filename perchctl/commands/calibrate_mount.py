@@ -190,8 +190,7 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
 
 
 def _check_unchanged(name: str, then: Profile) -> None:
-    """Raise InvalidValue if the profile no longer says what the numbers rest on: a gear by one
-    turn of the camera is wrong beside another, and a recording takes minutes; NotFound."""
+    """Raise InvalidValue if the profile no longer says what the numbers rest on; NotFound."""
     now = load_profile(name)
     if (now.camera, now.vehicle) != (then.camera, then.vehicle):
         raise InvalidValue(

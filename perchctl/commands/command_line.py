@@ -283,7 +283,6 @@ def _print_failure(sentence: str, code: int) -> None:
 
 @contextlib.contextmanager
 def _notes() -> Iterator[None]:
-    """Print each different `Note` of the block once; other warnings go where they went before."""
     printed: set[str] = set()
 
     with warnings.catch_warnings():

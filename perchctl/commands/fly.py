@@ -265,7 +265,6 @@ def _session(
     page: FlightPage | None,
     asks: bool,
 ) -> tuple[FlightReport, float | None]:
-    """Fly the session with the signals on its switch, and with the live page if there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
     watched = log.watched
     if page is not None:

@@ -81,7 +81,6 @@ def _bar(
     wanted: bool = True,
     width: int = 40,
 ) -> Iterator[Callable[..., Any]]:
-    """Yield what changes the bar, as `Progress.update` does. stdout is left alone."""
     console = Console(file=stream or sys.stderr)
     if not (wanted and console.is_terminal):
         yield lambda **changes: None

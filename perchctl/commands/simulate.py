@@ -174,9 +174,6 @@ def run(
 
 @dataclass(frozen=True)
 class _Campaign:
-    """What differs between campaigns with and without faults: the type of a flight's result, how a
-    seed is flown, figures and text of all results, and what they amount to as a failure."""
-
     kind: type[Any]
     fly: Callable[[int], Any]
     summary: Callable[[list[Any]], Mapping[str, Any]]

@@ -297,8 +297,6 @@ def _marker_record(
 
 
 def _finite(value: Any) -> Any:
-    """Return the number, or the nested lists of the array's numbers, as Python's; None for each
-    that is not finite."""
     if np.ndim(value):
         return [_finite(part) for part in value]
     return float(value) if math.isfinite(value) else None
@@ -311,7 +309,6 @@ def text_line(tracked: Tracked) -> str:
 
 
 def _target_text(target: CameraPose | None) -> str:
-    """Return the target's place and heading for people, in centimetres and degrees."""
     if target is None:
         return "target not seen"
     x, y, z = (f"{100.0 * v:+7.2f}" for v in target.tvec_m)

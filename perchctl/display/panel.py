@@ -177,7 +177,6 @@ class FlightPanel:
 
 
 def _new_live(stream: TextIO) -> Live:
-    """Return a panel that stays at the bottom of the terminal. NO_COLOR takes the colours away."""
     console = Console(
         file=stream,
         force_terminal=True,

@@ -1,9 +1,6 @@
 """The faults that can be laid into a simulated flight.
 
-A fault is one entry of `FAULTS`: its name, what happens, what it does with which drawn values,
-and the phases in which it begins. `draw_case` is one seed's fault: which, in which phase, when in
-it, with what values. A seed gives the same flight for ever:
-draws stay in their order.
+A seed gives the same flight for ever: draws stay in their order.
 """
 
 from __future__ import annotations
@@ -174,7 +171,6 @@ def _packet_twice(source: DrawInputs) -> tuple[e.Effect, ...]:
 
 
 def _hung_and_packet_lost(source: DrawInputs) -> tuple[e.Effect, ...]:
-    """Draw a stuck loop, with the loss of the first packets that the watchdog sends."""
     order = one_of("raw", "stop", "land")(source)
     return HUNG(source), lost(order)(source)
 

@@ -167,7 +167,6 @@ class FaultyCamera(WrappedSource):
         return np.clip(self._rng.normal(mean, sigma, image.shape), 0, 255).astype(np.uint8)
 
     def _late(self, frame: Frame | None, late_s: float, now_s: float) -> Frame | None:
-        """Return the frame that was queued for so long; its times look as if it were new."""
         if frame is not None:
             self._queue.append(frame)
         old = None
@@ -205,8 +204,7 @@ class ProgramKilled(BaseException):
 
 
 class PlantedError(Exception):
-    """The exception that a fault raises in the loop: unforeseen by the program, planned by the
-    campaign."""
+    """The exception that a fault raises in the loop, unforeseen by the program."""
 
 
 class FaultyClock:

@@ -1,7 +1,6 @@
 """What a fault does, as functions that act on a flight's edges when the fault begins, at `t_s`.
 
-An effect is such a function with its parameters: a `functools.partial`, which the catalogue draws
-and the injector calls. Durations are counted from the fault's beginning.
+Durations are counted from the fault's beginning.
 """
 
 from __future__ import annotations

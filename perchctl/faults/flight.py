@@ -148,7 +148,6 @@ class FaultyFlight:
         self._oracle.claims(claims_of_rescue(event), event.t_s)
 
     def _mission(self) -> tuple[str, str, FlightReport | None]:
-        """Run the program under test. Returns its end, what it said, and its report."""
         try:
             report = fly(self._parts)
         except PlantedError as error:
@@ -180,7 +179,6 @@ class FaultyFlight:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
 
     def _sample(self, t_s: float) -> Sample:
-        """Return the true state of the vehicle, with its distance from where it should be."""
         sample, world = sample_of(self._vehicle), self._vehicle.world
         begin_s, phase = self._injector.begin_s, self._injector.flown
         place = (sample.x_m, sample.y_m)

@@ -1,8 +1,6 @@
 """Whether a simulated flight went wrong, by the truth of the world and nothing else.
 
-The oracle is given samples of the true vehicle (`Sample`) while the flight and the time
-after it pass. It is told when the operator pressed Ctrl-C, when the program ended, and what it
-claimed, and raises flags (docs/campaigns.md, "Faults").
+The oracle raises flags (docs/campaigns.md, "Faults").
 """
 
 from __future__ import annotations
@@ -117,12 +115,10 @@ class _Lasting:
         self._for_s, self._since_s = for_s, math.inf
 
     def see(self, holds: bool, t_s: float) -> bool:
-        """Note the condition at this moment, and return True if it has held for long enough."""
         self._since_s = min(self._since_s, t_s) if holds else math.inf
         return self.holds(t_s)
 
     def holds(self, t_s: float) -> bool:
-        """Return True if it will have held for long enough at `t_s`, should it go on."""
         return t_s - self._since_s >= self._for_s - 1e-9
 
 
@@ -235,8 +231,6 @@ class Oracle:
             self._raise("fell", s.t_s)
 
     def _watch_fall(self, s: Sample) -> None:
-        """Follow falls: one begins as it sinks faster than ordered, and ends caught or on the
-        floor."""
         if _airborne(s) and not s.hanging and (not s.motors_on or s.acc_g < UNPOWERED_G):
             self._weak_s = s.t_s
         sinking = -s.vz_mps

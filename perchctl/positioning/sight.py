@@ -6,8 +6,7 @@ The world is that of the vehicle at rest on the ground, where its estimate is re
 stands at the origin, which is sent until the target has been seen often enough from there, and
 where the target is seen then it stays. So ground, fence and heights keep their meaning.
 
-What if a place is the last one, late, or sent twice? The estimator takes each for the place of
-now. So no exposure is sent twice, none out of order and none that is older than `OLDEST_S`; and
+No exposure is sent twice, none out of order and none that is older than `OLDEST_S`; and
 what lies farther from the estimate than both can explain is not believed. The age grows, and the
 planner holds, sinks and comes down by it.
 """

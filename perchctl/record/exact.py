@@ -1,7 +1,6 @@
 """Values as JSON, and back to the same bits: what a replay rests on.
 
-`to_exact` and `from_exact` follow the fields of the frozen dataclasses themselves; there is no
-list of keys. A float is written by its shortest text that reads back to the same one, infinities
+A float is written by its shortest text that reads back to the same one, infinities
 and NaN as ``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its
 type and shape; an enum by its value; where a field takes one of several dataclasses, such as a
 command, the class's name stands before it. None is left out where it is the field's default.
@@ -71,7 +70,6 @@ def _exact_fields(value: Any) -> dict[str, Any]:
 
 @cache
 def _fields_of(kind: type) -> list[tuple[str, Any, tuple[Any, ...]]]:
-    """Return each field of a dataclass: its name, its default, and the types that it may hold."""
     hints = typing.get_type_hints(kind)
     return [(f.name, f.default, _members(hints[f.name])) for f in dataclasses.fields(kind)]
 

@@ -35,7 +35,6 @@ _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
 
 def _axes(name: str, meaning: str) -> dict[str, str]:
-    """Return a field each for x, y and z, whose letter stands in the name's place for one."""
     return {name.format(axis): meaning for axis in "xyz"}
 
 

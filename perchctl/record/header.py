@@ -100,8 +100,7 @@ _SIDES = (2, 3, 4, 6, 8, 12)
 @cache
 def arithmetic_fingerprint() -> str:
     """Return eight hexadecimal digits. Where they are the same, with the same libraries,
-    single-threaded results are the same to the bit: they stand for the kernels that may be chosen,
-    and for the results of some small calculations."""
+    single-threaded results are the same to the bit."""
     bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
     for part in (_libm_probe(), *_numpy_probes(), *_opencv_probes()):
         bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)

@@ -143,7 +143,6 @@ class Recorder:
     # The thread that writes, or lockstep.
 
     def _attempt(self, *jobs: Job) -> None:
-        """Do the jobs unless the recording has ended; it ends with one that fails."""
         if self._over:
             return
         try:
@@ -158,7 +157,6 @@ class Recorder:
                 self._stream.close()  # without an index, where its last whole record ends
 
     def _write_frame(self, frame: Frame) -> None:
-        """Write a frame as its source gave it, and its picture unless that repeats."""
         number = frame.index & 0xFFFFFFFF
         about = {
             "number": frame.index,
@@ -174,8 +172,6 @@ class Recorder:
         self._add(FRAME, ns, json.dumps(about).encode(), number)
 
     def _write_tick(self, record: Mapping[str, Any]) -> None:
-        """Write a tick's record with its times since the first flown turn, and what it shows in
-        space."""
         t_s, exposed_s = float(record["t_s"]), record.get("frame_t_s")
         self._newest_s, ns = t_s, self._ns(t_s)
         first_s = self._first_s = t_s if self._first_s is None else self._first_s
@@ -191,7 +187,6 @@ class Recorder:
         self._add(TICK, ns, encode(shown)[:-1])
 
     def _flush(self) -> None:
-        """Bring to the disk, once a second, what was written; end a recording that is too large."""
         if self._newest_s - self._flushed_s < FLUSH_PERIOD_S:
             return
         self._flushed_s = self._newest_s

@@ -337,7 +337,6 @@ def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
 
 
 def _free_names(path: Path) -> Iterator[Path]:
-    """Yield the path, then with ``_2``, ``_3``...; none beside which there is a recording."""
     for number in count(1):
         name = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
         if not recording_path(name).exists():

@@ -277,14 +277,12 @@ def _message(kind: int, *parts: bytes) -> bytes:
 
 
 def _server_info(data_port: int) -> bytes:
-    """Return the answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
     name = b"perchctl".ljust(_NAME_BYTES, b"\0")
     where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
     return _message(SERVER_INFO, name, _VERSION, _VERSION, where)
 
 
 def _models(names: Sequence[str]) -> bytes:
-    """Return the answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
     parts = [struct.pack("<i", len(names))]
     for number, name in enumerate(names, 1):
         parts += [struct.pack("<i", _RIGID_BODY), name.encode() + b"\0"]

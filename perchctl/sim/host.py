@@ -299,7 +299,6 @@ class Runner:
         return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
     def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
-        """Return the answer to a request of the parent: (True, result) or (False, text)."""
         try:
             return True, self._host.answer(name, *arguments, **named)
         except Exception as error:

@@ -131,7 +131,7 @@ class Lens:
 
 
 def lens_of(camera: CameraModel) -> Lens:
-    """Return the camera's lens. Flights share it, since its rays take longer than 20 pictures."""
+    """Return the camera's lens, which flights share."""
     return _lens(*camera.contents)
 
 

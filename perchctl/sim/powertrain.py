@@ -7,8 +7,7 @@
   a w + b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and
   its square rises linearly with that voltage. A motor that hovers has the lag of 0.05 s of
   docs/firmware.md, "Catching a slip". One that stands still has `STANDING_LAG_S`: with it the
-  slips of that page cost what was measured there, whether the motors turned, turned slowly or
-  stood. With 0.05 s for all, a vehicle with slow motors falls up to two fifths less.
+  slips of that page cost what was measured there.
 - Nothing brakes a brushed motor, so it runs down more slowly than it runs up.
   `MOTOR_COAST_S` fits best what that page measured of falls, landings and take-offs.
 - The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
@@ -155,8 +154,6 @@ def _resting_v(left: float, knee: float) -> float:
 
 
 def _charge_at(rest_v: float, knee: float) -> float:
-    """Return the charge that belongs to a resting voltage; at the curve's ends where it is
-    beyond."""
     low, high = 0.0, 1.05
     for _ in range(40):
         middle = 0.5 * (low + high)

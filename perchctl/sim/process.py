@@ -1,6 +1,5 @@
 """The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
 
-`SimProcess` is the handle in the process that flies, `perchctl.sim.host` runs in the other one.
 The child does not share its terminal's Ctrl-C, and ends with its parent.
 """
 

@@ -261,7 +261,6 @@ class Renderer:
         return np.asarray(path.transpose(2, 0, 1))
 
     def _noise_bank(self, sigma: float) -> tuple[NDArray[np.int16], list[tuple[int, int]]]:
-        """Return what is added to pictures, and from which row and column on for each frame."""
         width, height = self.camera.size_px
         size = (height + _NOISE_ROOM_PX, width + _NOISE_ROOM_PX)
         rng = np.random.default_rng([self.seed, NOISE_STREAM])

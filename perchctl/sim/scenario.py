@@ -224,7 +224,6 @@ def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 
 
 def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Return what harder worlds draw; where the ranges are those of `sim`, its defaults."""
     air, cell, tilt, radio, capture = (
         np.random.default_rng([seed, _GROUPS_STREAM, group]) for group in (0, 1, 2, 6, 7)
     )

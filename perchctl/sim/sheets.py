@@ -191,7 +191,6 @@ class Placed:
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the distances between the nodes left and right, and above and below, in sum."""
     level = cv2.absdiff(x[1:-1, 2:], x[1:-1, :-2])
     return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
 

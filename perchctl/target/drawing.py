@@ -130,7 +130,6 @@ def _nested(
     small_side_m: float,
     ring_m: float,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the edges and black squares of the small marker in a white hole of the large one."""
     hole = small_side_m / 2.0 + ring_m
     large_edges = np.linspace(-large_side_m / 2, large_side_m / 2, len(large) + 1)
     small_edges = np.linspace(-small_side_m / 2, small_side_m / 2, len(small) + 1)

@@ -1,9 +1,7 @@
 """The reading of a target by a plain detector: of its drawing, before ink is spent, and of small
 pictures through blur and noise.
 
-The smallest side that is read is found by trial: a formula would hold for one id and one
-detector; a few hundred small pictures through the detector itself take a second and hold for the
-target at hand.
+The smallest side that is read is found by trial, which takes a second.
 """
 
 from __future__ import annotations

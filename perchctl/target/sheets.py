@@ -148,7 +148,6 @@ def _page_text(width: float, height: float) -> str:
 
 
 def _holding(needed: tuple[float, float], page: tuple[float, float]) -> tuple[float, float] | None:
-    """Return the page upright or across, as it holds what is needed; None if it does not."""
     for width, height in (page, page[::-1]):
         if width >= needed[0] - 1e-9 and height >= needed[1] - 1e-9:
             return width, height
@@ -196,8 +195,6 @@ def _side_and_cell(target: TargetConfig) -> tuple[float, float]:
 
 
 def _ruler_half(half: float) -> float:
-    """Return the distance of the rulers from the centre: at the sheet, or where the sheet is small
-    outside of its cut marks and of each other."""
     if half >= _RULER_REACH:
         return half
     return max(half + _MARK_GAP + _MARK, _RULER_REACH)
@@ -210,7 +207,6 @@ def _caption_room(texts: Sequence[str], width: float) -> tuple[list[str], float]
 
 
 def _fitting_page(target: TargetConfig, texts: Sequence[str]) -> str:
-    """Return the page, for --page, that holds the target: a named one, or a size."""
     for name, size in PAGES_MM.items():
         if _layout_on(target, size, texts):
             return name
@@ -263,7 +259,6 @@ class _Paper(FPDF):
     def stroke(
         self, x0: float, y0: float, x1: float, y1: float, width: float = 0.2, dash: float = 0.0
     ) -> None:
-        """Draw a straight line; `dash` is the length of dashes and gaps, 0 is solid."""
         self.set_line_width(width)
         self.set_dash_pattern(dash=dash, gap=dash)
         self.line(x0, y0, x1, y1)
@@ -277,8 +272,6 @@ class _Paper(FPDF):
         back: float = 0.0,
         turn_deg: float = 0.0,
     ) -> None:
-        """Write a line of text on the base line y, turned about its place. `back` of its width
-        (0..1) lies before x."""
         self.set_font("helvetica", size=size * _PT_PER_MM)
         with self.rotation(turn_deg, x, y):
             self.text(x - back * self.get_string_width(text), y, text)
@@ -310,8 +303,6 @@ def _draw_front(pdf: _Paper, target: TargetConfig, half: float, caption: list[st
 
 
 def _draw_back(pdf: _Paper, half: float, magnet_m: float) -> None:
-    """Draw the page as seen from the back, the sheet turned about its upright axis: all of it is
-    symmetric."""
     pdf.start()
     cx, cy = pdf.cx, pdf.cy
     _draw_cut_marks(pdf, half)
@@ -336,7 +327,6 @@ def _draw_back(pdf: _Paper, half: float, magnet_m: float) -> None:
 
 
 def _draw_rulers(pdf: _Paper, half_x: float, half_y: float) -> None:
-    """Draw two rulers of 100 mm: below, from left to right, and at the left, upwards."""
     y = pdf.cy + half_y + _GAP
     x = pdf.cx - half_x - _GAP
     left = pdf.cx - RULER / 2

@@ -206,7 +206,6 @@ def view_from(
 
 
 def _directions(values: tuple[float, float], least: float, figures: str, unit: str) -> str:
-    """Return values forward and left in words, without what is less than `least`."""
     names = (("forward", "back"), ("to the left", "to the right"))
     return " and ".join(
         f"{abs(value):{figures}} {unit} {ahead if value > 0.0 else behind}"
@@ -265,7 +264,6 @@ def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> 
 
 
 def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
-    """Return the range down to which the target is seen from `FROM_M` on; None if not there."""
     count = round(FROM_M / _STEP_M)
     lost = next((k for k in range(count, 0, -1) if not seen(k * _STEP_M)), 0)
     if lost == count:

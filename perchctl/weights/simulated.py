@@ -97,7 +97,6 @@ class SimulatedStand:
             yield Frame(k, k * FRAME_S, image, k * FRAME_S)
 
     def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> CameraPlace:
-        """Return the place that is `z_m` under the target and off it by x, y in level axes."""
         T_body_cam = self._profile.camera.mount.T_body_cam
         lens = np.array([x_m, y_m, z_m])  # target relative to the camera, level axes
         gear = np.asarray(self._profile.vehicle.gear_body_m)

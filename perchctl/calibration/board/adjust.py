@@ -198,7 +198,6 @@ def reject_outliers(
 def _find_outliers(
     views: Sequence[BoardView], fit: Fit, whole: dict[str, BoardView]
 ) -> tuple[list[NDArray[np.bool_]], dict[str, str]]:
-    """Return the corners to keep in each view, and the views to leave out with the reason."""
     masks, rms = [], []
     for residual in fit.residuals:
         distance = np.linalg.norm(residual, axis=1)

@@ -148,9 +148,10 @@ def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
 
 
 def _local_axes(cells: Array, corners: Array) -> Array:
-    """Return a square's two sides at each corner as the picture shows them, the columns of (n, 2,
-    2) px: the derivative of the homography from board to picture, which smooths over single bad
-    corners."""
+    """Return a square's two sides at each corner, the columns of (n, 2, 2) px.
+
+    They are the homography's derivative, which smooths over single bad corners.
+    """
     H, _ = cv2.findHomography(cells, corners, cv2.RANSAC, 5.0)
     if H is None:
         H, _ = cv2.findHomography(cells, corners)

@@ -97,8 +97,7 @@ def position_errors_mm(
 
 
 def _marker_m(camera: CameraModel, z_m: float) -> Array:
-    """Return the corners (4, 3) of the marker that is measured at that distance, in its own axes:
-    the large one as long as it fits into the picture."""
+    """Return the corners (4, 3) of the marker measured at that distance, in its own axes."""
     large_m = _SQUARE * LARGE_M
     return (
         large_m
@@ -108,8 +107,7 @@ def _marker_m(camera: CameraModel, z_m: float) -> Array:
 
 
 def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None) -> Array:
-    """Return target centres at that depth, (n, 3): straight ahead, then over the whole picture
-    wherever all corners of the marker are in view; with `covered`, in covered cells."""
+    """Return target centres at that depth, (n, 3), the first straight ahead."""
     w, h = camera.size_px
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 9), np.linspace(0, h - 1, 7)), axis=-1)
     rays = undistort(grid.reshape(-1, 2), camera)
@@ -124,8 +122,6 @@ def _places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None) 
 
 
 def _cells(camera: CameraModel, place: Array, corners_m: Array) -> NDArray[np.intp] | None:
-    """Return the cells (4, 2), column and row, that a marker's corners are in; None where it is not
-    wholly in the picture."""
     pixels = project(corners_m, _FACING, place, camera)
     w, h = camera.size_px
     if not ((pixels >= 0).all() and (pixels <= (w - 1, h - 1)).all()):

@@ -213,7 +213,6 @@ def robust_fit(
 
 
 def _is_usable(camera: CameraModel) -> bool:
-    """Return true if the lens is one-to-one over the image and its centre lies inside."""
     w, h = camera.size_px
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)), axis=-1)
     pixels = grid.reshape(-1, 2)
@@ -281,8 +280,6 @@ def _check_focal(parameters: Array, std: Array) -> None:
 
 
 def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[str]:
-    """Return what keeps it from being a good calibration, whatever its error, and what would mend
-    it."""
     lacks = []
     if not _is_usable(fit.camera):
         lacks.append("the lens model folds back inside of the picture: add views at its rims")
@@ -303,7 +300,6 @@ def tilts_deg(poses: Array) -> Array:
 
 
 def _uncovered_text(covered: NDArray[np.bool_]) -> str:
-    """Return the emptier ninths of the picture, the emptiest first: 'at the top left and right'."""
     thirds = [
         (float(cell.mean()), name)
         for row, names in zip(np.array_split(covered, 3), _NAMES, strict=True)

@@ -98,8 +98,6 @@ class _Progress:
         self._seconds = now_s - self._start_s
 
     def guided(self, frame: Frame, seen: bool, reader: PoseReader) -> GuidedFrame:
-        """Judge now and then which motion is missing, and return what to show of the newest frame;
-        `seen` is true if it shows the target."""
         recording = self._recording
         self._with_target.append(seen)
         if self._seconds - self._judged_s >= JUDGED_EVERY_S:

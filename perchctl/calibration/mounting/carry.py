@@ -119,8 +119,7 @@ def solve_carry(recording: MountingRecording) -> CarrySolution:
 
 
 def _known(knots_s: Array) -> Array:
-    """Return what is known before, as information (p, p): how large the sensor's errors may be, and
-    how far the integrated rotation walks from one knot to the next; it begins at zero."""
+    """Return the prior information (p, p) on the sensor's errors and the knots' walk."""
     steps = np.diff(np.eye(len(knots_s)), axis=0)[:, 1:]
     steps /= WALK_RAD * np.sqrt(np.diff(knots_s))[:, None]
     p = KNOTS + 3 * (len(knots_s) - 1)
@@ -283,7 +282,6 @@ def first_guess(whole: Integrated, poses: PoseArrays) -> tuple[Array, float]:
 
 
 def _pairs(t_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of pictures, and of the first one that is `_SPAN_S` later."""
     second = np.searchsorted(t_s, t_s + _SPAN_S[0])
     first = np.flatnonzero(second < len(t_s))
     second = second[first]
@@ -293,8 +291,6 @@ def _pairs(t_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
-    """Return R with body = R seen, by least squares in which what fits badly counts less, and the
-    misfit."""
     weight = np.ones(len(body))
     R = np.eye(3)
     for _ in range(_FIT_ROUNDS):

@@ -59,8 +59,6 @@ class PoseReader:
 
 
 def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
-    """Return the surest of a picture's poses, None without one; `t_s` is the camera's own timestamp
-    of the picture."""
     pose = output.poses.get("joint") or min(output.poses.values(), key=_uncertainty, default=None)
     if pose is None or pose.camera_cov is None or not np.isfinite(pose.camera_cov).all():
         return None

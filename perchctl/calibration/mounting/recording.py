@@ -228,5 +228,4 @@ def missing_motion(recording: MountingRecording) -> list[str]:
 
 
 def _extent(values: Array) -> float:
-    """Return how far values go from one side to the other, without the outermost hundredths."""
     return float(np.ptp(np.percentile(values, (2.0, 98.0)))) if len(values) else 0.0

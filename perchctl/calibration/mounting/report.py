@@ -32,7 +32,6 @@ class _Value:
     written: Array | None
 
     def lines(self) -> list[str]:
-        """Return the value with its 95 % interval, and what the profile says instead."""
         interval = self._text(SIGMAS_95 * self.sigma)
         line = f"{self.name:<12}{self._text(self.measured)} +- {interval} {self.unit} (95 %)"
         if self.written is None:

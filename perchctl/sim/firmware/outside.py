@@ -189,8 +189,6 @@ class OutsideFilter:
         self._correct(ATTITUDE, wrong, self._parameters["locSrv.extQuatStdDev"])
 
     def _grow(self, force_mps2: Vector) -> None:
-        """Let the errors grow after a prediction. `force_mps2` is the specific force in world
-        axes, which an attitude that is wrong sends elsewhere."""
         sx, sy, sz = (IMU_PERIOD_S * part for part in force_mps2)
         for rows in (self.covariance, self.covariance.T):
             rows[POSITION:VELOCITY] += IMU_PERIOD_S * rows[VELOCITY:ATTITUDE]
@@ -201,7 +199,6 @@ class OutsideFilter:
         self._bound()
 
     def _correct(self, first: int, wrong: Vector, sigma: float) -> None:
-        """Correct three states from `first` on, which are so far off, one after the other."""
         variance = max(sigma, _LEAST_SIGMA) ** 2
         sums: Array = np.zeros(9)
         for state in range(first, first + 3):

@@ -157,7 +157,6 @@ class Planner:
         duration_s: float,
         t_s: float,
     ) -> None:
-        """Plan the way to a place; the heading turns the short way round, None keeps it."""
         *axes, yaw = start
         now_rad = wrap_rad(yaw.value)
         turn_rad = 0.0 if heading_rad is None else wrap_rad(heading_rad - now_rad)
