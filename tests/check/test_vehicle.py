@@ -88,7 +88,7 @@ FAULTS = [
     ("packets", "lossy", "fail", "% of 20 lost"),
     ("firmware", "bad", "fail", "failed at boot"),
     ("supervisor", "bad", "fail", "locked (supervisor 0x"),
-    ("positioning", "bad", "fail", "no positioning deck, and no position comes"),
+    ("positioning", "bad", "fail", "no positioning deck"),
     ("ground", "bad", "fail", "places the vehicle at 0."),
     ("level", "bad", "fail", "pitch 20"),
     ("battery", "bad", "fail", "rests at 3.5"),

@@ -72,6 +72,7 @@ class Firmware:
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
         self._parameters |= self.scenario.parameters
+        self.supervisor.emergency = bool(self._parameters["stabilizer.stop"])
         self.estimator.reset(0.0)
 
     @property

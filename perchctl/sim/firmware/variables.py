@@ -29,7 +29,8 @@ class Parameter:
 
 # group -> "ctype: name=default ..."; "*" persistent, "!" read-only.
 _PARAMETER_GROUPS: dict[str, str] = {
-    "stabilizer": "uint8_t: estimator=2",
+    "stabilizer": "uint8_t: estimator=2 stop=0",
+    "system": "uint8_t: selftestPassed=1!",
     "kalman": "uint8_t: resetEstimation=0; float: initialX=0 initialY=0 initialZ=0 initialYaw=0",
     "posCtlPid": "float: zKp=2.0* zVelMax=1*; uint16_t: thrustBase=36000*",
     "pm": "float: lowVoltage=3.2*",
