@@ -36,11 +36,11 @@ class FlightProcesses(ProcessPoolExecutor):
 @contextlib.contextmanager
 def flight_processes(jobs: int) -> Iterator[Executor]:
     """Yield an executor of `jobs` processes; an exception ends them where they are."""
-    pool = FlightProcesses(jobs)
+    pool, others = FlightProcesses(jobs), set(multiprocessing.active_children())
     try:
         yield pool
     except BaseException:
-        for process in multiprocessing.active_children():
+        for process in set(multiprocessing.active_children()) - others:
             process.kill()
         raise
     finally:
