@@ -38,7 +38,7 @@ from perchctl.mission.state import (
     Phase,
     Severity,
 )
-from perchctl.vehicle import CRASHED, LOCKED, TUMBLED, EmergencyStop, StopMotors
+from perchctl.vehicle import CRASHED, FRESH_S, LOCKED, TUMBLED, EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
 Reason = str | Callable[[Context], str]
@@ -318,6 +318,13 @@ def why_no_picture(c: Context) -> str:
     return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
 
 
+def why_unconfirmed(c: Context) -> str:
+    cause = "by its telemetry the vehicle still flies"
+    if c.attitude_age_s > FRESH_S:
+        cause = f"nothing was heard from the vehicle for {c.attitude_age_s:.1f} s"
+    return f"the landing was not confirmed in time: {cause}"
+
+
 # --- The ways out of the mission --------------------------------
 
 
@@ -347,7 +354,7 @@ def backs_off(name: str, phases: Set[Phase], when: Predicate, reason: Reason) ->
     return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF)
 
 
-def gives_up(name: str, when: Predicate, reason: str) -> Transition:
+def gives_up(name: str, when: Predicate, reason: Reason) -> Transition:
     """The landing has ended, and not as it should."""
     return Transition(name, {P.LANDING}, when, P.ABORTED, reason, S.LAND, O.SAFETY)
 
@@ -708,7 +715,7 @@ TABLE: tuple[Transition, ...] = (
     gives_up(
         "landing-timeout",
         lambda c: c.in_phase_s > c.planner.landing.timeout_s,
-        "the landing was not confirmed in time",
+        why_unconfirmed,
     ),
 )
 
