@@ -8,6 +8,7 @@ its server is gone. So with VRPN silence is all that can be told.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
 import signal
 import socket
@@ -217,6 +218,8 @@ def serve_parent() -> None:
     channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
     is_loaded = False
+    # A library that lets no thread have a turn outlives a parent that was killed, but not this.
+    faulthandler.dump_traceback_later(setup.timeout_s + 1.0, exit=True)
     try:
         import motioncapture
 
@@ -224,6 +227,7 @@ def serve_parent() -> None:
         if setup.kind == "optitrack":  # its reader knows no names
             options = options | {"hostname": socket.gethostbyname(options["hostname"])}
         client = motioncapture.connect(setup.kind, options)
+        faulthandler.cancel_dump_traceback_later()
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.partial)
     except Exception as error:  # whatever the library, or the loading of its own modules, raises

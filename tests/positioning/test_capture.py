@@ -162,15 +162,19 @@ def test_bodies_that_come_one_by_one_do_not_hide_each_other(
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("fault", ["stalls", "hangs"])
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
-def test_it_ends_with_a_parent_that_was_killed(faulty: Callable[..., MotionCapture]) -> None:
+def test_it_ends_with_a_parent_that_was_killed(
+    faulty: Callable[..., MotionCapture], fault: str
+) -> None:
     code = (
-        "import time\n"
-        f"import sys; sys.path.append({str(ROOT)!r})\n"
-        "from perchctl.positioning import capture\n"
+        f"import sys, time; sys.path.append({str(ROOT)!r})\n"
+        "from perchctl.positioning.capture import MotionCapture, setup_of\n"
         "from perchctl.profile.positioning import PositioningConfig\n"
-        "one = capture.open_capture(PositioningConfig(by='mocap', host='stalls', body='cf'))\n"
-        "print(one._child.pid, flush=True); time.sleep(60)\n"
+        f"config = PositioningConfig(by='mocap', host={fault!r}, body='cf', connect_timeout_s=1)\n"
+        "class Told(MotionCapture):\n"
+        "    def _words(self): print(self._child.pid, flush=True); time.sleep(60)\n"
+        "one = Told(setup_of(config), '', 'cf'); one._words()\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
