@@ -62,7 +62,6 @@ class Firmware:
         self._low_level = False
         self._thrust_locked = True
         self.estimator = Estimator(self.scenario, self._parameters)
-        self.external_tick_ms = 0
         self.planner = Planner()
         self.supervisor = Supervisor()
         self.controller = Controller()
@@ -156,7 +155,6 @@ class Firmware:
 
     def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
         """Take a position from outside, m, or a pose: w, x, y, z, body to world."""
-        self.external_tick_ms = int(1e3 * self.t_s) % 65536
         self.estimator.external(position_m, quaternion)
 
     # What can be read ---------------------------------------------------------------

@@ -86,7 +86,6 @@ LOG_VARIABLES: dict[str, LogVariable] = {
     "pm.state": _field("power_state", ctype="int8_t"),
     "supervisor.info": _field("supervisor_info", ctype="uint16_t"),
     "stabilizer.thrust": _field("controller.thrust"),
-    "locSrvZ.tick": _field("external_tick_ms", ctype="uint16_t"),
     **{f"motor.m{i + 1}": _item("motors", i, "uint16_t") for i in range(4)},
 }
 for _i, _axis in enumerate("xyz"):
