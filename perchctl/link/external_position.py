@@ -91,6 +91,7 @@ def settle(
             )
         start = feed.place()
         assert start is not None  # one was sent
+        x, y, z = start.position_m
         set_parameters(cf, uri, start_parameters(start))
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
         for value in (1, 0):
@@ -98,12 +99,12 @@ def settle(
             wait(RESET_PULSE_S * value)
         if _agree(feed, start, newest, clock, wait):
             return
-    where = (
-        "the origin, where it stands" if config.by == "target" else f"where {config.label} sees it"
-    )
+    where = "the origin, where it stands"
+    if config.by != "target":
+        where = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, where {config.label} sees it"
     raise TimedOut(
         f"the estimate of {uri} does not come to {where}: does it stand still, and do positions "
-        f"arrive, and of this vehicle?"
+        f"arrive, of this vehicle and in metres?"
     )
 
 
