@@ -50,7 +50,9 @@ class Comparison(BaseModel):
         when, age_s = self.text(now), (now - self.at).total_seconds()
         if not self.passed:
             return f"{self.found} ({when})", f"mend that, then {AGAIN}"
-        if not -AHEAD_S <= age_s <= VALID_S:
+        if age_s < -AHEAD_S:
+            return f"{when}, which is yet to come", f"set this computer's clock, then {AGAIN}"
+        if age_s > VALID_S:
             return f"{when}, {age_s / 3600.0:.0f} h ago (24 h at most)", AGAIN
         return None
 
