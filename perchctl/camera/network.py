@@ -11,10 +11,10 @@ import math
 import re
 from base64 import b64encode
 from collections import deque
-from contextlib import closing
+from contextlib import closing, suppress
 from http.client import HTTPResponse
 from typing import Any
-from urllib.error import HTTPError
+from urllib.error import HTTPError, URLError
 from urllib.parse import unquote, urlsplit, urlunsplit
 from urllib.request import (
     HTTPDigestAuthHandler,
@@ -37,7 +37,7 @@ READ_BYTES = 65536
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*"}
 _NOT_MENDED = (401, 403, 404, 410)
 """What the server answers to another attempt, too."""
-_DIGEST = re.compile(r"\bDigest\s+(.*)", re.IGNORECASE)
+_DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 
 
 class MjpegSource(LiveSource):
@@ -76,24 +76,29 @@ class MjpegSource(LiveSource):
         try:
             response = opener.open(request, timeout=self.read_timeout_s)
         except HTTPError as refused:
-            if refused.code != 401 or not any(self._name_and_password):
+            asked = ", ".join(refused.headers.get_all("WWW-Authenticate") or [])
+            answer = self._answer(asked, request) if any(self._name_and_password) else None
+            if refused.code != 401 or answer is None:
                 raise
             refused.close()
-            asked = ", ".join(refused.headers.get_all("WWW-Authenticate") or [])
-            request.add_unredirected_header("Authorization", self._answer(asked, request))
+            request.add_unredirected_header("Authorization", answer)
             response = opener.open(request, timeout=self.read_timeout_s)
         return response
 
-    def _answer(self, asked: str, request: Request) -> str:
-        """Return the Authorization header, by a digest where the camera takes one: basic shows the
-        password."""
-        found = _DIGEST.search(asked)
-        if found is None:
+    def _answer(self, asked: str, request: Request) -> str | None:
+        """Return the Authorization header, by a digest where the camera takes one, since basic
+        shows the password; None if the library knows none of its digests."""
+        digests = _DIGEST.split(asked)[1:]
+        if not digests:
             return "Basic " + b64encode(":".join(self._name_and_password).encode()).decode()
         passwords = HTTPPasswordMgrWithDefaultRealm()
         passwords.add_password(None, request.full_url, *self._name_and_password)
-        challenge = parse_keqv_list(parse_http_list(found[1]))
-        return f"Digest {HTTPDigestAuthHandler(passwords).get_authorization(request, challenge)}"
+        handler = HTTPDigestAuthHandler(passwords)
+        for digest in digests:
+            with suppress(ValueError, URLError):  # of an algorithm that it does not know
+                challenge = parse_keqv_list(parse_http_list(digest))
+                return f"Digest {handler.get_authorization(request, challenge)}"
+        return None
 
     def _read(self, response: HTTPResponse) -> None:
         splitter = JpegSplitter()

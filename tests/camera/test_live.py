@@ -145,11 +145,13 @@ def test_no_first_frame_in_time(server: MjpegServer) -> None:
 
 DIGEST = 'Digest realm="camera", nonce="n1", qop="auth"'
 BASIC = 'Basic realm="camera"'
+UNKNOWN = DIGEST.replace("n1", "n2") + ", algorithm=SHA-256"
 
 
 @pytest.mark.parametrize(("challenges", "answered"), [
     ([BASIC], "Basic bWU6cEBzcw=="),
     ([BASIC, DIGEST], 'Digest username="me", realm="camera"'),
+    ([f"{UNKNOWN}, {DIGEST}", UNKNOWN], 'Digest username="me", realm="camera"'),
 ])  # fmt: skip
 def test_name_and_password_are_sent_once_they_are_asked_for(
     challenges: list[str], answered: str, server: MjpegServer, opened: list[LiveSource]
@@ -182,6 +184,7 @@ def test_a_redirect_to_another_address_gets_no_password(
     ({"status": 403}, "me:wrong@", "403"),
     ({"challenges": [DIGEST]}, "", "401 .*as in http://NAME:PASSWORD"),
     ({"challenges": [DIGEST]}, "me:wrong@", "401 .*as in http://NAME:PASSWORD"),
+    ({"challenges": [BASIC, UNKNOWN]}, "me:wrong@", "401 .*as in http://NAME:PASSWORD"),
 ])  # fmt: skip
 def test_what_trying_again_would_not_mend_is_said_at_once(
     changes: dict[str, Any], who: str, words: str, server: MjpegServer
