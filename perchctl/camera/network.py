@@ -228,6 +228,8 @@ _FINAL = (
 )
 """PyAV's errors that another attempt would not mend, by name."""
 _REASONS = {
+    "HTTPUnauthorizedError": "it wants another name or password (401), as in "
+    "rtsp://NAME:PASSWORD@HOST/PATH",
     "OSError": "the host cannot be reached, or its name is unknown",
     "ExitError": "no answer in time",
     "InvalidDataError": "no answer in time, or none of RTSP",
