@@ -121,7 +121,7 @@ def one_line(error: Exception) -> str:
     if isinstance(error, ConnectionRefusedError):
         return "connection refused"
     text = " ".join(without_password(str(error)).split())
-    return f"{type(error).__name__}: {text}"
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 class LiveSource:

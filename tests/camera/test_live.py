@@ -112,7 +112,8 @@ def test_an_unforeseen_error_in_a_stream_is_followed_by_another_connection(
     assert source.problem(100.0) is None
     opened.append(source := Broken(error, 5))
     until(lambda: source.problem(100.0) is not None)
-    assert type(error).__name__ in str(source.problem(100.0))
+    words = f"in 5 attempts: {type(error).__name__}: {error}".removesuffix(": ")
+    assert str(source.problem(100.0)).endswith(words)
     assert "secret" not in str(source.problem(100.0))
 
 
