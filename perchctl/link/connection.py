@@ -264,13 +264,15 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 def ready_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence it: its log has tracebacks of what is reported by callback as well."""
+    silence it: its log has tracebacks of what is reported by callback as well, and its radio prints
+    on stdout, which is for results."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 
     logger = logging.getLogger("cflib")
     logger.addHandler(logging.NullHandler())
     logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
+    vars(radiodriver)["print"] = lambda *words: logger.info("%s", words)
     radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()

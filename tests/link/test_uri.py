@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from cflib.crtp import radiodriver
 
 from perchctl.errors import InvalidValue
 from perchctl.link import check_uri, listening, vehicle_uri
@@ -46,17 +47,20 @@ def test_which_uris_are_of_one_vehicle(one: str, other: str, same: bool) -> None
     assert (vehicle_uri(one) == vehicle_uri(other)) is same
 
 
-def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    """cflib's own have an address without the zeros in front."""
+def test_a_scan_gives_uris_that_are_taken_and_prints_nothing(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """cflib's own have an address without the zeros in front, and its radio prints what fails."""
 
     class Radio:
         def scan_interface(self, address: int | None) -> list[list[str]]:
             end = "" if address is None else f"/{address:X}"
             return [[f"radio://0/80/2M{end}", ""]]
 
-    monkeypatch.setattr("cflib.crtp.CLASSES", [Radio])
-    monkeypatch.setattr(listening, "ready_cflib", lambda: None)
+    monkeypatch.setattr("cflib.crtp.CLASSES", [radiodriver.RadioDriver, Radio])
+    monkeypatch.setattr(radiodriver.RadioManager, "open", lambda number: 1 / 0)
     monkeypatch.setattr(listening, "_radio_problem", lambda: "")
     found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100")[0]
     assert found == ["radio://0/80/2M", "radio://0/80/2M/1"]
     assert list(map(check_uri, found)) == ["radio", "radio"]
+    assert capfd.readouterr() == ("", "")
