@@ -53,6 +53,9 @@ class ListeningLink(CflibLink):
     def _may_say_farewell(self) -> bool:
         return False  # neither when connecting fails half-way
 
+    def _prepare(self, connection: Connection) -> None:
+        """Nothing, unless a subclass listens to something."""
+
 
 # --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet ---
 

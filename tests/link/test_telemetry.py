@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.link import MotionLink
-from perchctl.link.listening import MOTION_BLOCK
+from perchctl.link.listening import MOTION_BLOCK, ListeningLink
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
     BATTERY_BLOCK,
@@ -137,6 +137,8 @@ class Listened(MotionLink):
 
 
 def test_whether_motors_turn_is_the_newest_packet_s() -> None:
+    """A link that only listens sends nothing for it."""
+    ListeningLink("usb://0", LinkConfig(), float)._prepare(None)  # type: ignore[arg-type]
     link = Listened()
     for bits in (FLYING, 0, FLYING | 0x2):
         link.hear(**{"supervisor.info": bits, "gyro.x": math.nan})
