@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.errors import TimedOut
-from perchctl.flight import out_of_view
+from perchctl.errors import SafetyAbort, TimedOut
+from perchctl.flight import fly_lockstep, out_of_view
 from perchctl.flight.preflight import (
     LEAN_DEG,
     still_waiting_for,
@@ -85,10 +85,9 @@ def test_put_where_the_refusal_says_it_flies(
 def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
     near = changed({"planner.approach_xy_m": (0.3, -0.2)}, TARGET)
     assert out_of_view(place(0.1, 0.05), FEET, 0.0, near, CAMERA) is None
-    problem = out_of_view(place(0.1, 0.05), FEET, 0.0, FAR_APPROACH, CAMERA)
-    assert problem is not None
-    words = r"from x 2\.00, y 0\.00 m .* would not see it.*1\.93 m aside .*leave .* out"
-    assert re.search(words, problem.sentence)
+    words = r"from x 2\.00, y 0\.00 m .* would not see it.* m aside .*leave .* out"
+    with pytest.raises(SafetyAbort, match=words):
+        fly_lockstep(FAR_APPROACH, 1)
 
 
 # --- Waiting for it -------------------------------------------------------------------------
