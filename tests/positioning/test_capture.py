@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +15,6 @@ from typing import Any, ClassVar
 import pytest
 
 import perchctl
-from perchctl.children import Channel
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.positioning import PositionFeed, capture, open_capture
 from perchctl.positioning import capture as capture_module
@@ -230,19 +227,12 @@ def test_the_real_library_through_its_process() -> None:
 # --- The reader's process: it ends with its parent, and not before -----------------------------
 
 
-def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    channel, parent = (Channel(end.detach()) for end in socket.socketpair())
-    ended = threading.Event()
-    monkeypatch.setattr(capture.os, "_exit", lambda code: ended.set())
-    parent.send(None)
-    assert channel.receive(0.05) is None
-    thread = threading.Thread(target=capture._end_with, args=(channel,))
-    thread.start()
-    assert not ended.wait(0.3)  # long after that limit
-    parent.close()
-    assert ended.wait(5.0)
-    thread.join()
-    channel.close()
+@pytest.mark.long
+def test_a_reader_outlives_the_time_in_which_it_was_set_up(
+    faulty: Callable[..., MotionCapture],
+) -> None:
+    reader, end_s = faulty("good", timeout_s=1.0), time.monotonic() + 2.5
+    until(lambda: (frame := reader.poll(time.monotonic())) and frame.t_s > end_s)
 
 
 class Clock:
