@@ -27,14 +27,10 @@ def check_firmware(cf: Any, uri: str) -> None:
         raise NotFound(f"the firmware at {uri} has no log variable {name}: {remedy}")
 
 
-def is_logged(cf: Any, name: str) -> bool:
-    """True if the firmware logs this variable."""
-    return cf.log.toc.get_element_by_complete_name(name) is not None
-
-
 def missing_variables(cf: Any) -> list[str]:
     """Return the needed variables that the firmware does not log."""
-    return [name for name in NEEDED if not is_logged(cf, name)]
+    table = cf.log.toc
+    return [name for name in NEEDED if table.get_element_by_complete_name(name) is None]
 
 
 def set_parameters(

@@ -32,7 +32,6 @@ from perchctl.link.external_position import estimator_parameters
 from perchctl.link.firmware import (
     NEEDED_PROTOCOL,
     check_firmware,
-    is_logged,
     missing_variables,
     read_parameters,
 )
@@ -173,10 +172,6 @@ class ProbeLink(ListeningLink):
     def lost(self) -> str | None:
         """Return why the link is gone, None while it is there."""
         return "it was closed" if self.connection is None else self.connection.lost
-
-    def has_variable(self, name: str) -> bool:
-        """True if the firmware logs this variable."""
-        return is_logged(self._cf, name)
 
     def echoes(self, duration_s: float) -> list[float]:
         """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time
