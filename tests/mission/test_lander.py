@@ -310,6 +310,19 @@ def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     assert lander.observe(Context(moved, later, c.profile)).state.reckoning.velocity_mps[0] < 0.2
 
 
+@pytest.mark.parametrize(("phase", "since_s", "is_there"), [
+    (Phase.PERCH, 1.0, True), (Phase.PERCH, 0.1, False), (Phase.LANDING, 1.0, False),
+])  # fmt: skip
+def test_what_carries_it_near_its_only_position_is_the_target(
+    phase: Phase, since_s: float, is_there: bool
+) -> None:
+    """Late pictures show it lower. On its way down the floor carries it, too."""
+    c = context("sight", phase=phase, since={planner.Condition.CARRIED: NOW_S - since_s})
+    reckoning = replace(c.state.reckoning, below_m=0.1)
+    state = lander.observe(c.evolve(reckoning=reckoning)).state
+    assert (state.reckoning.below_m == 0.0) is is_there
+
+
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""

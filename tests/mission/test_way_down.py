@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import ContactError, Observation, Outcome, Phase, PlannerState
+from perchctl.mission import ContactError, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.guidance import UNREAD_S
 from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.planner import step_mission
@@ -333,13 +333,18 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
 # --- Where it touched, as it is remembered -------------------------------------------------------
 
 
-@pytest.mark.parametrize(("since_s", "touched"), [(10.0, False), (9.0, True)])
-def test_one_sample_that_looks_like_a_contact_is_no_touch(since_s: float, touched: bool) -> None:
+@pytest.mark.parametrize(("steady_s", "since_s", "touched"), [
+    (math.inf, 10.0, False), (math.inf, 9.0, True), (9.0, 10.0, True),
+])  # fmt: skip
+def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is_one(
+    steady_s: float, since_s: float, touched: bool
+) -> None:
     tel = telemetry(10.02, HANG_Z_M, thrust=1.2 * HOVER_THRUST)
     pressing = landing(phase=Phase.PERCH, since={Condition.CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
-    after, _ = step_mission(pressing, observation(10.02, telemetry=tel), PROFILE, backs_off)
+    obs = observation(10.02, telemetry=tel, imu=ImuMotion(steady_s=steady_s))
+    after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
     assert (after.contact is not None) is touched
 
