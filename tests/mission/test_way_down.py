@@ -360,6 +360,14 @@ def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_reco
 # --- The release -----------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("obs", "is_held"), [({"target": None}, True), ({}, False)])
+def test_a_landing_that_does_not_come_down_is_held_unless_its_target_is_far_above(
+    obs: dict[str, Any], is_held: bool
+) -> None:
+    flight = fly(landing(1.5), at(1.5, obs=obs, thrust=20000.0), 1.2)
+    assert isinstance(flight.command, RawThrust) is is_held
+
+
 def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
     """Still motors would be a stop without a proof: what the magnet lets go of meanwhile is
     on the floor before the link counts as lost. Seen again, it begins anew."""
