@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 from perchctl.link import MotionLink
 from perchctl.link.listening import MOTION_BLOCK, ListeningLink
 from perchctl.link.telemetry import (
-    ATTITUDE_BLOCK,
-    BATTERY_BLOCK,
     BLOCKS,
     MOST_CARRIED_S,
     NEEDED,
-    STATE_BLOCK,
     WRAP_MS,
     Assembler,
     Timebase,
@@ -26,14 +23,6 @@ from perchctl.link.telemetry import (
 )
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
-
-SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
-
-
-@pytest.mark.parametrize("block", [STATE_BLOCK, ATTITUDE_BLOCK, BATTERY_BLOCK])
-def test_blocks_fit_into_a_packet(block: dict[str, str]) -> None:
-    """Firmware facts, "Link": at most 26 bytes a log block."""
-    assert sum(SIZES[ctype] for ctype in block.values()) <= 26
 
 
 def test_pitch_and_degrees_turn_at_the_edge() -> None:
