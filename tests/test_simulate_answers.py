@@ -14,12 +14,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import FlightResult
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import Profile
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import ROOT
 from tests.helpers.results import landed, perched
 
-SIM = load_profile("sim")
 KEY = "planner.integral_per_s"
 FLY_VARIANTS = "perchctl.campaign.fly_variants"
 Note = Callable[[Any], None]

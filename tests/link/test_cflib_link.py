@@ -44,7 +44,6 @@ CONFIG = LinkConfig(parameters={"stabilizer.estimator": 2})
 LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
 RAW_PORT = 3  # raw setpoints: attitude and thrust
 COMMAND_PORTS = (RAW_PORT, 7, 8, 9)
-LAND = Land(-0.05, 1.5)
 
 
 def let_pass(sim: SimProcess, dt_s: float, meanwhile: Callable[[], None] = lambda: None) -> None:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import perchctl
 from perchctl.mission import (
     Finding,
     ImuMotion,
@@ -60,7 +58,6 @@ from tests.mission.rig import TICK_S, at, is_setpoint
 DECKS = PROFILES["deck"]
 NOW_S = 10.0
 HIGH_M, LOW_M = 1.5, 0.2
-PERCHCTL = Path(perchctl.__file__).parent
 # --- By what is known ---------------------------------------------------------------------
 
 # Profile; what is observed, and what is remembered, beyond a hover that all is known of; what is

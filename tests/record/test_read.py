@@ -75,7 +75,6 @@ def with_line(at: int, line: bytes) -> Callable[[bytes], bytes]:
     return damaged
 
 
-NOW = __version__.encode()
 NO_LOG = "line 1: not a flight log"
 DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "empty": (b"", (NO_LOG, "logs are the .jsonl files")),

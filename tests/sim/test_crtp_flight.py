@@ -30,7 +30,6 @@ from tests.helpers.crtp_rig import (
 
 PACKET_S = 0.004  # a silence that swallows what is sent at its start
 LIFTED_M = 0.022  # 1 cm over the floor
-PRESSED_M = 2.5  # a setpoint above the ceiling at 2.2 m
 
 
 def lose(pilot: Pilot, send: Callable[[], None]) -> None:
