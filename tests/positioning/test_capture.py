@@ -16,12 +16,13 @@ import pytest
 
 import perchctl
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
-from perchctl.positioning import PositionFeed, capture, open_capture
+from perchctl.positioning import PositionFeed, open_capture
 from perchctl.positioning import capture as capture_module
 from perchctl.positioning.capture import CaptureSetup, MotionCapture, setup_of
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 from tests.helpers.capture import LIBRARY
+from tests.helpers.live import Clock
 from tests.helpers.waiting import until
 
 ROOT = Path(perchctl.__file__).resolve().parents[1]
@@ -235,14 +236,6 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(
     until(lambda: (frame := reader.poll(time.monotonic())) and frame.t_s > end_s)
 
 
-class Clock:
-    def __init__(self) -> None:
-        self.t_s = 100.0
-
-    def monotonic(self) -> float:
-        return self.t_s
-
-
 class Client:
     """Gives a frame after each of these waits, s, and then is gone."""
 
@@ -263,11 +256,11 @@ def test_what_waited_in_the_library_s_queue_is_not_passed_on_as_new(
 ) -> None:
     """After a pause come the frames of the pause, one upon the other, the oldest first."""
     clock, sent = Clock(), list[tuple[float, object]]()
-    monkeypatch.setattr(capture, "time", clock)
+    monkeypatch.setattr(capture_module, "time", SimpleNamespace(monotonic=clock))
     steady, queued = [0.01] * 3, [0.5, 1e-5, 1e-5, 1e-5]
     channel: Any = SimpleNamespace(send=sent.append)
     with pytest.raises(RuntimeError):
-        capture._pass_on(Client(clock, steady + queued + steady), channel, False)
+        capture_module._pass_on(Client(clock, steady + queued + steady), channel, False)
     begun_s = 100.0 + sum(steady) + sum(queued)
     assert len(sent) == 2 * len(steady)
     assert not [t_s for t_s, _ in sent if 100.0 + sum(steady) + 1e-6 < t_s <= begun_s + 1e-6]
