@@ -333,13 +333,13 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
 # --- Where it touched, as it is remembered -------------------------------------------------------
 
 
-@pytest.mark.parametrize(("steady_s", "since_s", "touched"), [
-    (math.inf, 10.0, False), (math.inf, 9.0, True), (9.0, 10.0, True),
+@pytest.mark.parametrize(("share", "steady_s", "since_s", "touched"), [
+    (1.2, 99, 10.0, False), (1.2, 99, 9.0, True), (1.2, 9.0, 10.0, True), (0.5, 9.0, 10.0, True),
 ])  # fmt: skip
 def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is_one(
-    steady_s: float, since_s: float, touched: bool
+    share: float, steady_s: float, since_s: float, touched: bool
 ) -> None:
-    tel = telemetry(10.02, HANG_Z_M, thrust=1.2 * HOVER_THRUST)
+    tel = telemetry(10.02, HANG_Z_M, thrust=share * HOVER_THRUST)
     pressing = landing(phase=Phase.PERCH, since={Condition.CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
