@@ -60,7 +60,7 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 class MarkerReading:
     """The poses (x, y, z, yaw) in one frame, each (4,) or None where it was not found.
 
-    `center_px` (2,) is the mean of both markers' corners, None where one is missing."""
+    `center_px` (2,) is the mean of both markers' corners, None where a pose is missing."""
 
     t_s: float
     large: Array | None
@@ -81,7 +81,8 @@ def read_markers(
     state = PipelineState()
     for frame in frames:
         state, output = step(state, frame, attitude, setup)
-        seen = [d for name in MARKERS if (d := output.detections.get(name)) is not None]
+        found, poses = output.detections, output.poses
+        seen = [d for name in MARKERS if (d := found.get(name)) is not None and name in poses]
         yield MarkerReading(
             frame.t_s,
             _vector(output.poses.get("large")),

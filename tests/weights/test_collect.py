@@ -12,7 +12,12 @@ import pytest
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.profile import PositioningConfig, find_calibration, load_profile
+from perchctl.profile import (
+    PositioningConfig,
+    changed_profile,
+    find_calibration,
+    load_profile,
+)
 from perchctl.weights import MocapTruth, SimulatedStand
 from perchctl.weights.collect import position_fault, read_markers
 from perchctl.weights.data import HEADER, read_data
@@ -75,6 +80,9 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     blind = [type(s)(s.t_s, s.large, None, None) for s in good]
     assert "at once were found in 6 of 12" in (position_fault([*good, *blind]) or "")
     assert "only 2 frames" in (position_fault(good[:2]) or "")
+    strict = changed_profile(profile, ["pose.max_reprojection_px=1e-6"])
+    poseless = list(read_markers(stand.frames(1, place, 3), strict, camera))
+    assert "at once were found in 0 of 3" in (position_fault(poseless) or "")
 
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
