@@ -163,7 +163,7 @@ def test_e_is_the_target_relative_to_the_gear_in_the_level_frame(
 def tilts_deg(attitude: bool, previous: bool, draws: int = 60) -> Array:
     """Angle between the true and the found normal of a small, far, tilted marker."""
     rng = np.random.default_rng(3)
-    roll, pitch = 0.20, -0.15
+    roll, pitch = -0.2, -0.2
     rvec, tvec = pose_of(0.02, -0.03, 0.9, 0.5, roll, pitch)
     true = cv2.Rodrigues(rvec)[0][:, 2]
     result = []
