@@ -12,12 +12,7 @@ import pytest
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.profile import (
-    PositioningConfig,
-    changed_profile,
-    find_calibration,
-    load_profile,
-)
+from perchctl.profile import PositioningConfig, changed_profile, find_calibration, load_profile
 from perchctl.weights import MocapTruth, SimulatedStand
 from perchctl.weights.collect import position_fault, read_markers
 from perchctl.weights.data import HEADER, read_data
