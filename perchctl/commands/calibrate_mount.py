@@ -24,11 +24,7 @@ from perchctl.calibration import (
     record_mounting,
     solve_mounting,
 )
-from perchctl.camera import (
-    check_size,
-    open_camera,
-    parse_source,
-)
+from perchctl.camera import check_size, open_camera, parse_source
 from perchctl.commands.command_line import (
     JsonOption,
     ProfileOption,
@@ -40,13 +36,7 @@ from perchctl.commands.interrupt import Stopper, ignore_signals
 from perchctl.commands.output import ask, print_lines, print_result, say, with_problem
 from perchctl.commands.progress import guide
 from perchctl.display import live_page
-from perchctl.errors import (
-    Interrupted,
-    InvalidValue,
-    NotFound,
-    SafetyAbort,
-    UsageError,
-)
+from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, UsageError
 from perchctl.files import check_place
 from perchctl.link import MotionLink, check_uri
 from perchctl.profile import (

@@ -19,20 +19,8 @@ from perchctl.commands.command_line import (
 from perchctl.commands.output import print_result
 from perchctl.errors import UsageError
 from perchctl.files import check_output, write_files
-from perchctl.profile import (
-    find_calibration,
-    load_profile,
-    writable_profile,
-    write_profile_values,
-)
-from perchctl.target import (
-    Board,
-    board_pdf,
-    make_design,
-    measured_target,
-    parse_length,
-    target_pdf,
-)
+from perchctl.profile import find_calibration, load_profile, writable_profile, write_profile_values
+from perchctl.target import Board, board_pdf, make_design, measured_target, parse_length, target_pdf
 
 PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
 MagnetOption = Annotated[

@@ -15,11 +15,7 @@ import typer
 
 from perchctl.analysis import profile_differences
 from perchctl.calibration import load_calibration
-from perchctl.camera import (
-    parse_source,
-    profile_record,
-    without_password,
-)
+from perchctl.camera import parse_source, profile_record, without_password
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands.command_line import (
     ForceOption,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 Vector3 = tuple[float, float, float]
 
@@ -37,6 +37,25 @@ Range = Ordered[float]
 
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse YAML's yes, no, on and off, which pydantic would read as 1 and 0."""
+        kind = cls.model_fields[info.field_name or ""].annotation
+        if _takes_numbers(kind) and _holds_switch(value):
+            raise ValueError("found true or false, as YAML reads yes, no, on, off; write a number")
+        return value
+
+
+def _takes_numbers(kind: Any) -> bool:
+    return kind in (int, float) or any(map(_takes_numbers, get_args(kind)))
+
+
+def _holds_switch(value: Any) -> bool:
+    if isinstance(value, (dict, list)):
+        return any(map(_holds_switch, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, bool)
 
 
 # --- Units ------------------------------------------------------------

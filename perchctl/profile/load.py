@@ -103,7 +103,8 @@ def _read_weights(name: str) -> WeightsConfig:
             f"the key"
         )
     weights = _read_yaml(path).get("weights")
-    missing = [axis for axis in WeightsConfig.model_fields if axis not in (weights or ())]
+    held = weights if isinstance(weights, dict) else {}
+    missing = [axis for axis in WeightsConfig.model_fields if axis not in held]
     if missing:
         raise InvalidValue(f"{path}: weights.{missing[0]} is missing; needed are x, y, z and yaw")
     try:

@@ -75,6 +75,18 @@ class PositioningConfig(Section):
         return values
 
     @model_validator(mode="after")
+    def _is_meant(self) -> PositioningConfig:
+        """Refuse a capture's keys by the decks: the flight would not use them. (A log's profile has
+        every key, and so `by`, too.)"""
+        given = self.model_fields_set - {"decks"}
+        if self.by == "deck" and (self.host if "by" in given else given):
+            raise ValueError(
+                "keys of a motion capture are given, but by is deck: write by: mocap, or only "
+                "positioning: deck"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _fits(self) -> PositioningConfig:
         if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
             raise ValueError(

@@ -71,6 +71,11 @@ class TargetDesign:
         if self.start_height_m == 0.0:
             sure_px = least_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
+        if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
+            found.append(
+                f"the ceiling is hardly above the search height ({self.start_height_m:g} m), or "
+                f"below it: lower planner.search.max_height_m"
+            )
         if start_m is not None and start_m > far_m:
             found.append(
                 f"gap at the start: from {self.start_height_m:g} m over the floor the target is "

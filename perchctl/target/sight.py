@@ -13,12 +13,7 @@ import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rot_z
 from perchctl.profile import Mounting, Profile, TargetConfig
-from perchctl.vision import (
-    CameraModel,
-    shows_enough_of_target,
-    square_corners,
-    undistort,
-)
+from perchctl.vision import CameraModel, shows_enough_of_target, square_corners, undistort
 
 MARGIN_PX = 3.0
 """cv2.aruco drops markers nearer than this to the picture's edge."""

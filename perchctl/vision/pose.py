@@ -478,7 +478,10 @@ def make_points(
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
         shift[rows, 0] = d.shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
-            W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
+            try:
+                W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
+            except np.linalg.LinAlgError:  # of a cut target's corners far aside, by rounding
+                W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
         elif d.refined:
             spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
             own = np.zeros(64)

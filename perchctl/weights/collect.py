@@ -60,7 +60,7 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 class MarkerReading:
     """The poses (x, y, z, yaw) in one frame, each (4,) or None where it was not found.
 
-    `center_px` (2,) is the mean of both markers' corners, None where one is missing."""
+    `center_px` (2,) is the mean of both markers' corners, None where a pose is missing."""
 
     t_s: float
     large: Array | None
@@ -81,7 +81,8 @@ def read_markers(
     state = PipelineState()
     for frame in frames:
         state, output = step(state, frame, attitude, setup)
-        seen = [d for name in MARKERS if (d := output.detections.get(name)) is not None]
+        found, poses = output.detections, output.poses
+        seen = [d for name in MARKERS if (d := found.get(name)) is not None and name in poses]
         yield MarkerReading(
             frame.t_s,
             _vector(output.poses.get("large")),
@@ -127,12 +128,13 @@ class SessionFile:
     Attributes:
         note: a sentence, if an unfinished end was taken off.
         done: number of positions that are complete.
+        next_position: number of the one to take next, above all that the file holds.
     """
 
     def __init__(self, path: Path, frames: int) -> None:
         self.path = path
         self.note = ""
-        self.done = 0
+        self.done, self.next_position = 0, 1
         if path.exists() and path.stat().st_size:
             self._continue(frames)
         else:
@@ -142,6 +144,7 @@ class SessionFile:
         """Append one whole position, and bring it to the disk."""
         self._write(rows, "a")
         self.done += 1
+        self.next_position += 1
 
     def _write(self, text: str, mode: str) -> None:
         try:
@@ -154,21 +157,27 @@ class SessionFile:
             raise cannot_be_written(self.path, error) from None
 
     def _continue(self, frames: int) -> None:
-        *lines, torn = self.path.read_bytes().split(b"\n")
+        try:
+            *lines, torn = self.path.read_bytes().split(b"\n")
+        except OSError as error:
+            raise InvalidValue(f"{self.path} cannot be read: {error.strerror}") from None
         if not lines or lines[0].strip() != HEADER.encode():
             raise InvalidValue(
                 f"{self.path}: line 1: not a session of perchctl (its header differs), so "
                 f"nothing is appended; name a new file"
             )
-        rows = Counter(line.partition(b",")[0] for line in lines[1:])
+        try:
+            positions = [int(line.partition(b",")[0]) for line in lines[1:]]
+        except ValueError:
+            raise InvalidValue(f"{self.path}: a row's position is not a whole number") from None
+        rows = Counter(positions)
         if torn:
             # The position that was being written: its tail is lost, so all of it is taken again.
-            last = lines[-1].partition(b",")[0]
-            if 0 < rows[last] < frames:
-                del lines[-rows.pop(last) :]
+            if positions and rows[positions[-1]] < frames:
+                del lines[-rows.pop(positions[-1]) :]
             os.truncate(self.path, sum(len(line) + 1 for line in lines))
             self.note = f"{self.path}: an unfinished end was taken off"
-        self.done = len(rows)
+        self.done, self.next_position = len(rows), max(rows, default=0) + 1
 
 
 # --- The actual pose --------------------------------------------------
@@ -282,10 +291,10 @@ class Experiment:
         """Take positions until the session holds so many. Raises Interrupted when the person stops
         (the session keeps what is complete), and the errors of the source and the truth."""
         while self.session.done < positions:
-            number = self.session.done + 1
+            number = self.session.next_position
             self.say(
-                f"position {number} of {positions}: place the camera so that both markers are "
-                f"whole in the picture, at another height, place and heading"
+                f"position {self.session.done + 1} of {positions}: place the camera so that both "
+                f"markers are whole in the picture, at another height, place and heading"
             )
             fault = self._try_position(number, frames)
             if fault is None:

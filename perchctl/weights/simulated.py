@@ -55,7 +55,7 @@ class SimulatedStand:
     def fill(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
         """Complete the session; `advance` is called with each frame. Raises InvalidValue."""
         while session.done < self._positions:
-            position = session.done + 1
+            position = session.next_position
             place, readings = self.place(position), []
             shown = self.frames(position, place, frames)
             for reading in read_markers(shown, self._profile, self._camera):

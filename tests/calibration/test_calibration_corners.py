@@ -13,13 +13,7 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.target import Board
 from perchctl.vision import project, split_fields
-from tests.helpers.boards import (
-    CHARUCO,
-    CHESSBOARD,
-    BoardRenderer,
-    draw_camera,
-    draw_poses,
-)
+from tests.helpers.boards import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera, draw_poses
 from tests.helpers.gear import SIZE_PX, Pictures, legs, turned_about
 from tests.helpers.recording import VIEWS, picture
 

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from perchctl.calibration import (
-    FoundViews,
-    calibrate_camera,
-    calibration_text,
-    load_calibration,
-)
+from perchctl.calibration import FoundViews, calibrate_camera, calibration_text, load_calibration
 from perchctl.calibration.board.adjust import MODEL_NAMES, PARAMETERS, parameters_of
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel

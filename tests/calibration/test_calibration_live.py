@@ -13,12 +13,7 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import GuidedFrame, capture_views
-from perchctl.calibration.board.capture import (
-    Capture,
-    covered_shares,
-    next_advice,
-    signature,
-)
+from perchctl.calibration.board.capture import Capture, covered_shares, next_advice, signature
 from perchctl.camera import Grey
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut

@@ -18,11 +18,7 @@ from perchctl.camera import image_files
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
-from tests.helpers.boards import (
-    CHESSBOARD,
-    corner_views,
-    draw_camera,
-)
+from tests.helpers.boards import CHESSBOARD, corner_views, draw_camera
 
 pytestmark = pytest.mark.long
 PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "shared" / "data" / "chessboard"

@@ -38,6 +38,11 @@ def frame(image: NDArray[np.uint8], index: int = 0) -> Frame:
     return Frame(index, index / 30.0, image)
 
 
+def waved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The picture with its rows up to 4 px to and fro: edges all over, and no side a line."""
+    return np.stack([np.roll(row, round(4.0 * math.sin(k / 5.0))) for k, row in enumerate(image)])
+
+
 def followed(
     image: NDArray[np.uint8],
     expected: Mapping[MarkerName, Array],

@@ -18,13 +18,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.positioning import (
-    BodyPose,
-    CaptureFrame,
-    FeedStatus,
-    Placed,
-    PositionFeed,
-)
+from perchctl.positioning import BodyPose, CaptureFrame, FeedStatus, Placed, PositionFeed
 from perchctl.positioning import feed as feeding
 from perchctl.positioning.feed import QUIET_S, STALE_S
 from perchctl.profile import PositioningConfig

@@ -24,8 +24,9 @@ def fly(*words: str) -> Result:
 
 
 @pytest.mark.parametrize(("section", "words"), [
-    (f"{{by: mocap, host: '{host}'}}", f"found '{host}'")
-    for host in ("http://lab", "lab:0", "lab:x", "lab/1", "a b")
+    ("{host: lab}", "but by is deck: write by: mocap"), ("{by: deck, host: lab}", "but by is deck"),
+    *((f"{{by: mocap, host: '{host}'}}", f"found '{host}'")
+      for host in ("http://lab", "lab:0", "lab:x", "lab/1", "a b")),
 ])  # fmt: skip
 def test_a_section_that_cannot_be_meant_is_refused(
     tmp_path: Path, section: str, words: str

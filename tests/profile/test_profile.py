@@ -91,7 +91,6 @@ def _refusal(tmp_path: Path, text: str) -> str:
         *((f"camera: {{format: {value}}}",
            ["camera.format", f"found {found}"])
           for value, found in [("4", "4"), ("mjpeg", "'mjpeg'"), ("[MJPG]", "['MJPG']")]),
-        ("camera: {latency_s: yes}", ["camera.latency_s"]),
         ("target: {small: {dictionary: DICT_4X4_1000, id: 997, side_m: 0.025}}",
          ["target", "the same marker", "DICT_4X4_1000/997", "another id"]),
         ("target: {large: {dictionary: DICT_4X4_50, id: 5, side_m: 0.15}, "
@@ -99,6 +98,9 @@ def _refusal(tmp_path: Path, text: str) -> str:
          ["target", "the same marker", "DICT_4X4_50/5 and DICT_4X4_250/5", "another id"]),
         ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "keep one"]),
         ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 is there twice"]),
+        ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
+        ("planner: {approach_xy_m: [off, 1]}", ["planner.approach_xy_m", "a number"]),
+        ("link: {parameters: {a.b: on}}", ["link.parameters", "a number"]),
         ("", ["empty", "extends: sim"]),
         ("# only a remark\n", ["empty"]),
         ("camera:\nkalman: {}", ["camera", "must hold keys", "None"]),

@@ -8,12 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perchctl.commands.profile import (
-    PICTURE_EDGES,
-    edges_beside,
-    mount_from_edges,
-    picture_edges,
-)
+from perchctl.commands.profile import PICTURE_EDGES, edges_beside, mount_from_edges, picture_edges
 from perchctl.profile import Mounting, Profile, editor_schema, load_profile, profile_text
 from perchctl.profile.keys import keys
 from tests.helpers.flights import short_profile

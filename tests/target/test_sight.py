@@ -223,6 +223,7 @@ def test_z3_is_the_geometry_s() -> None:
     [
         ({}, ""),
         ({"z1_m": 0.9}, "gap at the start"),
+        ({"start_range_m": 0.2}, "hardly above the search height"),
         ({"z2_m": 0.15}, "gap between the markers"),
         ({"z1_m": None}, "never read"),
         ({"small_nearest_m": 0.2}, "gap before contact"),

@@ -8,11 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.profile import (
-    CameraConfig,
-    Mounting,
-    Profile,
-)
+from perchctl.profile import CameraConfig, Mounting, Profile
 from perchctl.profile.vision import VehicleConfig
 from perchctl.vision import CameraModel, Pipeline, make_pipeline
 from tests.helpers.target_picture import CAMERA

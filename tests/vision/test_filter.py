@@ -11,13 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.geometry import (
-    Array,
-    make_T,
-    rot_z,
-    rotation_from_rpy,
-    wrap_rad,
-)
+from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.profile import KalmanConfig, TargetConfig
 from perchctl.vision import Attitude, MarkerPose, Pipeline, PipelineState
 from perchctl.vision.filter import (

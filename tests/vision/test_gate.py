@@ -13,13 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.profile import KalmanConfig, MergeConfig
-from perchctl.vision import (
-    Attitude,
-    MarkerPose,
-    Pipeline,
-    PipelineOutput,
-    PipelineState,
-)
+from perchctl.vision import Attitude, MarkerPose, Pipeline, PipelineOutput, PipelineState
 from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.pipeline import follow
 from perchctl.vision.tracks import (

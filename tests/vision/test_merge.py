@@ -12,17 +12,8 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array, wrap_rad, yaw_of
 from perchctl.profile import Profile, WeightsConfig
-from perchctl.vision import (
-    MarkerPose,
-    PipelineState,
-    make_pipeline,
-    pictures,
-    step,
-)
-from perchctl.vision.merge import (
-    disagree,
-    merge_pair,
-)
+from perchctl.vision import MarkerPose, PipelineState, make_pipeline, pictures, step
+from perchctl.vision.merge import disagree, merge_pair
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 

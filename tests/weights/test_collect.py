@@ -12,10 +12,10 @@ import pytest
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.profile import PositioningConfig, find_calibration, load_profile
+from perchctl.profile import PositioningConfig, changed_profile, find_calibration, load_profile
 from perchctl.weights import MocapTruth, SimulatedStand
 from perchctl.weights.collect import position_fault, read_markers
-from perchctl.weights.data import read_data
+from perchctl.weights.data import HEADER, read_data
 from tests.helpers.weights_data import run
 
 
@@ -43,6 +43,9 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
     assert done.exit_code == 0, done.output
     assert "an unfinished end was taken off" in done.stderr
     assert torn.read_bytes() == whole
+    torn.write_bytes(b"".join(line for line in whole.splitlines(True) if line[:2] != b"2,"))
+    run("collect", torn, "--truth", "sim", "--frames", 12, "--positions", 4)
+    assert np.unique(read_data(torn).position).tolist() == [1, 3, 4, 5], "one was taken out"
 
 
 def test_a_file_that_is_no_session_is_left_alone(tmp_path: Path) -> None:
@@ -52,6 +55,9 @@ def test_a_file_that_is_no_session_is_left_alone(tmp_path: Path) -> None:
     assert done.exit_code == 30
     assert "nothing is appended" in done.stderr
     assert other.read_text(encoding="utf-8") == "position,t_s\n1,0.1\n"
+    other.write_text(f"{HEADER}\nx,0.1\n", encoding="utf-8")
+    for path, said in ((other, "position is not a whole number"), (tmp_path, "cannot be read")):
+        assert said in run("collect", path, "--truth", "sim").stderr
 
 
 def test_shaken_and_half_seen_positions_are_refused() -> None:
@@ -69,6 +75,9 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     blind = [type(s)(s.t_s, s.large, None, None) for s in good]
     assert "at once were found in 6 of 12" in (position_fault([*good, *blind]) or "")
     assert "only 2 frames" in (position_fault(good[:2]) or "")
+    strict = changed_profile(profile, ["pose.max_reprojection_px=1e-6"])
+    poseless = list(read_markers(stand.frames(1, place, 3), strict, camera))
+    assert "at once were found in 0 of 3" in (position_fault(poseless) or "")
 
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:

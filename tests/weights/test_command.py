@@ -65,7 +65,7 @@ def test_weights_go_to_a_file_and_from_there_into_a_flight(session: Path, tmp_pa
     [
         ("weights: {x: 2, y: 0, z: 0, yaw: 0}", "weights.x"),
         ("weights: {x: 0.5, y: 0, z: 0}", "weights.yaw is missing"),
-        ("date: today", "weights"),
+        ("weights: 0.5", "weights.x is missing"),
         ("- 1", "keys and values"),
     ],
 )

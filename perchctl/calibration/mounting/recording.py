@@ -95,7 +95,8 @@ class MountingRecording:
         except FileNotFoundError:
             raise NotFound(f"{path} is not there: name a recording of calibrate mount") from None
         except (OSError, UnicodeDecodeError) as error:
-            raise InvalidValue(f"{path} cannot be read: {error}") from None
+            why = error.strerror if isinstance(error, OSError) else "it is not text"
+            raise InvalidValue(f"{path} cannot be read: {why}") from None
         parts: list[MountingRecording] = []
         for number, line in enumerate(text.splitlines(), start=1):
             try:
@@ -112,7 +113,7 @@ class MountingRecording:
                     t_s, gyro_radps = _numbers(record, "t_s"), _numbers(record, "gyro_radps", 3)
                     roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()
                     parts[-1].attitudes.append(AttitudeSample(t_s, roll, pitch, yaw, gyro_radps))
-            except (LookupError, TypeError, ValueError) as error:
+            except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
                 raise InvalidValue(
                     f"{path}, line {number} is no line of a recording of calibrate mount: {error}"
                 ) from None

@@ -507,7 +507,7 @@ def fitted(
         moved_px = float(np.abs(places.J[:, :6] @ step).max())
         if moved_px < _STILL_PX:
             break
-    if found is None or moved_px > _SETTLED_PX or pose.t[2] <= 0.0:
+    if found is None or not (moved_px <= _SETTLED_PX and pose.t[2] > 0.0):  # or no number
         return None
     return _visible(pose, found, places, outline)
 

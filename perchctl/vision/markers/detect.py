@@ -30,12 +30,7 @@ from perchctl.vision.markers.corners import (
     with_missing_marker,
     within,
 )
-from perchctl.vision.markers.cut import (
-    MOST_AGE_S,
-    cut_markers,
-    is_cut,
-    may_be_whole,
-)
+from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
 from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_in, hides
 from perchctl.vision.markers.edge_fit import refine_lines
 from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen

@@ -21,14 +21,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.lens import distort, undistort_px
 from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, incremented, mapped
-from perchctl.vision.markers.pattern import (
-    EDGE,
-    Drawing,
-    sheets,
-    soft_cells,
-    softened,
-    square,
-)
+from perchctl.vision.markers.pattern import EDGE, Drawing, sheets, soft_cells, softened, square
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18

@@ -35,7 +35,7 @@ from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.partial import seen_edges
 from perchctl.vision.types import Detection, Detections, MarkerName
-from tests.helpers.markers import SETUP, both, corners, frame
+from tests.helpers.markers import SETUP, both, corners, frame, waved
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 # The camera beside the gear along the picture's height and along its width, under it, and so
@@ -169,6 +169,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     assert found.shown == found.in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert cut_markers(Picture(image, None, SETUP, plain), expected) == {}
+    assert nothing(look("width", waved(picture("width")))), "nor do edges that fit badly"
 
 
 @pytest.mark.parametrize("name", ["height", "width"])

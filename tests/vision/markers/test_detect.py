@@ -8,12 +8,7 @@ import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.detect import (
-    around,
-    between,
-    detect_markers,
-    follow,
-)
+from perchctl.vision.markers.detect import around, between, detect_markers, follow
 from perchctl.vision.markers.detector import Picture, make_aruco_detector
 from perchctl.vision.markers.search import misfit
 from perchctl.vision.types import Detection, Detections

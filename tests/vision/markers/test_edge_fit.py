@@ -10,19 +10,10 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.corners import (
-    RAW_SIGMA_PX,
-    SUBPIX_SIGMA_PX,
-    refine_each,
-)
-from perchctl.vision.markers.edge_fit import (
-    refine_lines,
-)
-from perchctl.vision.markers.pattern import (
-    cells_agree,
-    rim_of_bits,
-)
-from tests.helpers.markers import POSE, SETUP, corners
+from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine_each
+from perchctl.vision.markers.edge_fit import refine_lines
+from perchctl.vision.markers.pattern import cells_agree, rim_of_bits
+from tests.helpers.markers import POSE, SETUP, corners, waved
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 # --- Corners by lines --------------------------------------------------------------------------
@@ -149,6 +140,8 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
         assert not result.refined
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
         assert result.sigma_px in (RAW_SIGMA_PX, SUBPIX_SIGMA_PX)
+    waves = waved(render(*POSE, noise=2.0))
+    assert refine_lines(waves, corners("large")[None], [RIMS[6]], CAMERA) == [None]
 
 
 # --- Cells -------------------------------------------------------------------------------------

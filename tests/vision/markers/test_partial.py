@@ -16,21 +16,14 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, make_pipeline
 from perchctl.vision.fields import field_picture
+from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.corners import RefinedCorners, from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import (
-    Picture,
-    hidden_in,
-    hides,
-    make_aruco_detector,
-)
-from perchctl.vision.markers.partial import (
-    KnownBy,
-    seen_partly,
-)
+from perchctl.vision.markers.detector import Picture, hidden_in, hides, make_aruco_detector
+from perchctl.vision.markers.partial import KnownBy, seen_edges, seen_partly
 from perchctl.vision.markers.search import search
 from perchctl.vision.types import Detections, MarkerName
-from tests.helpers.markers import POSE, SETUP, corners, followed, frame
+from tests.helpers.markers import POSE, SETUP, corners, followed, frame, waved
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Grey = NDArray[np.uint8]
@@ -183,6 +176,7 @@ def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
     right = render(*pose)
     assert partly(right, turned, "other") is None
     assert partly(right, corners("large", pose), "bits") is not None
+    assert partly(waved(right), corners("large", pose), "bits") is None
 
 
 def test_a_code_that_may_be_another_one_is_not_told_by_its_bits_alone() -> None:
@@ -228,6 +222,10 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
     assert hides(covered, TRUE)
+    bare, at = render(*POSE, noise=2.0), from_unit(undistort_px(TRUE, CAMERA))
+    seen = [seen_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE) for gear in (None, covered)]
+    whole, rest = (edges.weight.sum() for edges in seen)
+    assert (rest < 0.95 * whole) == (name != "corner"), "no side that is hidden counts"
     setup, found = replace(SETUP, mask=covered), []
     for grey in (0, 120, 255):
         image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)

@@ -13,19 +13,11 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, square_corners
-from perchctl.vision.markers.blurred import (
-    expected_in_blur,
-    hidden_in_blur,
-    told_apart,
-    verified,
-)
+from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur, told_apart, verified
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.pattern import Drawing, drawing_of
-from perchctl.vision.markers.photometric_fit import (
-    Alignment,
-    align,
-)
+from perchctl.vision.markers.photometric_fit import Alignment, align
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
