@@ -226,11 +226,11 @@ def plot_of(log_path: Path, profile: Profile) -> Path | None:
     A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
     if not profile.log.plot:
         return None
-    from perchctl.analysis import plot_flight
-
     picture = path_beside(log_path, ".png")
     try:
         with interruptible():
+            from perchctl.analysis import plot_flight
+
             plot_flight(read_log(log_path), picture)
     except (Exception, KeyboardInterrupt) as error:
         say(f"the plot could not be drawn: {str(error) or 'Ctrl-C'}")
