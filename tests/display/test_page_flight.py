@@ -35,7 +35,7 @@ OVER = [Phase.PERCHED, Phase.LANDED, Phase.ABORTED]
 
 
 def state_of(page: LivePage) -> dict[str, Any]:
-    return dict(json.loads(ask(page.url, "/state")[1]))
+    return dict(json.loads(ask(page.url, "/state")[1], parse_constant=pytest.fail))
 
 
 def seen_in(frame: Frame) -> PipelineOutput:
@@ -82,6 +82,8 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     decoded = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
     drawn = np.asarray(decoded).astype(int)
     assert np.abs(drawn[150, 250:350] - 90).max() > 50
+    flight.tick(tick(e_m=(np.nan, np.inf, np.nan)))
+    assert state_of(page)["below_m"] is None
     assert flight.problem is None
 
 
