@@ -13,7 +13,7 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
-from perchctl.display import FlightPage, LivePage
+from perchctl.display import FlightPage, LivePage, Sketch
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.flight.operator import AGAIN_S, HELD_S
@@ -82,8 +82,9 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     decoded = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
     drawn = np.asarray(decoded).astype(int)
     assert np.abs(drawn[150, 250:350] - 90).max() > 50
-    flight.tick(tick(e_m=(np.nan, np.inf, np.nan)))
-    assert state_of(page)["below_m"] is None
+    flight.tick(tick(e_m=(np.nan, np.inf, np.nan), hold="camera silent"))
+    state = state_of(page)
+    assert (state["below_m"], state["note"]) == (None, "held: camera silent")
     assert flight.problem is None
 
 
@@ -106,11 +107,12 @@ def test_the_numbers_tell_their_age(page: LivePage, clock: list[float]) -> None:
     clock[0] += 60.0
     assert state_of(page)["age_s"] is None  # connecting may take its time
     flight.tick(tick(START_S))
-    assert state_of(page)["age_s"] == 0.0
+    page.show(Sketch(np.zeros((480, 640), np.uint8)))
+    state = state_of(page)
+    assert (state["age_s"], state["fresh"]) == (0.0, True)
     clock[0] += 3.25  # the loop hangs, the page's threads do not
-    assert state_of(page)["age_s"] == 3.25
-    flight.tick(tick(START_S + 3.3))
-    assert state_of(page)["age_s"] == 0.0
+    state = state_of(page)
+    assert (state["age_s"], state["fresh"]) == (3.25, False)
 
 
 @pytest.mark.parametrize("phase", OVER)
