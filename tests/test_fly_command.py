@@ -242,8 +242,9 @@ def test_the_outcome_and_the_plot_are_told_on_stdout(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.usefixtures("flown")
-def test_ctrl_c_in_the_drawing_leaves_the_result(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("name", ["plot_flight", "__getattr__"])
+def test_ctrl_c_in_the_drawing_or_its_loading_leaves_the_result(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It has been told before the drawing begins, and the object follows without a plot."""
 
@@ -251,7 +252,8 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
         assert "LANDED: Ctrl-C" in capsys.readouterr().err
         os.kill(os.getpid(), 2)  # Ctrl-C
 
-    monkeypatch.setattr("perchctl.analysis.plot_flight", draw)
+    monkeypatch.delattr("perchctl.analysis.plot_flight")
+    monkeypatch.setattr(f"perchctl.analysis.{name}", draw, raising=False)
     code = fly_and_report(resolve(), True, False)
     out, err = capsys.readouterr()
     told = json.loads(out)

@@ -140,8 +140,8 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
         raise
     except lost as error:
         raise PerchError(
-            f"a process that flew seed {seed} or another was ended from outside: where memory is "
-            f"short, fly fewer at a time (--jobs), and go on with --out by --resume"
+            "a flight's process was killed from outside: where memory is short, fly fewer at a "
+            "time (--jobs); --resume goes on with what --out holds"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(

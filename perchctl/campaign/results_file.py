@@ -164,18 +164,20 @@ def _read(path: Path, header: dict[str, Any], kind: type[R], earlier: dict[int, 
         found, *flights = map(json.loads, good.splitlines())
         if any(found.get(key) != value for key, value in _FORM.items()):
             raise ValueError(f"no header of version {VERSION}")
-        results = [from_exact(kind, flight) for flight in flights if flight.pop("kind") == "flight"]
+        others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header[key]]
+        if others:
+            raise InvalidValue(
+                f"{path} was flown with another {' and another '.join(others)}: take the same, or "
+                f"name another file"
+            )
+        if any(flight.pop("kind") != "flight" for flight in flights):
+            raise ValueError("a line of it is no flight")
+        results = [from_exact(kind, flight) for flight in flights]
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(
             f"{path}: not the lines of a campaign's results ({error}): take the original, or name "
             f"a new file"
         ) from None
-    others = [name for key, name in _MUST_AGREE.items() if found.get(key) != header[key]]
-    if others:
-        raise InvalidValue(
-            f"{path} was flown with another {' and another '.join(others)}: take the same, or name "
-            f"another file"
-        )
     for result in results:
         earlier.setdefault(result.seed, result)
     return len(good)

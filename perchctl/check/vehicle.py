@@ -116,7 +116,7 @@ def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
 
 def _telemetry(vehicle: Vehicle, profile: Profile) -> Finding:
     if vehicle.telemetry is None:
-        return failed("none comes", "see variables and packets; restart the vehicle")
+        return failed("none comes", "see firmware and packets; restart the vehicle")
     wanted_hz = 1.0 / profile.link.telemetry_period_s
     age_ms = 1e3 * vehicle.age_s
     found = f"{vehicle.samples_hz:.0f} Hz of {wanted_hz:.0f}, newest {age_ms:.0f} ms old"

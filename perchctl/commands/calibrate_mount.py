@@ -226,7 +226,8 @@ def _record_live(
         for part in parts:
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
-                ask("press Enter when it is held so:")
+                with contextlib.suppress(EOFError):  # Ctrl-D goes on as Enter does
+                    ask("press Enter when it is held so:")
             recording = MountingRecording(part)
             recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)

@@ -164,10 +164,12 @@ def with_positioning(profile: Profile, by: str | None) -> Profile:
         raise InvalidValue(
             f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
         )
-    if by == profile.positioning.by:
+    own = profile.positioning
+    if by == own.by:
         return profile
-    # What belongs to another kind would be of no use, and puzzle.
-    config = PositioningConfig.model_validate({"by": by, "decks": profile.positioning.decks})
+    # Keys of the kind that is left would puzzle; but beside a deck a profile may name a capture.
+    kept = own.model_dump() if (own.by, by) == ("deck", "mocap") else {"decks": own.decks}
+    config = PositioningConfig.model_validate({**kept, "by": by})
     return profile.model_copy(update={"positioning": config})
 
 
@@ -224,11 +226,11 @@ def plot_of(log_path: Path, profile: Profile) -> Path | None:
     A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
     if not profile.log.plot:
         return None
-    from perchctl.analysis import plot_flight
-
     picture = path_beside(log_path, ".png")
     try:
         with interruptible():
+            from perchctl.analysis import plot_flight
+
             plot_flight(read_log(log_path), picture)
     except (Exception, KeyboardInterrupt) as error:
         say(f"the plot could not be drawn: {str(error) or 'Ctrl-C'}")

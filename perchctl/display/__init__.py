@@ -1,4 +1,4 @@
-"""What people see while it runs: panel, status line, live page."""
+"""What people see while it runs: panel and live page."""
 
 import lazy_loader
 

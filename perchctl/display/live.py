@@ -255,7 +255,9 @@ class _Handler(BaseHTTPRequestHandler):
                 self._send_page()
             case "/state":
                 state = json.dumps(self.server.page.state())
-                self._send(200, "application/json", state.encode())
+                # A browser reads no NaN and no Infinity.
+                readable = json.loads(state, parse_constant=lambda _name: None)
+                self._send(200, "application/json", json.dumps(readable).encode())
             case "/stream":
                 self._send_stream()
             case _:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from perchctl.faults.effects import killed, push, thrust_changed
+from perchctl.faults.effects import battery_sags, killed, push, thrust_changed
 from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
 
@@ -65,7 +65,7 @@ def _too_weak(facts: Facts) -> float | None:
 
 
 def _sagged_too_fast(facts: Facts) -> float | None:
-    if facts.weak_s is None:
+    if facts.weak_s is None or not facts.does(battery_sags):
         return None
     down_s = NOTICED_S + facts.low_m / DOWN_MPS
     in_time = facts.low_s is not None and facts.weak_s - facts.low_s >= down_s

@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -71,6 +72,8 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(calibrate_mount, "guide", press_after(10))
+    at_its_end = SimpleNamespace(isatty=lambda: True)  # a terminal's input
+    monkeypatch.setattr(calibrate_mount, "sys", SimpleNamespace(stdin=at_its_end))
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
     with closing(Relay(sim.uri)) as relay:
         words = ["-p", "mine.yaml", "-u", relay.uri, "--source", sim.stream_url, "--part", "carry"]

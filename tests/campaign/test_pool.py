@@ -151,7 +151,7 @@ def test_a_second_press_ends_the_program_at_once() -> None:
     ("fly", "words"),
     [
         (fails_later, "unforeseen ZeroDivisionError in the flight of seed 1: no such luck"),
-        (is_killed_later, "ended from outside"),
+        (is_killed_later, "was killed from outside: "),
     ],
 )
 def test_a_flight_that_fails_loses_none_of_the_others(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,10 +23,11 @@ from perchctl.campaign import (
     rate_text,
 )
 from perchctl.campaign.results import ENDS, worst_first
-from perchctl.errors import SafetyAbort
+from perchctl.errors import Interrupted, SafetyAbort
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.commands.simulate import fly_each, say_where_logs_are
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT, short_profile
 from tests.helpers.results import aborted, landed, perched
@@ -106,6 +109,16 @@ def test_a_flat_battery_is_a_result_and_leaves_no_log(tmp_path: Path) -> None:
     assert "charge it" in results[0].reason
     assert all(r.log is None and r.scenario is not None for r in results)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_with_nothing_flown_there_is_nothing_to_report() -> None:
+    with pytest.raises(Interrupted, match="0 of 2 flights were flown"):
+        fly_each(lambda *_: None, pytest.fail, 2, nullcontext(None))  # type: ignore[arg-type]
+
+
+def test_logs_that_lack_something_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    say_where_logs_are([PERCHED, replace(PERCHED, log_problem="no space left")], Path("logs"))
+    assert capsys.readouterr().err.endswith("1 of 2 logs are incomplete: no space left\n")
 
 
 def test_where_none_took_off_it_is_not_the_seeds() -> None:

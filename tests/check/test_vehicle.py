@@ -129,9 +129,7 @@ def test_without_telemetry_nothing_that_hangs_on_it_passes(
 
 GOOD = Vehicle(
     uri="radio://0/80/2M/E7E7E7E7E7",
-    parameters={
-        "system.selftestPassed": 1, "stabilizer.estimator": 2,
-    },
+    parameters={"system.selftestPassed": 1, "stabilizer.estimator": 2},
     echoes=[0.004] * 100,
     quality=99.0,
     telemetry=AT_REST,
@@ -139,11 +137,6 @@ GOOD = Vehicle(
     samples_hz=100.0,
     decks=("bcFlow2",),
 )  # fmt: skip
-
-
-def parameters(**changes: float | None) -> dict[str, float]:
-    named = {key.replace("__", "."): value for key, value in changes.items()}
-    return {k: v for k, v in ({**GOOD.parameters, **named}).items() if v is not None}
 
 
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
@@ -156,7 +149,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("telemetry", "fail", {"age_s": 0.5}),
     ("firmware", "fail", {"protocol": 11}),
     ("firmware", "fail", {"missing": ("stateEstimate.x",)}),
-    ("firmware", "fail", {"parameters": parameters(system__selftestPassed=0)}),
+    ("firmware", "fail", {"parameters": {**GOOD.parameters, "system.selftestPassed": 0}}),
     *(
         ("supervisor", "fail", {"telemetry": said(supervisor=bits)})
         for bits in (
@@ -192,15 +185,10 @@ def test_a_fault_alone_makes_its_row_and_no_other(
     assert others == set()
 
 
-@pytest.mark.parametrize(("decks", "profile", "found"), [
-    (("labUwb",), Profile.model_validate({"positioning": {"decks": ["labUwb"]}}), "by labUwb"),
-])  # fmt: skip
-def test_a_deck_is_named_that_places_the_vehicle(
-    decks: tuple[str, ...], profile: Profile, found: str
-) -> None:
-    """One of one's own where the profile names it."""
-    vehicle = replace(GOOD, decks=decks)
-    assert rows_of(vehicle, profile)["positioning"].found == found
+def test_a_deck_of_one_s_own_places_the_vehicle_where_the_profile_names_it() -> None:
+    profile = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
+    vehicle = replace(GOOD, decks=("labUwb",))
+    assert rows_of(vehicle, profile)["positioning"].found == "by labUwb"
 
 
 def test_an_old_profile_s_limit_is_the_flight_s() -> None:

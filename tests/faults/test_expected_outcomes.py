@@ -13,9 +13,8 @@ from perchctl.faults.oracle import FLAGS
 from perchctl.faults.truth import Facts
 
 BLOW = partial(e.push, force_n=(0.7, 0.0, 0.0), for_s=0.04)
-
-
 WEAK = partial(e.thrust_changed, to=(0.85, 1.0, 1.0, 1.0))
+SAGS = partial(e.battery_sags, rate_vps=0.1, by_v=0.6)
 OUTCOMES = {outcome.name: outcome for outcome in EXPECTED_OUTCOMES}
 
 
@@ -54,11 +53,12 @@ def test_they_name_flags() -> None:
         ("too low to catch", Facts(slipped_s=8.0, slipped_m=1.2), None),
         ("too weak to hover", Facts((WEAK,), weak_s=6.0), 6.0),
         ("too weak to hover", Facts(weak_s=6.0), None),
-        ("sags too fast", Facts(weak_s=10.0, low_s=8.0, low_m=2.0), 10.0),
-        ("sags too fast", Facts(weak_s=10.0), 10.0),
-        ("sags too fast", Facts(weak_s=15.0, low_s=8.0, low_m=2.0), None),
-        ("sags too fast", Facts(weak_s=10.0, low_s=8.0, low_m=0.1), None),
-        ("sags too fast", Facts(low_s=8.0, low_m=2.0), None),
+        ("sags too fast", Facts((SAGS,), weak_s=10.0, low_s=8.0, low_m=2.0), 10.0),
+        ("sags too fast", Facts((SAGS,), weak_s=10.0), 10.0),
+        ("sags too fast", Facts(weak_s=10.0), None),
+        ("sags too fast", Facts((SAGS,), weak_s=15.0, low_s=8.0, low_m=2.0), None),
+        ("sags too fast", Facts((SAGS,), weak_s=10.0, low_s=8.0, low_m=0.1), None),
+        ("sags too fast", Facts((SAGS,), low_s=8.0, low_m=2.0), None),
     ],
 )
 def test_each_by_its_cause(name: str, facts: Facts, cause_s: float | None) -> None:
@@ -74,7 +74,7 @@ CAUSED: dict[str, Facts] = {
     "knocked off the magnet": Facts(effects=(BLOW,), begin_s=9.95, slipped_s=10.0, toppled=True),
     "too low to catch": Facts(slipped_s=10.0, slipped_m=0.8),
     "too weak to hover": Facts((WEAK,), weak_s=10.0),
-    "sags too fast": Facts(weak_s=10.0),
+    "sags too fast": Facts((SAGS,), weak_s=10.0),
 }
 """What brings each about, at 10 s."""
 

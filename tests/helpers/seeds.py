@@ -7,7 +7,6 @@ import os
 import signal
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 FOR_EVER_S = 300.0
 
@@ -16,10 +15,8 @@ FOR_EVER_S = 300.0
 class Ended:
     seed: int
     outcome: str = "perched"
-    log_problem: str | None = None
     pid: int = 0
     deaf: bool = False  # to Ctrl-C and SIGTERM
-    log: Path | None = None
 
     @property
     def is_bad(self) -> bool:
