@@ -67,7 +67,9 @@ def _default_and_allowed(key: Key) -> str:
     allowed = key.allowed
     if key.default is not None:  # which shows how many
         allowed = re.sub("^([0-9] numbers|lowest, highest)(, )?", "", allowed)
-    if allowed in ("", "text", "text, or none", "true, false"):
+    else:  # which says that none is allowed
+        allowed = allowed.removesuffix(", or none")
+    if allowed in ("", "text", "true, false"):
         return default
     return f"{default}; {allowed}"
 
