@@ -1,4 +1,4 @@
-"""What people see while it runs: panel, status line, live page."""
+"""What people see during a flight: panel, status line, live page."""
 
 import lazy_loader
 
