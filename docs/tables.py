@@ -66,12 +66,12 @@ def _default_and_allowed(key: Key) -> str:
     default = f"{_shown(key.default)} {key.unit if key.default not in (None, ()) else ''}".strip()
     allowed = key.allowed
     if key.default is not None:  # which shows how many
-        allowed = re.sub("^([0-9] numbers|lowest, highest)(, )?", "", allowed)
+        allowed = re.sub("^([0-9] numbers|lowest, highest)?(, )?(each )?", "", allowed)
     else:  # which says that none is allowed
         allowed = allowed.removesuffix(", or none")
-    if allowed in ("", "text", "true, false"):
+    if allowed in ("", "text", "true, false") or allowed.startswith("any number"):
         return default
-    return f"{default}; {allowed}"
+    return f"{default}; {allowed}".replace("above ", ">").replace("below ", "<")
 
 
 def _shown(value: Any) -> str:
@@ -124,33 +124,6 @@ def frame_diagram() -> str:
 def _mermaid_type(annotation: str) -> str:
     """The value that goes on: not None, and of a pair with a memory the second."""
     return annotation.removesuffix(" | None").rpartition(", ")[2].removesuffix("]")
-
-
-def package_diagram() -> str:
-    """Which package imports which, without what a longer path implies already."""
-    from tests.test_architecture import IMPORTS, LAYERS, room_of
-
-    packages = [
-        room for rooms in LAYERS for room in rooms if (ROOT / room.replace(".", "/")).is_dir()
-    ]
-    needs: dict[str, set[str]] = {package: set() for package in packages}
-    for found in IMPORTS:
-        importer, imported = room_of(found.importer), room_of(found.imported)
-        if importer in needs and imported in needs and importer != imported:
-            needs[importer].add(imported)
-    lines = ["flowchart BT"]
-    for package in packages:
-        implied = {far for near in needs[package] for far in _reached(needs, near)}
-        for other in sorted(needs[package] - implied):
-            lines.append(f"    {package.split('.')[1]} --> {other.split('.')[1]}")
-    return "\n".join(lines)
-
-
-def _reached(needs: dict[str, set[str]], package: str) -> set[str]:
-    reached = set(needs[package])
-    for near in needs[package]:
-        reached |= _reached(needs, near)
-    return reached
 
 
 def packages() -> str:
@@ -243,7 +216,6 @@ def _order(phase: Phase) -> int:
 
 PARTS: dict[str, Callable[[], str]] = {
     "frame-diagram": lambda: f"```mermaid\n{frame_diagram()}\n```",
-    "package-diagram": lambda: f"```mermaid\n{package_diagram()}\n```",
     "packages": packages,
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{mission_diagram()}\n```",
