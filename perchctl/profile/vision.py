@@ -68,9 +68,9 @@ class Mounting(Section):
     image's right to the vehicle's left.
     """
 
-    position_m: BodyVector3 = key((0.0, 0.0, 0.01), "its place in body axes: forward, left, up")
+    position_m: BodyVector3 = key((0.0, 0.0, 0.01), "the camera in body axes: forward, left, up")
     rpy_deg: Vector3 = key(
-        (0.0, 0.0, 0.0), "rotation; at 0 0 0, picture right is forward and picture bottom left"
+        (0.0, 0.0, 0.0), "rotation: at 0 0 0 the picture's right is forward, its bottom left"
     )
 
     @field_validator("rpy_deg")
