@@ -16,7 +16,7 @@ class SearchConfig(Section):
     """It climbs so far between two looks."""
     max_height_m: float = key(1.3, "greatest height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
-        60.0, "rotation between waits: the picture is wider than high", ge=0, le=180
+        60.0, "rotation between waits, as the picture is wider than high", ge=0, le=180
     )
     confirm_frames: ClassVar[int] = 3
     """In a row with the target."""
@@ -197,7 +197,7 @@ class SafetyConfig(Section):
     """Limits and reaction times; `*_hold_s` stays where it is, `*_land_s` lands."""
 
     min_rest_v: float = key(3.8, "least resting voltage for a take-off", ge=0, le=5)
-    min_load_v: float = key(3.0, "least voltage under load; lands below it", ge=0, le=5)
+    min_load_v: float = key(3.0, "voltage under load below which the vehicle lands", ge=0, le=5)
     battery_debounce_s: ClassVar[float] = 1.5  # below `min_load_v` before it lands
     energy_gate: bool = key(True, "land instead of an attempt that the battery cannot finish")
     energy_reserve_s: float = key(
@@ -212,7 +212,7 @@ class SafetyConfig(Section):
     camera_hold_s: float = key(0.5, "time without a good picture: hold in place", gt=0, le=10)
     camera_land_s: float = key(3.0, "time without a good picture: land", gt=0, le=60)
     max_frame_age_s: float = key(0.4, "older pictures are not used", gt=0, le=5)
-    jump_m: float = key(0.25, "step of the estimate, beyond its speed, called a jump", gt=0, le=5)
+    jump_m: float = key(0.25, "step that the estimate's speed does not explain", gt=0, le=5)
     jump_z_m: ClassVar[float] = 0.15
     """Such a step of its height."""
     jump_deg: ClassVar[float] = 15.0
@@ -224,9 +224,11 @@ class SafetyConfig(Section):
     flight_variance_m2: ClassVar[float] = 0.05  # of the position in flight: above it, held
     variance_land_s: ClassVar[float] = 1.0  # above it for so long: landed
     jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
-    max_height_m: float = key(3.0, "greatest height above ground; lands when higher", gt=0, le=20)
+    max_height_m: float = key(
+        3.0, "height above ground beyond which the vehicle lands", gt=0, le=20
+    )
     fence_radius_m: float = key(
-        2.0, "radius of the fence around the take-off place; lands outside", gt=0, le=50
+        2.0, "radius around the take-off place, outside which the vehicle lands", gt=0, le=50
     )
     max_tilt_deg: float = key(55.0, "tilt beyond which the motors are cut", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted

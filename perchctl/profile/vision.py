@@ -324,7 +324,7 @@ class MergeConfig(Section):
     weights: WeightsConfig = WeightsConfig()
     weights_file: str | None = key(None, "file from `perchctl fit-weights`; replaces `weights`")
     stages: Literal["seen", "range"] = key(
-        "seen", "merge all markers seen, or by distance as the paper's equations 4, 6, 11"
+        "seen", "merge all markers seen, or choose by distance (the paper's equations 4, 6, 11)"
     )
     z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
     z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)

@@ -49,9 +49,9 @@ FIELDS: dict[str, str] = {
     # the vehicle's own estimate, world axes
     **_axes("{}_m", "body in the world of the state estimate, z up"),
     **_axes("v{}_mps", "velocity, world axes"),
-    "roll_rad": "right-handed about body x",
-    "pitch_rad": "right-handed about body y: positive is nose down",
-    "yaw_rad": "right-handed about world z",
+    "roll_rad": "roll, right-handed about body x",
+    "pitch_rad": "pitch, right-handed about body y: positive is nose down",
+    "yaw_rad": "heading, right-handed about world z",
     "acc_z_g": "specific force along body z, +1 at rest",
     "thrust": "thrust command of the vehicle's controller, 0..65535",
     "battery_v": "battery voltage under the present load",
