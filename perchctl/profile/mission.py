@@ -63,7 +63,7 @@ class AscendConfig(Section):
     """The cone's radius at the target."""
     cone_slope: ClassVar[float] = 0.2
     """The cone's radius grows by it a metre below."""
-    standoff_m: float = key(0.08, "distance to the target where it settles", gt=0.01, le=0.5)
+    standoff_m: float = key(0.08, "distance below the target at which it settles", gt=0.01, le=0.5)
     settle_xy_m: float = key(0.004, "settled: gear at most this far from the axis", gt=0, le=0.1)
     settle_z_m: ClassVar[float] = 0.02  # settled: at most so far below the stand-off
     settle_yaw_deg: ClassVar[float] = 3.0
@@ -93,9 +93,9 @@ class PerchConfig(Section):
     climb_mps: ClassVar[float] = 0.2
     """Climb of the setpoint that presses."""
     contact_dwell_s: float = key(0.25, "time for which contact must hold", gt=0, lt=3)
-    contact_z_m: float = key(0.05, "contact: vertical distance, gear to target", gt=0, le=0.3)
+    contact_z_m: float = key(0.05, "largest vertical distance to target in contact", gt=0, le=0.3)
     contact_xy_m: float = key(
-        0.025, "contact: horizontal distance, gear to target; the magnet's radius", gt=0, le=0.5
+        0.025, "largest horizontal distance in contact, the magnet's radius", gt=0, le=0.5
     )
     contact_speed_mps: ClassVar[float] = 0.06  # contact: vertical speed
     contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this

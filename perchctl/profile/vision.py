@@ -284,7 +284,7 @@ class KalmanConfig(Section):
         0.004, "process noise per frame, the paper's Q = k2 I, with `noise: fixed`", gt=0
     )
     alpha: float = key(0.85, "factor on a coasting track's speeds, per frame", gt=0, le=1)
-    n_max: int = key(8, "number of frames that a track coasts", ge=0, le=100)
+    n_max: int = key(8, "longest coasting of a track, in frames", ge=0, le=100)
     frame: Literal["level", "world"] = key(
         "world", "frame in which tracks are filtered; `level` is the paper's"
     )

@@ -86,7 +86,7 @@ FIELDS: dict[str, str] = {
     "lock_note": "why the frame's pose was rejected, or where the target was locked anew",
     "cam_age_s": "time since the last good frame",
     "delay_s": "measured latency beyond the profile's camera.latency_s",
-    "delay_used_s": "what the frames' times are corrected by, with `camera.latency_s: measured`",
+    "delay_used_s": "correction of the frames' times, with `camera.latency_s: measured`",
     # the target's estimate at t_s, which the planner steers by: the paper's error vector
     **_axes("e{}_m", "target relative to the gear, level frame"),
     "eyaw_rad": "heading of the target in the level frame",
