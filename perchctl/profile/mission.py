@@ -10,7 +10,7 @@ from perchctl.profile.base import Section, key
 class SearchConfig(Section):
     """Phase 2. Waits `wait_s`, climbs `step_m`, tries again; never above `max_height_m`."""
 
-    attempts: int = key(6, "waits for the target, then it lands", ge=1, le=100)
+    attempts: int = key(6, "number of waits for the target before landing", ge=1, le=100)
     wait_s: float = key(1.5, "wait at each height", gt=0, le=60)
     step_m: ClassVar[float] = 0.12
     """It climbs so far between two looks."""
