@@ -126,6 +126,33 @@ def _mermaid_type(annotation: str) -> str:
     return annotation.removesuffix(" | None").rpartition(", ")[2].removesuffix("]")
 
 
+def package_diagram() -> str:
+    """Which package imports which, without what a longer path implies already."""
+    from tests.test_architecture import IMPORTS, LAYERS, room_of
+
+    packages = [
+        room for rooms in LAYERS for room in rooms if (ROOT / room.replace(".", "/")).is_dir()
+    ]
+    needs: dict[str, set[str]] = {package: set() for package in packages}
+    for found in IMPORTS:
+        importer, imported = room_of(found.importer), room_of(found.imported)
+        if importer in needs and imported in needs and importer != imported:
+            needs[importer].add(imported)
+    lines = ["flowchart BT"]
+    for package in packages:
+        implied = {far for near in needs[package] for far in _reached(needs, near)}
+        for other in sorted(needs[package] - implied):
+            lines.append(f"    {package.split('.')[1]} --> {other.split('.')[1]}")
+    return "\n".join(lines)
+
+
+def _reached(needs: dict[str, set[str]], package: str) -> set[str]:
+    reached = set(needs[package])
+    for near in needs[package]:
+        reached |= _reached(needs, near)
+    return reached
+
+
 def packages() -> str:
     """What each package holds: the first sentence of its docstring."""
     rows = []
@@ -216,6 +243,7 @@ def _order(phase: Phase) -> int:
 
 PARTS: dict[str, Callable[[], str]] = {
     "frame-diagram": lambda: f"```mermaid\n{frame_diagram()}\n```",
+    "package-diagram": lambda: f"```mermaid\n{package_diagram()}\n```",
     "packages": packages,
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{mission_diagram()}\n```",
