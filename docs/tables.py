@@ -66,10 +66,12 @@ def _default_and_allowed(key: Key) -> str:
     default = f"{_shown(key.default)} {key.unit if key.default not in (None, ()) else ''}".strip()
     allowed = key.allowed
     if key.default is not None:  # which shows how many
-        allowed = re.sub("^([0-9] numbers|lowest, highest)(, )?", "", allowed)
-    if allowed in ("", "text", "text, or none", "true, false"):
+        allowed = re.sub("^([0-9] numbers|lowest, highest)?(, )?(each )?", "", allowed)
+    else:  # which says that none is allowed
+        allowed = allowed.removesuffix(", or none")
+    if allowed in ("", "text", "true, false") or allowed.startswith("any number"):
         return default
-    return f"{default}; {allowed}"
+    return f"{default}; {allowed}".replace("above ", ">").replace("below ", "<")
 
 
 def _shown(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Processes of perchctl's own beside the one that flies, and the connection to each.
+"""Child processes beside the one that flies, and the connection to each.
 
 A pair of sockets carries pickled messages: only the child inherits the other end, so neither side
 unpickles foreign bytes.

@@ -110,7 +110,7 @@ class LogIncomplete(PerchError):
 
 class ReplayDiffers(PerchError):
     exit_code = 61
-    meaning = "a replay decides or sees something else than the flight"
+    meaning = "a replay differs from the flight in a decision or a pose"
 
 
 class Interrupted(PerchError):

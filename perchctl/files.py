@@ -1,4 +1,4 @@
-"""The one way to write a whole file, and what a file is by its content.
+"""Writes whole files, and recognises a file by its content.
 
 A file is written under a temporary name beside its place, brought to the disk, and renamed:
 a reader finds the old file or the new one, never a part of one.

@@ -1,4 +1,4 @@
-"""Frames and rotations: the laws every other module cites.
+"""Frames and rotations: the conventions that every other module cites.
 
 Conventions (`docs/conventions.md` has them all):
 

@@ -1,4 +1,4 @@
-"""Where perchctl finds its shipped files and puts the user's."""
+"""Paths of perchctl's shipped files and of the user's."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""YAML as perchctl reads it: PyYAML's plain values, and no key twice in a mapping, of which PyYAML
-would keep the last without a word."""
+"""YAML as perchctl reads it: plain values, and a key given twice is refused (PyYAML would keep the
+last one silently)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C while perchctl is still loading: one sentence and an exit code, no traceback.
+"""Answers Ctrl-C during loading with one sentence and an exit code, without a traceback.
 
 A KeyboardInterrupt would come up in the middle of some library's import, which prints it as
 ignored, or makes another error of it. Nothing is open yet: the process ends where it is. This

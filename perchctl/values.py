@@ -1,4 +1,4 @@
-"""What frozen dataclasses are changed by, at the cost of a dictionary's copy."""
+"""Changed copies of frozen dataclasses, at the cost of a dictionary's copy."""
 
 from __future__ import annotations
 

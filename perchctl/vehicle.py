@@ -1,4 +1,4 @@
-"""What planner, link, simulator and log agree on: telemetry in, commands out."""
+"""Types that planner, link, simulator and log share: telemetry and commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What flights were, read off their logs: shown, compared, drawn, reported, and replayed."""
+"""Analysis of flight logs: shown, compared, drawn, reported, and replayed."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What can be known on the ground before a flight: one row for each question."""
+"""The check on the ground before a flight: one row for each question."""
 
 import lazy_loader
 

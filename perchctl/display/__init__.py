@@ -1,4 +1,4 @@
-"""What people see while it runs: panel and live page."""
+"""What people see during a flight: panel and live page."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Faults laid into simulated flights, and the oracle that judges by the world's truth."""
+"""Faults injected into simulated flights, and the oracle that judges by the true state."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The link to a vehicle: what a flight needs of it, by cflib or in lockstep."""
+"""The link to a vehicle, by cflib or in lockstep."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""From frames and telemetry to the target: the one session through which every command looks."""
+"""From frames and telemetry to the target: the one session that every command uses."""
 
 import lazy_loader
 

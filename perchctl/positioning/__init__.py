@@ -1,4 +1,4 @@
-"""Where a vehicle without a deck has its position from: a motion capture, or the target itself."""
+"""Position sources of a vehicle without a deck: a motion capture, or the target itself."""
 
 import lazy_loader
 

@@ -10,13 +10,13 @@ from perchctl.profile.base import Section, key
 class SearchConfig(Section):
     """Phase 2. Waits `wait_s`, climbs `step_m`, tries again; never above `max_height_m`."""
 
-    attempts: int = key(6, "times to wait, before it lands", ge=1, le=100)
-    wait_s: float = key(1.5, "at each height", gt=0, le=60)
+    attempts: int = key(6, "number of waits for the target before landing", ge=1, le=100)
+    wait_s: float = key(1.5, "wait at each height", gt=0, le=60)
     step_m: ClassVar[float] = 0.12
     """It climbs so far between two looks."""
-    max_height_m: float = key(1.3, "never above it to look for the target", gt=0, le=20)
+    max_height_m: float = key(1.3, "greatest height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
-        60.0, "turned each time: the picture is wider than high", ge=0, le=180
+        60.0, "rotation between waits, as the picture is wider than high", ge=0, le=180
     )
     confirm_frames: ClassVar[int] = 3
     """In a row with the target."""
@@ -35,7 +35,7 @@ class EstimateConfig(Section):
 class AlignConfig(Section):
     """Phase 4. Errors must stay within tolerance for `dwell_s`."""
 
-    xy_m: float = key(0.04, "aligned: the gear's distance from the target's axis", gt=0, le=1)
+    xy_m: float = key(0.04, "aligned: gear at most this far from the target's axis", gt=0, le=1)
     yaw_deg: ClassVar[float] = 5.0  # aligned: heading
     dwell_s: ClassVar[float] = 0.4  # for which both must hold
     timeout_s: ClassVar[float] = 20.0
@@ -54,7 +54,7 @@ class AscendConfig(Section):
     the stand-off.
     """
 
-    speed_mps: float = key(0.25, "climb, far below", gt=0, le=1)
+    speed_mps: float = key(0.25, "climb speed far below the target", gt=0, le=1)
     near_speed_mps: ClassVar[float] = 0.12
     """Climb nearer than `near_m`."""
     near_m: ClassVar[float] = 0.35
@@ -63,19 +63,19 @@ class AscendConfig(Section):
     """The cone's radius at the target."""
     cone_slope: ClassVar[float] = 0.2
     """The cone's radius grows by it a metre below."""
-    standoff_m: float = key(0.08, "between gear and target where it settles", gt=0.01, le=0.5)
-    settle_xy_m: float = key(0.004, "settled: distance from the axis", gt=0, le=0.1)
+    standoff_m: float = key(0.08, "distance below the target at which it settles", gt=0.01, le=0.5)
+    settle_xy_m: float = key(0.004, "settled: gear at most this far from the axis", gt=0, le=0.1)
     settle_z_m: ClassVar[float] = 0.02  # settled: at most so far below the stand-off
     settle_yaw_deg: ClassVar[float] = 3.0
     """Settled: heading."""
     settle_speed_mps: ClassVar[float] = 0.04
     """Settled: speed."""
     settle_dwell_s: float = key(
-        0.3, "settled: for which position, heading and speed must all hold", ge=0, lt=10
+        0.3, "settled: time for which position, heading and speed must hold", ge=0, lt=10
     )
     settle_timeout_s: ClassVar[float] = 10.0  # at the stand-off
     fresh_s: float = key(
-        0.25, "a target older than this, beyond the latency, is not fresh", gt=0, le=2
+        0.25, "a target estimate older than this plus the latency is not fresh", gt=0, le=2
     )
     timeout_s: ClassVar[float] = 40.0
     """An ascent that takes longer counts as failed."""
@@ -88,14 +88,14 @@ class PerchConfig(Section):
     mode: Literal["position", "raw"] = key(
         "position", "press by a setpoint above the contact, or by raw thrust"
     )
-    thrust: int = key(60000, "of the raw mode", ge=1000, le=65535)
+    thrust: int = key(60000, "thrust in raw mode", ge=1000, le=65535)
     press_m: ClassVar[float] = 0.25  # the setpoint above the contact
     climb_mps: ClassVar[float] = 0.2
     """Climb of the setpoint that presses."""
-    contact_dwell_s: float = key(0.25, "for which contact must hold", gt=0, lt=3)
-    contact_z_m: float = key(0.05, "contact: the gear's distance from the target", gt=0, le=0.3)
+    contact_dwell_s: float = key(0.25, "time for which contact must hold", gt=0, lt=3)
+    contact_z_m: float = key(0.05, "largest vertical distance to target in contact", gt=0, le=0.3)
     contact_xy_m: float = key(
-        0.025, "contact: its distance from the axis, the magnet's radius", gt=0, le=0.5
+        0.025, "largest horizontal distance in contact, the magnet's radius", gt=0, le=0.5
     )
     contact_speed_mps: ClassVar[float] = 0.06  # contact: vertical speed
     contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this
@@ -131,7 +131,7 @@ class CompleteConfig(Section):
     slip_mps: ClassVar[float] = 0.12  # a slip: sinking faster
     slip_dwell_s: ClassVar[float] = 0.03  # a slip: for so long; a free fall is answered at once
     slip_acc_g: ClassVar[float] = 0.5  # a free fall, or a slip wherever the estimate is: less
-    watch_s: float = key(1.5, "after the motor stop, before it counts as perched", gt=0, le=60)
+    watch_s: float = key(1.5, "monitoring from the motor stop to PERCHED", gt=0, le=60)
 
 
 class RecoverConfig(Section):
@@ -155,13 +155,13 @@ class LandingConfig(Section):
     own landing, which goes to `undershoot_m` below the ground of the estimate, and by
     `drift_mps` of the flight's time lower, so that a drifted height still ends on the floor."""
 
-    speed_mps: float = key(0.3, "of the landing", gt=0, le=1)
+    speed_mps: float = key(0.3, "descent speed of the landing", gt=0, le=1)
     handover_m: float = key(
-        0.3, "above the ground: from here the vehicle lands by itself", ge=0.1, le=2
+        0.3, "height above the ground from which the vehicle lands by itself", ge=0.1, le=2
     )
-    undershoot_m: float = key(0.05, "the landing aims so far below the ground", ge=0, le=1)
+    undershoot_m: float = key(0.05, "the landing aims this far below the ground", ge=0, le=1)
     drift_mps: ClassVar[float] = 0.012  # of the estimate's height: the aim sinks so fast
-    timeout_s: float = key(30.0, "for which a landing is waited for", gt=0, le=120)
+    timeout_s: float = key(30.0, "longest time of a landing", gt=0, le=120)
 
     @property
     def overdue_s(self) -> float:
@@ -172,10 +172,10 @@ class LandingConfig(Section):
 class PlannerConfig(Section):
     """How the mission flies, phase by phase."""
 
-    takeoff_height_m: float = key(0.5, "of the take-off, above the ground", ge=0.2, le=5)
-    takeoff_speed_mps: float = key(0.3, "of the setpoint, from the ground up", gt=0, le=1)
+    takeoff_height_m: float = key(0.5, "height of the take-off above the ground", ge=0.2, le=5)
+    takeoff_speed_mps: float = key(0.3, "climb speed of the take-off setpoint", gt=0, le=1)
     approach_xy_m: tuple[float, float] | None = key(
-        None, "fly here after take-off, in the estimate's world"
+        None, "where to fly after take-off, in the estimate's world"
     )
     approach_timeout_s: ClassVar[float] = 15.0  # for take-off and way
     search: SearchConfig = SearchConfig()
@@ -187,7 +187,7 @@ class PlannerConfig(Section):
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
     attempts: int = key(5, "perching attempts in all", ge=1, le=50)
-    perching_time_s: float = key(120.0, "then it lands", gt=0, le=1200)
+    perching_time_s: float = key(120.0, "time for all attempts; then it lands", gt=0, le=1200)
     integral_per_s: float = key(0.4, "gain of the integral of the horizontal error", ge=0, le=5)
     integral_limit_m: ClassVar[float] = 0.08
     """Of that integral."""
@@ -196,23 +196,23 @@ class PlannerConfig(Section):
 class SafetyConfig(Section):
     """Limits and reaction times; `*_hold_s` stays where it is, `*_land_s` lands."""
 
-    min_rest_v: float = key(3.8, "no flight begins below it", ge=0, le=5)
-    min_load_v: float = key(3.0, "in flight, under load: lands below it", ge=0, le=5)
+    min_rest_v: float = key(3.8, "least resting voltage for a take-off", ge=0, le=5)
+    min_load_v: float = key(3.0, "voltage under load below which the vehicle lands", ge=0, le=5)
     battery_debounce_s: ClassVar[float] = 1.5  # below `min_load_v` before it lands
-    energy_gate: bool = key(True, "no attempt begins that the battery has not enough for: it lands")
+    energy_gate: bool = key(True, "land instead of an attempt that the battery cannot finish")
     energy_reserve_s: float = key(
-        4.0, "of hovering, left after an attempt and a landing", ge=0, le=120
+        4.0, "hover time left after an attempt and a landing", ge=0, le=120
     )
     battery_stale_s: ClassVar[float] = 90.0
     """A battery reading that stands still for longer is stale."""
-    telemetry_hold_s: float = key(0.3, "age of telemetry: held", gt=0, le=5)
-    telemetry_land_s: float = key(1.0, "age of telemetry: landed", gt=0, le=10)
+    telemetry_hold_s: float = key(0.3, "telemetry older than this: hold in place", gt=0, le=5)
+    telemetry_land_s: float = key(1.0, "telemetry older than this: land", gt=0, le=10)
     proof_age_s: ClassVar[float] = 0.1
     """Older telemetry proves nothing: no contact, no landing, no stop."""
-    camera_hold_s: float = key(0.5, "since the last good picture: held", gt=0, le=10)
-    camera_land_s: float = key(3.0, "since the last good picture: landed", gt=0, le=60)
-    max_frame_age_s: float = key(0.4, "an older picture is no measurement", gt=0, le=5)
-    jump_m: float = key(0.25, "a step of the estimate beyond its speed: a jump", gt=0, le=5)
+    camera_hold_s: float = key(0.5, "time without a good picture: hold in place", gt=0, le=10)
+    camera_land_s: float = key(3.0, "time without a good picture: land", gt=0, le=60)
+    max_frame_age_s: float = key(0.4, "older pictures are not used", gt=0, le=5)
+    jump_m: float = key(0.25, "step that the estimate's speed does not explain", gt=0, le=5)
     jump_z_m: ClassVar[float] = 0.15
     """Such a step of its height."""
     jump_deg: ClassVar[float] = 15.0
@@ -224,11 +224,13 @@ class SafetyConfig(Section):
     flight_variance_m2: ClassVar[float] = 0.05  # of the position in flight: above it, held
     variance_land_s: ClassVar[float] = 1.0  # above it for so long: landed
     jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
-    max_height_m: float = key(3.0, "above the ground: lands when higher", gt=0, le=20)
-    fence_radius_m: float = key(
-        2.0, "of the fence around the place of take-off: lands outside", gt=0, le=50
+    max_height_m: float = key(
+        3.0, "height above ground beyond which the vehicle lands", gt=0, le=20
     )
-    max_tilt_deg: float = key(55.0, "beyond it the motors are cut", gt=0, le=180)
+    fence_radius_m: float = key(
+        2.0, "radius around the take-off place, outside which the vehicle lands", gt=0, le=50
+    )
+    max_tilt_deg: float = key(55.0, "tilt beyond which the motors are cut", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted
     loop_late_hold_s: ClassVar[float] = 0.25
     """With a turn of the loop so late it holds its place."""
@@ -237,11 +239,9 @@ class SafetyConfig(Section):
     estimator_wait_s: ClassVar[float] = 10.0  # on the ground
     estimator_variance_m2: ClassVar[float] = 0.01
     """A larger variance of the position refuses take-off."""
-    ground_z_m: float = key(
-        0.0, "height at which the estimate places the ground, where it takes off", ge=-10, le=10
-    )
+    ground_z_m: float = key(0.0, "the estimate's height of the ground at take-off", ge=-10, le=10)
     ground_tolerance_m: float = key(
-        0.15, "farther from it the vehicle hangs, or is held: no take-off", gt=0, le=10
+        0.15, "farther from `ground_z_m` the vehicle hangs or is held: no take-off", gt=0, le=10
     )
     start_tilt_deg: ClassVar[float] = 10.0
     """A larger roll or pitch refuses take-off."""

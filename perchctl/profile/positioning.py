@@ -33,29 +33,29 @@ class PositioningConfig(Section):
     system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = key(
         "vicon", "kind of motion capture"
     )
-    host: str = key("", "its computer, or `NAME:PORT`", pattern=_HOST)
-    body: str = key("crazyflie", "the vehicle's rigid body there", min_length=1)
+    host: str = key("", "the capture's computer, or `NAME:PORT`", pattern=_HOST)
+    body: str = key("crazyflie", "name of the vehicle's rigid body", min_length=1)
     body_rpy_deg: Vector3 = key(
-        (0.0, 0.0, 0.0), "the rigid body's axes in the vehicle's: roll, pitch, yaw"
+        (0.0, 0.0, 0.0), "rotation of the rigid body in the vehicle's axes: roll, pitch, yaw"
     )
     body_position_m: BodyVector3 = key(
         (0.0, 0.0, 0.0), "the rigid body's origin in the vehicle's axes"
     )
     send: Literal["position", "pose"] = key("position", "position alone, or position and attitude")
-    rate_hz: float = key(100.0, "at most so many are sent a second", ge=10, le=100)
+    rate_hz: float = key(100.0, "most positions sent a second", ge=10, le=100)
     latency_s: float = key(
-        0.01, "from the cameras' exposure to arrival, as far as known", ge=0, le=MOST_LATENCY_S
+        0.01, "time from the cameras' exposure to arrival, as far as known", ge=0, le=MOST_LATENCY_S
     )
     position_sigma_m: float = key(
-        0.005, "what the vehicle takes it for: `locSrv.extPosStdDev`", gt=0, le=0.2
+        0.005, "standard deviation that the vehicle assumes: `locSrv.extPosStdDev`", gt=0, le=0.2
     )
     attitude_sigma_rad: ClassVar[float] = 0.05  # what the vehicle takes it for
-    hold_s: float = key(0.15, "without a fresh position it is held in place", gt=0, le=0.5)
-    land_s: float = key(0.7, "without a fresh position it is landed", gt=0, le=2)
-    connect_timeout_s: float = key(5.0, "for the first frame", gt=0, le=60)
+    hold_s: float = key(0.15, "time without a fresh position: hold in place", gt=0, le=0.5)
+    land_s: float = key(0.7, "time without a fresh position: land", gt=0, le=2)
+    connect_timeout_s: float = key(5.0, "longest wait for the first frame", gt=0, le=60)
 
     decks: tuple[str, ...] = key(
-        (), "further decks that give a position, of drivers of your own: names as `check` has them"
+        (), "decks with your own drivers that give a position, named as `check` shows them"
     )
 
     @property

@@ -33,20 +33,20 @@ class LinkConfig(Section):
     """The profile's `link`: URI, telemetry and firmware parameters."""
 
     uri: str = key("sim://", "`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
-    connect_timeout_s: float = key(15.0, "for both tries together", gt=0, le=120)
+    connect_timeout_s: float = key(15.0, "time limit for both tries to connect", gt=0, le=120)
     parameters: dict[str, int | float] = Field(
         default_factory=dict, description="firmware parameters, set and read back before the flight"
     )
-    telemetry_period_s: float = key(0.01, "of position and attitude", ge=0.01, le=0.1)
-    loop_hz: float = key(50.0, "turns of the flight loop", ge=5, le=200)
+    telemetry_period_s: float = key(0.01, "period of position and attitude", ge=0.01, le=0.1)
+    loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
 
 
 class LogConfig(Section):
-    directory: str = key("perchctl-logs", "for the log and its plot")
-    plot: bool = key(True, "draw the flight after it")
+    directory: str = key("perchctl-logs", "folder of the log and its plot")
+    plot: bool = key(True, "draw a plot after the flight")
     max_mb: float = key(
         2000.0,
-        "a larger recording is ended, before it is packed",
+        "size before compression at which a recording ends",
         gt=0,
         le=1e6,
     )
@@ -55,9 +55,9 @@ class LogConfig(Section):
 class Profile(Section):
     """One flight's resolved configuration."""
 
-    name: str = key("unnamed", "of the profile; else its file's")
+    name: str = key("unnamed", "the profile's name; by default its file's")
     description: str = key("", "one sentence for people")
-    date: datetime.date | None = key(None, "of the measurements in it; printed on the target")
+    date: datetime.date | None = key(None, "date of its measurements; printed on the target")
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()

@@ -23,57 +23,54 @@ class SimulationConfig(Section):
     """Ranges from which a seed draws one flight's conditions (`perchctl.sim.scenario`)."""
 
     start_offset_m: float = key(
-        0.5, "start under the target, at most so far aside in x and in y", ge=0, le=5
+        0.5, "largest offset of the start from the target, in x and in y", ge=0, le=5
     )
     target_yaw_deg: Range = key((-180.0, 180.0), "the target's heading")
-    ceiling_z_m: Range = key((1.8, 2.6), "over the floor")
-    mass_kg: Range = key((0.038, 0.042), "all-up")
-    battery_rest_v: Range = key((3.85, 4.2), "at the start")
-    camera_latency_s: Range = key((0.03, 0.12), "the true one")
-    camera_jitter_s: float = key(0.008, "of the latency, one sigma", ge=0, le=0.2)
-    camera_rate_hz: float = key(30.0, "frames", gt=0, le=200)
+    ceiling_z_m: Range = key((1.8, 2.6), "the ceiling's height above the floor")
+    mass_kg: Range = key((0.038, 0.042), "all-up mass")
+    battery_rest_v: Range = key((3.85, 4.2), "resting voltage at the start")
+    camera_latency_s: Range = key((0.03, 0.12), "true latency")
+    camera_jitter_s: float = key(0.008, "scatter of the latency, one sigma", ge=0, le=0.2)
+    camera_rate_hz: float = key(30.0, "frame rate", gt=0, le=200)
     camera_drop_rate: float = key(0.1, "share of frames lost", ge=0, lt=1)
     camera_burst_frames: tuple[int, int] | None = key(
-        (8, 20), "frames lost in one go, once a flight"
+        (8, 20), "frames lost in one gap, once a flight"
     )
-    camera_noise_sigma: Range = key((4.0, 8.0), "of 255")
-    camera_exposure_s: float = key(0.008, "motion blur", ge=0, le=0.05)
+    camera_noise_sigma: Range = key((4.0, 8.0), "pixel noise, of 255")
+    camera_exposure_s: float = key(0.008, "exposure time, which blurs motion", ge=0, le=0.05)
     camera_defocus_px: float = key(0.6, "sigma of the lens's blur", ge=0, le=10)
     camera_fields: Literal["progressive", "top", "bottom"] = key(
-        "progressive", "interlaced: which row's field comes first"
+        "progressive", "`top`, `bottom`: interlaced, with this field first"
     )
     camera_readout_s: float = key(
-        0.0, "rolling shutter: from the first row to the last", ge=0, le=0.05
+        0.0, "rolling shutter: time from first to last row", ge=0, le=0.05
     )
-    camera_flicker: float = key(
-        0.0, "share of the light that comes and goes 100 times a second", ge=0, le=1
-    )
+    camera_flicker: float = key(0.0, "share of the light that flickers at 100 Hz", ge=0, le=1)
     camera_pumping: float = key(
-        0.0, "share by which an exposure control that hunts is off", ge=0, le=0.9
+        0.0, "largest relative error of a hunting exposure control", ge=0, le=0.9
     )
     camera_analogue: float = key(
-        0.0, "trembling, torn and lost lines; 1 is about to be lost", ge=0, le=1
+        0.0, "trembling, torn and lost lines; at 1 the video is nearly lost", ge=0, le=1
     )
     camera_receiver_hz: float | None = key(
         None,
-        "the receiver's own rate, at which it gives out its newest picture again; "
-        "none: each once, as it comes",
+        "rate at which the receiver repeats its newest picture; none: each picture once",
         gt=0,
         le=200,
     )
-    mount_error_deg: float = key(1.0, "what the profile's mount is wrong by, at most", ge=0, le=20)
+    mount_error_deg: float = key(1.0, "largest rotation error of the profile's mount", ge=0, le=20)
     mount_error_m: float = key(
-        0.001, "what the profile's mount is wrong by, at most", ge=0, le=0.05
+        0.001, "largest position error of the profile's mount", ge=0, le=0.05
     )
     estimate_noise_m: ClassVar[float] = 0.002
     """Noise of the state estimate."""
-    estimate_tilt_bias_deg: float = key(0.3, "of the state estimate, at most", ge=0, le=10)
-    drift_mps: float = key(0.01, "of the state estimate", ge=0, le=0.2)
+    estimate_tilt_bias_deg: float = key(0.3, "largest tilt bias of the state estimate", ge=0, le=10)
+    drift_mps: float = key(0.01, "drift of the state estimate", ge=0, le=0.2)
     gyro_bias_dps: float = key(
-        0.0, "of the gyroscope, without a deck; each axis, at most", ge=0, le=5
+        0.0, "largest gyroscope bias of each axis, without a deck", ge=0, le=5
     )
     acc_bias_g: float = key(
-        0.0, "of the accelerometer, without a deck; each level axis, at most", ge=0, le=0.2
+        0.0, "largest accelerometer bias of each level axis, without a deck", ge=0, le=0.2
     )
     draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
     magnet_force_n: ClassVar[float] = 1.2  # that the magnet holds
@@ -86,10 +83,10 @@ class SimulationConfig(Section):
     capture_noise_m: ClassVar[float] = 0.001
     """Standard deviation of a motion capture's position."""
     neighbours: tuple[tuple[float, float, float], ...] = key(
-        (), "other targets beside the own one: x and y (m) in its axes, heading (deg)", max_length=8
+        (), "other targets: x and y (m) in the own target's axes, heading (deg)", max_length=8
     )
     neighbour_ids: tuple[MarkerId, MarkerId] | None = key(
-        None, "of their large and small markers; none: the own target's"
+        None, "ids of the neighbours' large and small markers; none: the own target's"
     )
     camera_burst_start_s: ClassVar[tuple[float, float]] = (4.0, 22.0)
     """Of the frames lost in one go."""
@@ -98,14 +95,12 @@ class SimulationConfig(Section):
     ceiling_suction: Shares = key(
         (0.1, 0.1), "share of thrust gained with the rotors at the ceiling"
     )
-    cell_resistance_ohm: Ohms | None = key(None, "none: a good one's, 0.143")
-    cell_slow_ohm: Ohms = key((0.0, 0.0), "more of it, that an old or cold cell shows within 15 s")
-    cell_charge: Charges = key((1.0, 1.0), "share of a new one's that it holds")
-    cell_knee: Knees = key((0.1, 0.1), "share of its charge where the steep end begins")
-    target_tilt_deg: Tilts = key((0.0, 0.0), "of the target out of the horizontal")
+    cell_resistance_ohm: Ohms | None = key(None, "internal resistance; none: 0.143, a good cell's")
+    cell_slow_ohm: Ohms = key((0.0, 0.0), "further resistance of an old or cold cell, within 15 s")
+    cell_charge: Charges = key((1.0, 1.0), "charge, as a share of a new cell's")
+    cell_knee: Knees = key((0.1, 0.1), "share of charge left where its voltage drops")
+    target_tilt_deg: Tilts = key((0.0, 0.0), "tilt of the target from the horizontal")
     radio_loss: Losses = key((0.0, 0.0), "share of the time in which no packet passes")
-    radio_burst_s: Bursts = key((0.1, 0.1), "mean length of such a time")
-    capture_hole_s: Amounts = key(
-        (0.0, 0.0), "motion capture: for so long it does not see the vehicle"
-    )
-    capture_hole_every_s: float = key(15.0, "on average", gt=0, le=1000)
+    radio_burst_s: Bursts = key((0.1, 0.1), "mean length of a radio gap")
+    capture_hole_s: Amounts = key((0.0, 0.0), "length of a gap in motion capture")
+    capture_hole_every_s: float = key(15.0, "mean time between capture gaps", gt=0, le=1000)

@@ -70,7 +70,7 @@ class Mounting(Section):
 
     position_m: BodyVector3 = key((0.0, 0.0, 0.01), "the camera in body axes: forward, left, up")
     rpy_deg: Vector3 = key(
-        (0.0, 0.0, 0.0), "its turn; at 0 0 0 the picture's right is forward, its bottom left"
+        (0.0, 0.0, 0.0), "rotation: at 0 0 0 the picture's right is forward, its bottom left"
     )
 
     @field_validator("rpy_deg")
@@ -112,32 +112,32 @@ class CameraConfig(Section):
 
     source: str = key(
         "sim:",
-        "`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
+        "`camera:N`, `camera:NAME`, `rtsp://...`, `http://...`, `aideck://HOST`, "
         "`video:FILE`, `images:DIR`, `sim:`",
     )
     calibration: str = key(
-        "example_640x480.yaml", "file beside the profile, in `calib/`, or a whole path"
+        "example_640x480.yaml", "file beside the profile or in `calib/`, or a full path"
     )
     cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
     latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = key(
-        START_LATENCY_S, "from exposure to arrival; `measured`: by each flight"
+        START_LATENCY_S, "time from exposure to arrival; `measured`: each flight measures it"
     )
     mount: Mounting = Mounting()
-    start_timeout_s: float = key(8.0, "wait for the first good picture", gt=0, le=60)
+    start_timeout_s: float = key(8.0, "longest wait for the first good picture", gt=0, le=60)
     mirrored: bool = key(False, "flip each picture before use")
-    mask: str | None = key(None, "picture of what the vehicle itself covers, white")
+    mask: str | None = key(None, "picture file, white where the vehicle covers the view")
     fields: ClassVar[str] = "auto"  # of interlaced pictures: found by measure
     readout_s: float | None = key(
-        0.0, "rolling shutter: from the first row to the last; none: not known", ge=0, le=0.05
+        0.0, "rolling shutter: time from first to last row; none: unknown", ge=0, le=0.05
     )
 
     format: str | None = key(
         None,
-        "asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
+        "requested from `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
         pattern="^[A-Z0-9]{3,4}$",
     )
     rate_hz: float | None = key(
-        None, "asked of `camera:` sources; none: the driver's own", gt=0, le=500
+        None, "rate requested from `camera:` sources; none: the driver's own", gt=0, le=500
     )
 
     @field_validator("latency_s", mode="before")
@@ -169,9 +169,9 @@ class MarkerConfig(Section):
     """One marker of the profile's `target`: dictionary, id and side."""
 
     dictionary: str = key(..., "an OpenCV dictionary")
-    id: int = key(..., "within the dictionary", ge=0)
+    id: int = key(..., "the marker's id in its dictionary", ge=0)
     side_m: float = key(
-        ..., "of the black square, as printed; small: less than half of large", ge=0.004, le=2.0
+        ..., "side of the printed black square; small: less than half of large", ge=0.004, le=2.0
     )
 
     @model_validator(mode="after")
@@ -196,20 +196,20 @@ class TargetConfig(Section):
     large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
     size_sigma: float = key(
-        0.005, "share by which all printed sizes may be off; less once measured", ge=0, le=0.1
+        0.005, "relative error of all printed sizes, one sigma; less once measured", ge=0, le=0.1
     )
     curl_per_m: float = key(
         0.03,
-        "so much times r^2 a place r from the sheet's centre may be off its plane",
+        "at r from its centre, the sheet may leave its plane by this times r^2",
         ge=0,
         le=10,
     )
 
     expected_xy_m: tuple[_InARoom, _InARoom] | None = key(
-        None, "where it hangs, in the estimate's world: of several alike the nearest counts"
+        None, "the target's place in the estimate's world; of several the nearest counts"
     )
     expected_within_m: float = key(
-        0.3, "one farther from `expected_xy_m` is another vehicle's", gt=0, le=20
+        0.3, "a target farther from `expected_xy_m` is another vehicle's", gt=0, le=20
     )
 
     @model_validator(mode="after")
@@ -247,7 +247,7 @@ class DetectorConfig(Section):
     """The profile's `detector`: how markers are searched and measured."""
 
     refinement: Literal["subpix", "line"] = key(
-        "line", "of corners: lines, and all that builds on them, or OpenCV's sub-pixel"
+        "line", "corners by edge lines (even if blurred or cut), or OpenCV's sub-pixel"
     )
     blurred: ClassVar[bool] = True  # with lines: looked for where blur may hide the target
     blurred_every: ClassVar[int] = 4  # ... in so many pictures of a stream without it
@@ -261,7 +261,7 @@ class PoseConfig(Section):
 
     solver: ClassVar[str] = "sqpnp"  # OpenCV's, for the first guess
     refine: ClassVar[bool] = True  # by least squares on the corners after it
-    max_reprojection_px: float = key(3.0, "no pose above this RMS", gt=0)
+    max_reprojection_px: float = key(3.0, "a pose above this RMS error is rejected", gt=0)
     each_marker: ClassVar[bool] = False  # beside the joint pose also each marker's own
 
 
@@ -281,50 +281,50 @@ class KalmanConfig(Section):
 
     k1: float = key(0.04, "measurement noise, the paper's R = k1 I, with `noise: fixed`", gt=0)
     k2: float = key(
-        0.004, "process noise of a frame, the paper's Q = k2 I, with `noise: fixed`", gt=0
+        0.004, "process noise per frame, the paper's Q = k2 I, with `noise: fixed`", gt=0
     )
-    alpha: float = key(
-        0.85, "a coasting track's speeds are multiplied by it each frame", gt=0, le=1
-    )
-    n_max: int = key(8, "frames for which a track coasts", ge=0, le=100)
+    alpha: float = key(0.85, "factor on a coasting track's speeds, per frame", gt=0, le=1)
+    n_max: int = key(8, "longest coasting of a track, in frames", ge=0, le=100)
     frame: Literal["level", "world"] = key(
-        "world", "where tracks live: `level` as the paper, or `world`"
+        "world", "frame in which tracks are filtered; `level` is the paper's"
     )
     noise: Literal["fixed", "measured"] = key(
-        "measured", "k1 and k2 for every frame, or each pose's own covariance and accelerations"
+        "measured", "`fixed`: k1 and k2; `measured`: each pose's covariance, and accelerations"
     )
     acceleration_mps2: ClassVar[float] = 3.0
     """Of camera or target in the level frame, with `noise: measured`."""
     turn_radps2: ClassVar[float] = 3.0
     """Of the camera's attitude and heading, likewise."""
     drift_mps2: float = key(
-        0.1, "of the state estimate's drift, for tracks in the world, likewise", gt=0, le=100
+        0.1, "drift of the state estimate, with `frame: world`, `noise: measured`", gt=0, le=100
     )
-    attitude_sigma_deg: float = key(0.3, "constant error of roll and pitch, likewise", ge=0, le=10)
+    attitude_sigma_deg: float = key(
+        0.3, "error of roll and pitch, with `noise: measured`", ge=0, le=10
+    )
     drift_mps: ClassVar[float] = 0.05
     """An unmeasured target moves in the estimate's world at most so fast."""
-    gate: bool = key(True, "a pose that contradicts the target's track is not taken")
+    gate: bool = key(True, "reject a pose that contradicts the target's track")
 
 
 class WeightsConfig(Section):
     """The paper's weights: the large marker's share in each axis and in yaw."""
 
-    x: float = key(0.275, "the large marker's share; the small one has the rest", ge=0, le=1)
-    y: float = key(0.306, "as x", ge=0, le=1)
-    z: float = key(0.728, "as x", ge=0, le=1)
-    yaw: float = key(0.469, "as x", ge=0, le=1)
+    x: float = key(0.275, "the large marker's share of x; the small one has the rest", ge=0, le=1)
+    y: float = key(0.306, "the large marker's share of y", ge=0, le=1)
+    z: float = key(0.728, "the large marker's share of z", ge=0, le=1)
+    yaw: float = key(0.469, "the large marker's share of yaw", ge=0, le=1)
 
 
 class MergeConfig(Section):
     """The profile's `merge`: how the two markers become one estimate."""
 
     method: Literal["weights", "joint"] = key(
-        "joint", "the paper's weights, or both markers solved as one"
+        "joint", "the paper's weights, or both markers solved as one pose"
     )
     weights: WeightsConfig = WeightsConfig()
-    weights_file: str | None = key(None, "of `perchctl fit-weights`; replaces `weights`")
+    weights_file: str | None = key(None, "file from `perchctl fit-weights`; replaces `weights`")
     stages: Literal["seen", "range"] = key(
-        "seen", "merge what is seen, or by distance as equations 4, 6, 11"
+        "seen", "merge all markers seen, or choose by distance (the paper's equations 4, 6, 11)"
     )
     z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
     z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)

@@ -1,4 +1,4 @@
-"""The flight log and its recording: written, read, summarised and made a table."""
+"""The flight log and its recording: written, read, summarised and exported as a table."""
 
 import lazy_loader
 

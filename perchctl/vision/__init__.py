@@ -1,4 +1,4 @@
-"""From a frame to the target's estimate: detection, pose, merge and filter, pure.
+"""From a frame to the target's estimate by pure functions: detection, pose, merge and filter.
 
 pipeline: the one way from a picture to the target; its memory is a value.
 fields: the two pictures of an interlaced frame.

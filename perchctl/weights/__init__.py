@@ -1,4 +1,4 @@
-"""The paper's merge weights: data from a session, the fit, and how sure it is."""
+"""The paper's merge weights: data from a session, the fit, and its certainty."""
 
 import lazy_loader
 
