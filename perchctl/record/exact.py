@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
-_GONE = {"timing"}  # in logs of before
+_GONE = {"timing"}  # fields of a flight in real time by 0.2.0
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
@@ -124,6 +124,8 @@ def _from_exact(hint: Any, data: Any) -> Any:
 def _dataclass_from(kind: Any, data: Any) -> Any:
     hints, values = _hints(kind), {}
     for name, part in data.items():
+        if name in _GONE:
+            continue
         try:
             values[name] = _from_exact(hints[name], part)
         except (ValueError, TypeError, LookupError, AttributeError) as error:

@@ -173,9 +173,9 @@ def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> N
     assert why in str(caught.value)
 
 
-def test_a_field_that_is_missing_has_its_default() -> None:
-    """As of an earlier version's log."""
-    record = decode_line(turn_line(whole_turn()))
+def test_a_turn_of_an_earlier_version_comes_back() -> None:
+    """A field that is missing has its default; one that is no more is passed over."""
+    record = decode_line(turn_line(whole_turn())) | {"timing": {"planner_s": 0.001}}
     del record["attempts"]
     assert turn_of(record).attempts == 0
     del record["began_s"]
