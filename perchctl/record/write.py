@@ -278,8 +278,10 @@ class LogWatcher:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
+            # What was waited for in vain is in the file by now.
+            problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused + self._failed
-            lost = {"lost_records": lost_records, "problem": self.lacks}
+            lost = {"lost_records": lost_records, "problem": problem or self.formless}
             self._store(partial(encode, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
         with suppress(OSError):
