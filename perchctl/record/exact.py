@@ -128,7 +128,7 @@ def _dataclass_from(kind: Any, data: Any) -> Any:
             continue
         try:
             values[name] = _from_exact(hints[name], part)
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
             raise ValueError(f"{name}: {error}") from None
     return kind(**values)
 
@@ -191,7 +191,10 @@ def json_line(plain: Mapping[str, Any]) -> bytes:
 
 def decode_line(line: bytes) -> dict[str, Any]:
     """Return the record of a line. Raises ValueError for anything that is not one JSON object."""
-    record = json.loads(line.decode("utf-8"))
+    try:
+        record = json.loads(line.decode("utf-8"))
+    except RecursionError:
+        raise ValueError("nested too deep") from None
     if not isinstance(record, dict):
         raise ValueError("not a JSON object")
     return record

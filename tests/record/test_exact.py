@@ -164,6 +164,7 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
      ({"command": ["Jump", {}]}, "command: 'Jump'"), ({"command": 3}, "command: "),
      ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),
      ({"observation": {}}, "observation: "), ({"role": "flying"}, "role: "),
+     ({"t_s": {"dtype": "u1", "shape": [1], "data": [300]}}, "t_s: Python integer 300"),
      ({"taken": {"samples": 3}}, "taken: samples: "), ({"taken": "none"}, "taken: ")],
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
