@@ -359,7 +359,7 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
     kind = record.get("kind")
     if kind not in KINDS:
         raise ValueError(f"kind {kind!r}, allowed are {', '.join(KINDS)}")
-    t_s = record.get("t_s")
+    t_s: Any = record.get("t_s")
     is_time = type(t_s) in (int, float) and abs(t_s) < math.inf
     if not is_time and kind not in ("summary", "recording"):
         raise ValueError(f"t_s must be a number of seconds, found {t_s!r}")

@@ -4,7 +4,6 @@ process of its own."""
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import math
 import os
@@ -17,11 +16,12 @@ from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
 
+from perchctl.children import SharedTime
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
 from perchctl.profile import TargetConfig
@@ -189,22 +189,6 @@ class VehicleHost:
 
 LOOP_PATIENCE_S = 2.0
 """The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
-
-
-class SharedTime(ctypes.Structure):
-    """How far simulated time has come and may go, where both processes see it.
-
-    Attributes:
-        reached_s: written by the simulator.
-        limit_s: written by the flight; infinity lets time run freely.
-    """
-
-    MARGIN_S: ClassVar = 0.02
-    """Simulated time may run so far past the moment that the flight loop waits for."""
-
-    reached_s: float
-    limit_s: float
-    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
 
 
 def serve_parent(
