@@ -31,8 +31,8 @@ def _serve_parent(*arguments: Any) -> None:
 
 
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager. It has the methods of the child's
-    `perchctl.sim.host.VehicleHost`, and of its server, its world and its motion capture.
+    """Handle of a running simulated vehicle; a context manager. It has the methods that the child's
+    `perchctl.sim.host.VehicleHost` calls in `answer`.
 
     From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
     does not answer, `InvalidValue` when it refuses.
