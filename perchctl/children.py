@@ -25,12 +25,8 @@ _PREFACE = "import sys; sys.path.append(sys.argv[1]); "
 
 
 class SharedTime(ctypes.Structure):
-    """How far simulated time has come and may go, where both processes see it.
-
-    Attributes:
-        reached_s: written by the simulator.
-        limit_s: written by the flight; infinity lets time run freely.
-    """
+    """How far simulated time has come (`reached_s`, by the simulator) and may go (`limit_s`, by the
+    flight; infinity lets it run freely), where both processes see it."""
 
     MARGIN_S: ClassVar = 0.02
     """Simulated time may run so far past the moment that the flight loop waits for."""

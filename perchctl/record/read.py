@@ -27,12 +27,7 @@ from perchctl.geometry import Array
 from perchctl.mission import SentCommand, Turn
 from perchctl.profile import Profile, first_invalid_key
 from perchctl.record.exact import decode_line, from_exact
-from perchctl.record.fields import (
-    FIELDS,
-    FORMAT,
-    READABLE_VERSIONS,
-    SCHEMA_VERSION,
-)
+from perchctl.record.fields import FIELDS, FORMAT, READABLE_VERSIONS, SCHEMA_VERSION
 from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
 

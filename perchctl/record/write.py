@@ -40,7 +40,6 @@ MOST_WAITING = 3000
 NO_ANSWER = "the disk does not answer: the flight log lacks its end"
 NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
 
-
 Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""
 

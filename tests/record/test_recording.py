@@ -12,17 +12,11 @@ import pytest
 from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.geometry import (
-    make_T,
-    rot_z,
-    rotation_from_rpy,
-)
+from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.record import recorded_pictures
 from tests.helpers import recorded
 
 FLIGHT = recorded.flown(120)
-
-
 STARTED = datetime(2024, 5, 17, 12, 30, 15, tzinfo=UTC)
 
 
