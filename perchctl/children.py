@@ -7,6 +7,7 @@ unpickles foreign bytes.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import multiprocessing
 import os
 import socket
@@ -16,11 +17,23 @@ import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar
 
 # -P and the path at the end: an installed package is found as usual, a checkout too,
 # and nothing in the working directory can shadow a module.
 _PREFACE = "import sys; sys.path.append(sys.argv[1]); "
+
+
+class SharedTime(ctypes.Structure):
+    """How far simulated time has come (`reached_s`, by the simulator) and may go (`limit_s`, by the
+    flight; infinity lets it run freely), where both processes see it."""
+
+    MARGIN_S: ClassVar = 0.02
+    """Simulated time may run so far past the moment that the flight loop waits for."""
+
+    reached_s: float
+    limit_s: float
+    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
 
 
 class Channel(Connection):

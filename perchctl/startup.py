@@ -17,10 +17,12 @@ SENTENCE = "Ctrl-C"
 
 
 def is_program() -> bool:
-    """Return True if this process is the command line: no script that imports perchctl, and none
+    """Return True if this process is the command line: no program that imports perchctl, and none
     of its child processes, which have its arguments."""
     script = "" if "multiprocessing" in sys.modules else os.path.basename(sys.argv[0])
-    return script.startswith("perchctl") or (script == "-m" and "perchctl" in sys.orig_argv)
+    if script == "-m":
+        script = sys.orig_argv[-len(sys.argv)].removeprefix("-m")  # the module
+    return script == "perchctl"
 
 
 def leave_at_ctrl_c() -> None:

@@ -99,7 +99,7 @@ MOST_NAMES = {
     "perception": 5,
     "positioning": 10,
     "profile": 33,
-    "sim": 13,
+    "sim": 12,
     "target": 14,
     "vision": 26,
     "weights": 9,

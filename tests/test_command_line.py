@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import sys
 import textwrap
 import warnings
 from pathlib import Path
@@ -20,6 +21,7 @@ from perchctl import __version__
 from perchctl.commands.command_line import COMMANDS, report_failures
 from perchctl.commands.output import ask_to_confirm
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
+from perchctl.startup import is_program
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT
 
@@ -255,6 +257,20 @@ def test_an_ignored_ctrl_c_stays_ignored() -> None:
     """As a shell starts what it puts into the background."""
     ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
     assert run_apart("fly", "--dry-run", before=ignored + pressed_at("numpy")).code == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "started", "mine"),
+    [("/bin/perchctl", "/bin/perchctl", True), ("-m", "-m perchctl", True),
+     ("perchctl_notes.py", "perchctl_notes.py", False), ("-m", "-m notes perchctl", False)],
+)  # fmt: skip
+def test_a_program_that_imports_perchctl_keeps_its_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch, name: str, started: str, mine: bool
+) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *started.split()[1 + (name == "-m") :]])
+    monkeypatch.setattr(sys, "orig_argv", ["python", *started.split()])
+    monkeypatch.delitem(sys.modules, "multiprocessing", raising=False)
+    assert is_program() is mine
 
 
 @pytest.mark.parametrize(

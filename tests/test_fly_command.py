@@ -196,7 +196,7 @@ def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str) -> None:
     ids=["a log variable is missing", "old protocol"],
 )
 def test_an_unfit_firmware(link: dict[str, Any], code: int, words: list[str], eyes: str) -> None:
-    with SimProcess.start(**link) as sim:
+    with SimProcess.start(link=link) as sim:
         said = run("fly", "-p", SHORT, "--uri", sim.uri, "--source", eyes, "--yes")
         assert max(sim.truth()["motors"]) == 0
     assert said.code == code

@@ -7,10 +7,9 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from perchctl.sim import SharedTime
+from perchctl.children import SharedTime
 
 SIM_PATIENCE_S = 5.0
 """Wait for a stopped simulator, on the wall's clock: longer than it waits for the loop."""

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 T = TypeVar("T")
-_GONE = {"timing"}  # in logs of before
+_GONE = {"timing"}  # fields of a flight in real time by 0.2.0
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
@@ -124,9 +124,11 @@ def _from_exact(hint: Any, data: Any) -> Any:
 def _dataclass_from(kind: Any, data: Any) -> Any:
     hints, values = _hints(kind), {}
     for name, part in data.items():
+        if name in _GONE:
+            continue
         try:
             values[name] = _from_exact(hints[name], part)
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
             raise ValueError(f"{name}: {error}") from None
     return kind(**values)
 
@@ -189,7 +191,10 @@ def json_line(plain: Mapping[str, Any]) -> bytes:
 
 def decode_line(line: bytes) -> dict[str, Any]:
     """Return the record of a line. Raises ValueError for anything that is not one JSON object."""
-    record = json.loads(line.decode("utf-8"))
+    try:
+        record = json.loads(line.decode("utf-8"))
+    except RecursionError:
+        raise ValueError("nested too deep") from None
     if not isinstance(record, dict):
         raise ValueError("not a JSON object")
     return record

@@ -6,6 +6,7 @@ import base64
 import contextlib
 import csv
 import gzip
+import math
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping
@@ -26,12 +27,7 @@ from perchctl.geometry import Array
 from perchctl.mission import SentCommand, Turn
 from perchctl.profile import Profile, first_invalid_key
 from perchctl.record.exact import decode_line, from_exact
-from perchctl.record.fields import (
-    FIELDS,
-    FORMAT,
-    READABLE_VERSIONS,
-    SCHEMA_VERSION,
-)
+from perchctl.record.fields import FIELDS, FORMAT, READABLE_VERSIONS, SCHEMA_VERSION
 from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
 
@@ -227,14 +223,18 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """Return the flown mask, (height, width), True where the gear covers; None without one."""
+        """Return the flown mask, (height, width), True where the gear covers; None without one.
+        Errors: InvalidValue."""
         text = self.header.get("mask")
         if text is None:
             return None
         width, height = camera.size_px
-        packed = zlib.decompress(base64.b64decode(text))
-        bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
-        return bits[: width * height].reshape(height, width).astype(bool)
+        try:
+            packed = zlib.decompress(base64.b64decode(text))
+            bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8))
+            return bits[: width * height].reshape(height, width).astype(bool)
+        except (ValueError, TypeError, zlib.error) as error:
+            raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
 
     @property
     def computer_differences(self) -> str:
@@ -354,9 +354,9 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
     kind = record.get("kind")
     if kind not in KINDS:
         raise ValueError(f"kind {kind!r}, allowed are {', '.join(KINDS)}")
-    t_s = record.get("t_s")
-    timeless = kind in ("summary", "recording")
-    if not timeless and (isinstance(t_s, bool) or not isinstance(t_s, (int, float))):
+    t_s: Any = record.get("t_s")
+    is_time = type(t_s) in (int, float) and abs(t_s) < math.inf
+    if not is_time and kind not in ("summary", "recording"):
         raise ValueError(f"t_s must be a number of seconds, found {t_s!r}")
     return record
 

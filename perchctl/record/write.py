@@ -40,7 +40,6 @@ MOST_WAITING = 3000
 NO_ANSWER = "the disk does not answer: the flight log lacks its end"
 NO_ROOM = "the disk does not keep up with the flight log: records are dropped"
 
-
 Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""
 
@@ -278,8 +277,10 @@ class LogWatcher:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
+            # What was waited for in vain is in the file by now.
+            problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused + self._failed
-            lost = {"lost_records": lost_records, "problem": self.lacks}
+            lost = {"lost_records": lost_records, "problem": problem or self.formless}
             self._store(partial(encode, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
         with suppress(OSError):

@@ -1,7 +1,6 @@
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
 from .capture import draw_capture as draw_capture
-from .host import SharedTime as SharedTime
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
 from .process import SimProcess as SimProcess

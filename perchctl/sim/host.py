@@ -4,7 +4,6 @@ process of its own."""
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import math
 import os
@@ -17,20 +16,19 @@ from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
 
+from perchctl.children import SharedTime
 from perchctl.geometry import rotation_from_quaternion, rpy_from_rotation
 from perchctl.link import Packet
-from perchctl.profile import TargetConfig
-from perchctl.sim.capture import CaptureSettings, MotionCaptureServer, SimCapture
+from perchctl.sim.capture import MotionCaptureServer, SimCapture
 from perchctl.sim.crtp import CrtpServer
 from perchctl.sim.optics import Picture
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
-from perchctl.vision import CameraModel
 
 Address = tuple[str, int]
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
@@ -46,35 +44,33 @@ class VehicleHost:
     driver sends them. Answers go to the address that asked.
 
     Args:
-        camera: None: no camera and no stream.
-        capture: None: no motion capture.
-        truth_file: JSON lines of the true state, 50 a simulated second.
         link: further arguments of `CrtpServer`.
+        truth_file: JSON lines of the true state, 50 a simulated second.
+        parts: further arguments of `SimulatedVehicle`, of this one and each that replaces it.
     """
 
     def __init__(
         self,
         scenario: Scenario,
-        camera: CameraModel | None = None,
-        target: TargetConfig | None = None,
-        capture: CaptureSettings | None = None,
+        link: dict[str, Any] | None = None,
         truth_file: Path | None = None,
-        **link: Any,
+        **parts: Any,
     ) -> None:
-        self._parts = camera, target, capture
+        self._parts = parts
         self._steps = 0
         self._peer: Address | None = None
         self._silent_s = (math.inf, math.inf)
         self._bursts = scenario.radio_bursts()
-        self.vehicle = SimulatedVehicle(scenario, *self._parts)
-        self.server = CrtpServer(self.vehicle.firmware, **link)
+        self.vehicle = SimulatedVehicle(scenario, **parts)
+        self.server = CrtpServer(self.vehicle.firmware, **(link or {}))
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
         self.socket.bind(("127.0.0.1", 0))
         self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
-        self.stream = None if camera is None else MjpegServer()
-        self.positions = None if capture is None else MotionCaptureServer(capture.names)
+        self.stream = None if self.vehicle.camera is None else MjpegServer()
+        capture = self.vehicle.capture
+        self.positions = None if capture is None else MotionCaptureServer(capture.settings.names)
         self._truth = None if truth_file is None else truth_file.open("w", encoding="utf-8")
 
     @property
@@ -161,7 +157,7 @@ class VehicleHost:
 
     def replace_vehicle(self, scenario: Scenario) -> None:
         """Put a new vehicle under the same link: connection and log blocks stay."""
-        self.vehicle = SimulatedVehicle(scenario, *self._parts)
+        self.vehicle = SimulatedVehicle(scenario, **self._parts)
         self.server.replace_firmware(self.vehicle.firmware)
 
     def close(self) -> None:
@@ -189,22 +185,6 @@ class VehicleHost:
 
 LOOP_PATIENCE_S = 2.0
 """The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
-
-
-class SharedTime(ctypes.Structure):
-    """How far simulated time has come and may go, where both processes see it.
-
-    Attributes:
-        reached_s: written by the simulator.
-        limit_s: written by the flight; infinity lets time run freely.
-    """
-
-    MARGIN_S: ClassVar = 0.02
-    """Simulated time may run so far past the moment that the flight loop waits for."""
-
-    reached_s: float
-    limit_s: float
-    _fields_ = (("reached_s", ctypes.c_double), ("limit_s", ctypes.c_double))
 
 
 def serve_parent(

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
+from perchctl.children import SharedTime
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
-from perchctl.sim.host import SharedTime, serve_parent
 from perchctl.sim.scenario import Scenario
 
 ANSWER_TIMEOUT_S = 60.0
@@ -24,9 +24,15 @@ _STOP_TIMEOUT_S = 5.0
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
+def _serve_parent(*arguments: Any) -> None:
+    from perchctl.sim.host import serve_parent  # with the physics: in the child only
+
+    serve_parent(*arguments)
+
+
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager. It has the methods of the child's
-    `perchctl.sim.host.VehicleHost`, and of its server, its world and its motion capture.
+    """Handle of a running simulated vehicle; a context manager. It has the methods that the child's
+    `perchctl.sim.host.VehicleHost` calls in `answer`.
 
     From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
     does not answer, `InvalidValue` when it refuses.
@@ -47,7 +53,7 @@ class SimProcess:
         self.shared_time = _CONTEXT.RawValue(SharedTime, 0.0, math.inf)
         self._channel, childs = _CONTEXT.Pipe()
         arguments = (childs, self.shared_time, pace, scenario, settings)
-        self._child = _CONTEXT.Process(target=serve_parent, args=arguments, daemon=True)
+        self._child = _CONTEXT.Process(target=_serve_parent, args=arguments, daemon=True)
         # The child takes over that Ctrl-C is blocked, until it has left the terminal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

@@ -8,12 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.analysis import (
-    FlightAnalysis,
-    newest_logs,
-    show_record,
-    show_text,
-)
+from perchctl.analysis import FlightAnalysis, newest_logs, show_record, show_text
 from perchctl.analysis.flight import last_ascent
 from perchctl.analysis.show import COLUMNS
 from perchctl.mission import Event, EventKind, Phase

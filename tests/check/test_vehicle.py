@@ -79,7 +79,7 @@ def vehicles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, dic
             sim.replace_vehicle(BAD)
             sim.set_pose((0.0, 0.0, 0.6), hold=True)
             found["bad"] = looked_at(sim)
-        with SimProcess.start(**OLD) as sim:
+        with SimProcess.start(link=OLD) as sim:
             found["old"] = looked_at(sim)
         yield found
 

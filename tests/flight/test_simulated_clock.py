@@ -10,8 +10,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.children import SharedTime
 from perchctl.flight.clock import SIM_PATIENCE_S, SimulatedClock
-from perchctl.sim import CONTROL_PERIOD_S, SharedTime
+from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.host import LOOP_PATIENCE_S, Runner
 
 CLOCK_MARGIN_S = SharedTime.MARGIN_S

@@ -8,12 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.geometry import (
-    Array,
-    rotation_from_quaternion,
-    rotation_from_rpy,
-    rpy_from_rotation,
-)
+from perchctl.geometry import Array, rotation_from_quaternion, rotation_from_rpy, rpy_from_rotation
 
 Place = tuple[float, float, float]
 

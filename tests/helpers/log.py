@@ -15,13 +15,7 @@ from perchctl.profile import Profile
 from perchctl.record import LogWatcher
 from perchctl.record.fields import tick_record
 from perchctl.record.header import make_header
-from perchctl.vehicle import (
-    Command,
-    Idle,
-    PositionSetpoint,
-    StopMotors,
-    Telemetry,
-)
+from perchctl.vehicle import Command, Idle, PositionSetpoint, StopMotors, Telemetry
 from perchctl.vision import MarkerPose, PipelineOutput, TargetEstimate
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers import mission

@@ -11,14 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.calibration import load_calibration
-from perchctl.geometry import (
-    R_MARKER_TARGET,
-    Array,
-    invert_T,
-    make_T,
-    rot_z,
-    rotation_from_rpy,
-)
+from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.places import data_folder
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario

@@ -184,7 +184,9 @@ def test_closing_does_not_wait_for_ever(hung: tuple[LogWatcher, Disk]) -> None:
     disk.gate.set()
     assert writer._writer._thread is not None
     writer._writer._thread.join(20.0)
-    assert len(read_log(writer.path).records) == 10  # it answered after all
+    log = read_log(writer.path)  # the disk answered after all
+    assert log.summary is not None
+    assert (len(log.records), log.summary.get("problem")) == (10, None)
 
 
 @pytest.mark.parametrize(

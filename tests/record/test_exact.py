@@ -164,6 +164,7 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
      ({"command": ["Jump", {}]}, "command: 'Jump'"), ({"command": 3}, "command: "),
      ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),
      ({"observation": {}}, "observation: "), ({"role": "flying"}, "role: "),
+     ({"t_s": {"dtype": "u1", "shape": [1], "data": [300]}}, "t_s: Python integer 300"),
      ({"taken": {"samples": 3}}, "taken: samples: "), ({"taken": "none"}, "taken: ")],
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
@@ -173,9 +174,9 @@ def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> N
     assert why in str(caught.value)
 
 
-def test_a_field_that_is_missing_has_its_default() -> None:
-    """As of an earlier version's log."""
-    record = decode_line(turn_line(whole_turn()))
+def test_a_turn_of_an_earlier_version_comes_back() -> None:
+    """A field that is missing has its default; one that is no more is passed over."""
+    record = decode_line(turn_line(whole_turn())) | {"timing": {"planner_s": 0.001}}
     del record["attempts"]
     assert turn_of(record).attempts == 0
     del record["began_s"]

@@ -6,6 +6,7 @@ import threading
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from perchctl.mission.state import BatteryOutlook
 from perchctl.record import LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_plain
 from perchctl.record.fields import FIELDS, tick_record
+from perchctl.record.messages import TICK_SCHEMA
 from perchctl.record.write import log_path
 from perchctl.vehicle import (
     EmergencyStop,
@@ -29,6 +31,7 @@ from perchctl.vision import Consistency
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held
 
+KINDS = {"number": (int, float), "string": (str,), "boolean": (bool,), "array": (list,)}
 STARTED = datetime(2024, 3, 1, 14, 5, 9, tzinfo=UTC)
 
 
@@ -80,7 +83,7 @@ def test_names_and_no_overwriting(tmp_path: Path) -> None:
 
 
 def test_every_field_is_filled_by_something() -> None:
-    """No documented key that nothing writes."""
+    """No documented key that nothing writes, and none by another type than a recording names."""
     pose = synthetic.target(1.0, 1.6)
     frame = synthetic.output(3, pose, np.random.default_rng(1))
     frame.poses["joint"] = frame.poses["large"]
@@ -108,6 +111,9 @@ def test_every_field_is_filled_by_something() -> None:
         record = tick_record(tick, (0.0, 0.0, 1.0), 0.01)
         seen |= {key for key, value in record.items() if value is not None}
         assert record["cmd"] == name
+        for key, value in to_plain(record).items():
+            kind: Any = TICK_SCHEMA["properties"][key]  # type: ignore[index]
+            assert value is None or type(value) in KINDS[kind["type"]], key
         height_m = {"land": -0.05, "position": 3.0}.get(name)
         assert (record["cmd_z_m"], record["z_m"]) == (height_m, 0.0)
         assert list(record) == list(FIELDS)

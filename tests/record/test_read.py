@@ -80,7 +80,6 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "empty": (b"", (NO_LOG, "logs are the .jsonl files")),
     "picture": (b"\x89PNG\r\n\x1a\n" + bytes(50), (NO_LOG, "it is a picture")),
     "table": (b"t_s,phase\n0.0,SEARCH\n", (NO_LOG,)),
-    "other lines": (b'{"part":"carry"}\n', (NO_LOG,)),
     "no header": (b'{"kind":"tick","t_s":0.0}\n', (NO_LOG,)),
     "list": (b"[1]\n", (NO_LOG,)),
     "torn gzip": (b"\x1f\x8b\x08\x00" + b"\xff" * 50, (NO_LOG,)),
@@ -94,6 +93,8 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     ),
     "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "take the original")),
     "no time": (with_line(4, b'{"kind":"tick"}'), ("line 4", "t_s must be")),
+    "endless": (with_line(4, b'{"kind":"tick","t_s":1e999}'), ("line 4", "t_s must be")),
+    "nested": (with_line(4, b"[" * 100_000), ("line 4", "nested too deep")),
     "kind": (with_line(3, b'{"kind":"?","t_s":1}'), ("line 3", "allowed are")),
 }
 

@@ -12,17 +12,11 @@ import pytest
 from mcap.reader import make_reader
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.geometry import (
-    make_T,
-    rot_z,
-    rotation_from_rpy,
-)
+from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.record import recorded_pictures
 from tests.helpers import recorded
 
 FLIGHT = recorded.flown(120)
-
-
 STARTED = datetime(2024, 5, 17, 12, 30, 15, tzinfo=UTC)
 
 
@@ -92,8 +86,16 @@ def test_readers_find_it_whole_by_its_index_and_foxgloves_own_schemas(
     assert len(found["/tick"]) == len(found["/tf"]) == len(FLIGHT.ticks)
 
 
-def test_people_s_times_count_from_the_first_flown_turn(found: dict[str, list[Any]]) -> None:
+def test_people_s_times_count_from_the_first_flown_turn_and_messages_by_the_wall(
+    found: dict[str, list[Any]],
+) -> None:
+    """The body is where it was when that was measured."""
     assert json.loads(found["/tick"][0])["t_s"] == 0.0
+    tick, moved = FLIGHT.ticks[50], {t.child_frame_id: t for t in found["/tf"][50].transforms}
+    for name, age_s in (("gear", 0.0), ("body", tick["tel_age_s"])):
+        at = moved[name].timestamp
+        since_s = at.seconds - STARTED.timestamp() + 1e-9 * at.nanos
+        assert since_s == pytest.approx(tick["t_s"] - 1.0 - age_s, abs=1e-8)
 
 
 def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(

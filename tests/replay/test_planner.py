@@ -188,6 +188,9 @@ def test_the_header_s_profile_and_mask_are_the_flown_ones_to_the_bit(tmp_path: P
     mask = log.flown_mask(camera)
     assert mask is not None
     assert np.array_equal(mask, covered > 0)
+    log.header["mask"] = "AAAA"
+    with pytest.raises(InvalidValue, match="no mask"):
+        log.flown_mask(camera)
 
 
 # --- what if -------------------------------------------------------------------------------

@@ -253,10 +253,8 @@ def test_an_exception_in_a_with_block_drops_the_vehicle(
 
 def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
     """Row "Protocol < 12": supervisor port missing, old channels work, bit field reads 0."""
-    missing = ("supervisor.info",)
-    with SimProcess.start(
-        pace="stepped", protocol_version=11, missing_log_variables=missing
-    ) as process:
+    link = {"protocol_version": 11, "missing_log_variables": ("supervisor.info",)}
+    with SimProcess.start(pace="stepped", link=link) as process:
         process.advance(1.0)
         with contextlib.closing(Client(process.uri, toc_cache)) as client:
             assert client.connect()

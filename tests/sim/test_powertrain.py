@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
-from perchctl.sim.powertrain import (
-    MOTOR_FORCE_N,
-    STANDSTILL_V,
-    Cell,
-    motor_v,
-    thrust_n,
-)
+from perchctl.sim.powertrain import MOTOR_FORCE_N, STANDSTILL_V, Cell, motor_v, thrust_n
 
 HOVER_A = 3.8
 LEVELS_V = (3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)

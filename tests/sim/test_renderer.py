@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from perchctl.geometry import (
-    R_MARKER_TARGET,
-    Array,
-    invert_T,
-    make_T,
-    rot_z,
-    rotation_from_rpy,
-)
+from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.sim.optics import lens_of

@@ -16,13 +16,7 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
-from perchctl.sim.firmware.outside import (
-    POSITION,
-    Imu,
-    OutsideFilter,
-    Quaternion,
-    Vector,
-)
+from perchctl.sim.firmware.outside import POSITION, Imu, OutsideFilter, Quaternion, Vector
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 if TYPE_CHECKING:

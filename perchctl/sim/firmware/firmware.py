@@ -7,13 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from perchctl.sim.firmware.controller import (
-    MODE_RAW,
-    MOTORS_OFF,
-    Controller,
-    MotorDriver,
-    Setpoint,
-)
+from perchctl.sim.firmware.controller import MODE_RAW, MOTORS_OFF, Controller, MotorDriver, Setpoint
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import Quaternion, Vector
 from perchctl.sim.firmware.planner import Planner

@@ -1,7 +1,8 @@
 """The log variables and parameters that a Crazyflie announces, and what they read and set.
 
-Names that something reads are the real firmware's. Each table is filled up to the measured
-size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
+Names are the real firmware's: of the variables that something reads, and of the parameters that a
+profile may set, most of which change nothing here. Each table is filled up to the measured size
+(docs/firmware.md, "Link": 385 log variables, 257 parameters).
 """
 
 from __future__ import annotations
@@ -29,12 +30,26 @@ class Parameter:
 
 # group -> "ctype: name=default ..."; "*" persistent, "!" read-only.
 _PARAMETER_GROUPS: dict[str, str] = {
-    "stabilizer": "uint8_t: estimator=2 stop=0",
+    "stabilizer": "uint8_t: estimator=2 controller=1 stop=0",
     "system": "uint8_t: selftestPassed=1!",
-    "kalman": "uint8_t: resetEstimation=0; float: initialX=0 initialY=0 initialZ=0 initialYaw=0",
-    "posCtlPid": "float: zKp=2.0* zVelMax=1*; uint16_t: thrustBase=36000*",
-    "pm": "float: lowVoltage=3.2*",
-    "deck": "uint8_t: bcFlow2=1! bcLighthouse4=0!",
+    "commander": "uint8_t: enHighLevel=1",
+    "hlCommander": "float: vtoff=0.5* vland=0.5*",
+    "supervisor": "uint8_t: infdmp=0 tmblChckEn=1; uint16_t: prefltTimeout=30000"
+    " landedTimeout=3000",
+    "kalman": "uint8_t: resetEstimation=0 robustTdoa=0 robustTwr=0; float: initialX=0 initialY=0"
+    " initialZ=0 initialYaw=0 pNAcc_xy=0.5 pNAcc_z=1 pNVel=0 pNPos=0 pNAtt=0 mNBaro=2"
+    " mNGyro_rollpitch=0.1 mNGyro_yaw=0.1 attitudeReversion=0.001 maxPos=100 maxVel=10",
+    "posCtlPid": "float: xKp=2* xKi=0* xKd=0* yKp=2* yKi=0* yKd=0* zKp=2* zKi=0.5* zKd=0*"
+    " rLimit=20* pLimit=20* xVelMax=1* yVelMax=1* zVelMax=1*;"
+    " uint16_t: thrustBase=36000* thrustMin=20000*",
+    "velCtlPid": "float: vxKp=25* vxKi=1* vxKd=0* vyKp=25* vyKi=1* vyKd=0* vzKp=25* vzKi=15*"
+    " vzKd=0*",
+    "pid_attitude": "float: roll_kp=6* roll_ki=3* roll_kd=0* pitch_kp=6* pitch_ki=3* pitch_kd=0*"
+    " yaw_kp=6* yaw_ki=1* yaw_kd=0.35* yawMaxDelta=0*",
+    "pid_rate": "float: roll_kp=250* roll_ki=500* roll_kd=2.5* pitch_kp=250* pitch_ki=500*"
+    " pitch_kd=2.5* yaw_kp=120* yaw_ki=16.7* yaw_kd=0*",
+    "pm": "float: lowVoltage=3.2* criticalLowVoltage=3*",
+    "deck": "uint8_t: bcFlow2=1! bcFlow=0! bcLighthouse4=0! bcLoco=0! bcDWM1000=0! bcAI=0!",
     "locSrv": "float: extPosStdDev=0.01 extQuatStdDev=0.0045",
     "ctrlMel": "float: mass=0.029",
 }
