@@ -78,7 +78,8 @@ class Comparison:
             yield _row(f"  {plain(each['phase'])}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
         yield ""
         yield "profile keys that differ, A and B" if self.profile else "their profiles are the same"
-        for key, (a, b) in self.profile.items():
+        for key, values in self.profile.items():
+            a, b = ("none" if value is None else value for value in values)
             yield from hung(f"  {plain(key):<{_NAME - 2}}  ", f"{a}  {b}")
 
     def _measure_rows(self) -> Iterator[str]:

@@ -15,7 +15,7 @@ from tests.helpers import log as synthetic
 def pair(tmp_path: Path) -> Comparison:
     """The second was killed in its ascent, and flown with another profile."""
     profile = synthetic.header()["profile"]
-    profile = profile | {"camera": profile["camera"] | {"latency_s": 0.1}}
+    profile = profile | {"camera": profile["camera"] | {"latency_s": 0.1, "mask": "a.png"}}
     del profile["log"]["plot"]
     one = synthetic.write(tmp_path / "one.jsonl", summary=synthetic.SUMMARY)
     other = synthetic.write(tmp_path / "other.jsonl", {"profile": profile}, most=500)
@@ -26,6 +26,7 @@ def test_what_differs_is_in_the_table(pair: Comparison) -> None:
     found = pair
     assert found.profile == {
         "camera.latency_s": (0.07, 0.1),
+        "camera.mask": (None, "a.png"),
         "log.plot": (True, "not there"),
     }
     record = found.record()
@@ -37,3 +38,4 @@ def test_what_differs_is_in_the_table(pair: Comparison) -> None:
     assert max(map(len, text.splitlines())) <= 79
     assert "UNKNOWN: the log ends in ASCEND" in text
     assert "camera.latency_s                0.07  0.1" in text
+    assert "camera.mask                     none  a.png" in text
