@@ -81,6 +81,13 @@ def render(
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
+def side_by_side(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], background: float = BACKGROUND
+) -> NDArray[np.uint8]:
+    """Both pictures' sheets in one; both without noise."""
+    return np.where(second == np.uint8(background), first, second)
+
+
 def bits_of(name: str, index: int) -> NDArray[np.uint8]:
     """The inner bits of a marker, 1 = white, (n, n)."""
     dictionary = aruco_dictionary(name)
