@@ -22,7 +22,7 @@ import numpy as np
 from common import Picture, camera_pose, in_view, renderer, rms, setup_with, table, true_corners
 
 from perchctl.calibration import load_calibration
-from perchctl.camera.aideck import without_mosaic
+from perchctl.camera.aideck import remove_mosaic
 from perchctl.campaign import FlightResult
 from perchctl.campaign.flights import fly_seed
 from perchctl.geometry import Array
@@ -97,7 +97,7 @@ def mosaic_of(image: Array, gains: tuple[float, float, float]) -> Array:
 WAYS: dict[str, Callable[[Picture], Picture]] = {
     "as it is": lambda image: image,
     "OpenCV's": lambda image: np.asarray(cv2.cvtColor(image, cv2.COLOR_BayerBG2GRAY), np.uint8),
-    "1 2 1": without_mosaic,
+    "1 2 1": remove_mosaic,
 }
 
 

@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perchctl.calibration import FoundViews, calibrate_camera
-from perchctl.calibration.board.adjust import parameters_of
+from perchctl.calibration.board.adjust import lens_parameters
 from perchctl.calibration.board.detect import BoardView, find_board
 from perchctl.calibration.board.predict import position_errors_mm
 from tests.helpers.boards import (
@@ -63,7 +63,7 @@ def main() -> None:
         start_s = time.perf_counter()
         views, truth = views_of(seed, options.corners)
         result = calibrate_camera(FoundViews(tuple(views)), "synthetic")
-        off = (result.fit.parameters - parameters_of(truth)) / result.std
+        off = (result.fit.parameters - lens_parameters(truth)) / result.parameter_std
         line = (
             f"seed {seed:2d}: {len(result.views)} of {len(views)} views, "
             f"RMS {result.fit.rms_px:.3f} px, {result.camera.model}, largest parameter error "

@@ -45,8 +45,8 @@ PARTS: dict[str, tuple[str, ...]] = {
     "history, turns, log": (
         "perchctl.flight.inputs:add_samples",
         "perchctl.perception.perception:update_calibration",
-        "perchctl.flight.inputs:Turns.flown",
-        "perchctl.flight.inputs:Turns.waiting",
+        "perchctl.flight.inputs:TurnReporter.flown",
+        "perchctl.flight.inputs:TurnReporter.report_waiting",
         "perchctl.flight.lockstep:Truth.tick",
     ),
 }

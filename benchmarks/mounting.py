@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perchctl.calibration import MountingRecording, profile_camera
 from perchctl.calibration.board.adjust import SIGMAS_95
-from perchctl.calibration.mounting.carry import solve_carry
+from perchctl.calibration.mounting.carry import solve_rotation
 from perchctl.calibration.mounting.pivot import solve_pivot
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
@@ -44,7 +44,7 @@ def recording(hand: Hand, bare: bool) -> MountingRecording:
 def errors_of(seed: int, bare: bool) -> tuple[dict[str, float], list[float]]:
     """Of each goal, and of each value in units of its sigma. Raises InvalidValue."""
     hands = {part: draw_hand(PROFILE, part, seed) for part in ("carry", "pivot")}
-    carried = solve_carry(recording(hands["carry"], bare))
+    carried = solve_rotation(recording(hands["carry"], bare))
     pivoted = solve_pivot(recording(hands["pivot"], bare), PROFILE.target.size_sigma)
     truth = hands["carry"]
     turn = Rotation.from_matrix(carried.R_body_cam @ truth.T_body_cam[:3, :3].T)

@@ -20,7 +20,7 @@ from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import Profile, TargetConfig
 from perchctl.sim import Renderer, Scenario
 from perchctl.target import make_design
-from perchctl.target.reading import FOUND_RATE, NOISE, TRIALS, PlainReader
+from perchctl.target.reading import FOUND_RATE, NOISE, TRIALS, ArucoReader
 from perchctl.vision import CameraModel
 from perchctl.vision.types import MarkerName
 
@@ -49,7 +49,7 @@ class Bench:
             small_side_m=target.small.side_m,
         )
         self._renderer = Renderer(scenario, camera, target, seed=5)
-        self._reader = PlainReader(target)
+        self._reader = ArucoReader(target)
         self._focal_px = float(camera.K[0, 0])
         self._rates: dict[tuple[str, int, float | None], float] = {}
 

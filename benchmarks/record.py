@@ -32,13 +32,13 @@ from speed import RATE_HZ, sequence
 
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.mission import (
-    FrameSeen,
+    FrameRecord,
     Observation,
     PlannerState,
-    PoseSeen,
     Tick,
     Turn,
     TurnInputs,
+    UnfilteredPose,
 )
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher
@@ -137,12 +137,12 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
     )  # fmt: skip
     target = None if output is None else output.target
     state, command = PlannerState(), PositionSetpoint(0.1 + t_s / 97.0, 0.2, 1.1, 0.3)
-    seen = None if frame is None else FrameSeen(frame.index, frame.t_s, frame.t_arrival_s)
+    seen = None if frame is None else FrameRecord(frame.index, frame.t_s, frame.t_arrival_s)
     found = {} if output is None else output.poses
     obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
     turn = Turn(
         number, "flown", t_s, t_s, TurnInputs(samples, frame=seen),
-        {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
+        {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
         obs, command, state.phase, "seek", reason="the target is looked for",
     )  # fmt: skip
     return Tick(t_s, samples[-1], output, target, state, command, 0.0, 0.03, 0.01, turn=turn)

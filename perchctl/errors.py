@@ -13,7 +13,7 @@ from decimal import Decimal
 MOST_DECIMALS = 9
 
 
-def distinct_figures(found: float, limit: float, decimals: int) -> tuple[str, str]:
+def distinct_texts(found: float, limit: float, decimals: int) -> tuple[str, str]:
     """Return texts of a number that was found and of its limit, for a message: with `decimals` or
     as many as the limit has, and with more if both would look the same."""
     own = -int(Decimal(f"{limit:g}").as_tuple().exponent)

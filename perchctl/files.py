@@ -56,13 +56,13 @@ def file_kind(path: Path) -> str:
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
     """Raise InvalidValue if the name does not end in one of `suffixes` (the case does not matter),
-    which the message says is `content`, or if `check_place` does."""
+    which the message says is `content`, or if `check_writable` does."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
-    check_place(path, force)
+    check_writable(path, force)
 
 
-def check_place(path: Path, force: bool) -> None:
+def check_writable(path: Path, force: bool) -> None:
     """Check that a file can be put there; to be called before any long work.
 
     Args:
@@ -97,7 +97,7 @@ def cannot_be_written(
 
 
 @contextmanager
-def whole_file(path: Path, mode: int | None = None) -> Iterator[Path]:
+def atomic_write(path: Path, mode: int | None = None) -> Iterator[Path]:
     """Yield a temporary path for the block to write a file to. As the block ends, the file is
     brought to the disk and gets its place; after an error nothing is left.
 
@@ -109,7 +109,7 @@ def whole_file(path: Path, mode: int | None = None) -> Iterator[Path]:
     made = [folder for folder in path.parents if not folder.exists()]
     try:
         with _refusals_of(path):
-            mode = mode_of(path) if path.exists() else mode
+            mode = file_mode(path) if path.exists() else mode
             path.parent.mkdir(parents=True, exist_ok=True)
         yield part
         with _refusals_of(path):
@@ -135,7 +135,7 @@ def _refusals_of(path: Path) -> Iterator[None]:
         raise cannot_be_written(path, error) from None
 
 
-def mode_of(path: Path) -> int:
+def file_mode(path: Path) -> int:
     """Return a file's permissions. Raises OSError."""
     return stat.S_IMODE(path.stat().st_mode)
 
@@ -151,12 +151,12 @@ def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
         InvalidValue: a path is a folder; or a full disk, or missing rights.
     """
     for path in files:
-        check_place(path, force=True)
+        check_writable(path, force=True)
     with ExitStack() as stack:
         for path, data in files.items():
             # Until it is whole, nobody else reads what may not be for them.
             at_first = 0o666 if mode is None and not path.exists() else 0o600
-            part = stack.enter_context(whole_file(path, mode))
+            part = stack.enter_context(atomic_write(path, mode))
             opener = partial(os.open, mode=at_first)
             with _refusals_of(path), open(part, "xb", opener=opener) as stream:
                 stream.write(data)

@@ -46,7 +46,7 @@ class Telemetry:
     acc_y_g: float = 0.0
     start: int = 0
 
-    def has(self, bit: int) -> bool:
+    def has_bit(self, bit: int) -> bool:
         return bool(self.supervisor & bit)
 
 
@@ -58,29 +58,29 @@ FRESH_S = 0.3
 """Telemetry that is older says nothing of the motors."""
 
 
-def is_known(newest: Telemetry | None, now_s: float) -> bool:
+def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
     """Return True if there is telemetry, and it is fresh."""
     return newest is not None and now_s - newest.t_s <= FRESH_S
 
 
-def knows_its_position(newest: Telemetry | None, now_s: float) -> bool:
+def has_fresh_position(newest: Telemetry | None, now_s: float) -> bool:
     """Return True if position and velocity are known too: they come by a packet of their own."""
     if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
         return False
     return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
 
 
-def may_fly(newest: Telemetry | None, now_s: float) -> bool:
+def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
     """Return True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives
     the motors by 2 s (docs/firmware.md, "When setpoints stop")."""
-    return newest is None or not is_known(newest, now_s) or newest.has(FLYING)
+    return newest is None or not is_fresh(newest, now_s) or newest.has_bit(FLYING)
 
 
-def is_cut(newest: Telemetry | None, now_s: float) -> bool:
+def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
     """Return True if an emergency stop has come to be: locked, with the motors off."""
-    if newest is None or not is_known(newest, now_s):
+    if newest is None or not is_fresh(newest, now_s):
         return False
-    return newest.has(LOCKED) and newest.thrust < 1
+    return newest.has_bit(LOCKED) and newest.thrust < 1
 
 
 @dataclass(frozen=True)

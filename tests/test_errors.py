@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from perchctl.errors import UsageError, distinct_figures, no_simulator
+from perchctl.errors import UsageError, distinct_texts, no_simulator
 
 
 @pytest.mark.parametrize("missing", ["mujoco", "glfw"])
@@ -21,7 +21,7 @@ def test_a_missing_simulator_is_named_with_what_to_do(missing: str) -> None:
 def test_found_and_allowed_never_look_alike(found: float, hundredths: int, decimals: int) -> None:
     limit = hundredths / 100.0
     assume(abs(found - limit) > 1e-8)
-    shown, allowed = distinct_figures(found, limit, decimals)
+    shown, allowed = distinct_texts(found, limit, decimals)
     assert shown != allowed
     assert float(allowed) == limit
     assert (float(shown) > limit) is (found > limit)

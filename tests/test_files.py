@@ -11,11 +11,11 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.files import (
+    atomic_write,
     check_output,
-    check_place,
+    check_writable,
     file_kind,
-    mode_of,
-    whole_file,
+    file_mode,
     write_files,
 )
 from tests.helpers.commands import run
@@ -30,7 +30,7 @@ def names(folder: Path) -> list[str]:
 def test_what_stands_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text("mine")
-    check_place(path, force=True)
+    check_writable(path, force=True)
     check_output(tmp_path / "a.YML", (".yaml", ".yml"), force=False)
     monkeypatch.setattr("os.access", lambda place, mode: Path(place) != tmp_path)
     for place, force, said in (
@@ -40,7 +40,7 @@ def test_what_stands_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.Mon
         (tmp_path / "new" / "a.txt", True, rf"no right to write in {tmp_path}$"),
     ):
         with pytest.raises(InvalidValue, match=said):
-            check_place(place, force)
+            check_writable(place, force)
     with pytest.raises(InvalidValue, match=r"a\.png must end in \.yaml or \.yml, which is text"):
         check_output(tmp_path / "a.png", (".yaml", ".yml"), force=True, content="text")
 
@@ -63,14 +63,14 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
 
 def test_a_file_is_hidden_beside_its_place_until_it_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(b"film")
         assert part.parent == tmp_path
         assert (part.name[:6], part.suffix) == (".film.", ".mp4")
         assert not path.exists()
     assert names(tmp_path) == ["film.mp4"]
     for place in (path, tmp_path / "made" / "new" / "film.mp4"):
-        with pytest.raises(FileNotFoundError), whole_file(place) as part:
+        with pytest.raises(FileNotFoundError), atomic_write(place) as part:
             raise FileNotFoundError(part.write_bytes(b"other"))
     assert path.read_bytes() == b"film"
     assert names(tmp_path) == ["film.mp4"]
@@ -84,12 +84,12 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
         old.chmod(mode)
         new.unlink(missing_ok=True)
         write_files({old: b"mine", new: b"copy"}, mode=0o640)
-        assert (mode_of(old), mode_of(new)) == (mode, 0o640)
+        assert (file_mode(old), file_mode(new)) == (mode, 0o640)
         assert old.read_bytes() == b"mine"
         old.chmod(0o600)
     write_files({plain: b"new"})
     (tmp_path / "by_system").touch()
-    assert mode_of(plain) == mode_of(tmp_path / "by_system")
+    assert file_mode(plain) == file_mode(tmp_path / "by_system")
 
 
 def test_what_is_not_for_all_is_for_nobody_else_before_it_is_whole(

@@ -18,7 +18,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
 from perchctl.commands import app
-from perchctl.commands.fly import fly_and_report, resolve
+from perchctl.commands.fly import fly_and_report, resolve_options
 from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.record import LogWatcher
@@ -227,14 +227,14 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("flown")
 def test_the_outcome_and_the_plot_are_told_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
-    assert fly_and_report(resolve(), as_json=False, view=False) == 130
+    assert fly_and_report(resolve_options(), as_json=False, view=False) == 130
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert lines[0].startswith("LANDED: Ctrl-C")
     (log,) = Path("perchctl-logs").glob("*.jsonl")
     assert lines[-2:] == [f"log:       {log}", f"plot:      {log.with_suffix('.png')}"]
     assert err == "perchctl: connecting to sim://\n"
-    fly_and_report(resolve(), as_json=True, view=False)
+    fly_and_report(resolve_options(), as_json=True, view=False)
     out, err = capsys.readouterr()  # the object is alone on stdout
     told = json.loads(out)
     assert told["plot"] == told["log"].replace(".jsonl", ".png")
@@ -254,7 +254,7 @@ def test_ctrl_c_in_the_drawing_or_its_loading_leaves_the_result(
 
     monkeypatch.delattr("perchctl.analysis.plot_flight")
     monkeypatch.setattr(f"perchctl.analysis.{name}", draw, raising=False)
-    code = fly_and_report(resolve(), True, False)
+    code = fly_and_report(resolve_options(), True, False)
     out, err = capsys.readouterr()
     told = json.loads(out)
     assert (code, told["exit_code"], told["outcome"], told["plot"]) == (130, 130, "landed", None)
@@ -274,5 +274,5 @@ def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
         return close(self, *arguments)
 
     monkeypatch.setattr(LogWatcher, "close", slow)
-    assert fly_and_report(resolve(), True, False) == 130
+    assert fly_and_report(resolve_options(), True, False) == 130
     assert json.loads(capsys.readouterr().out)["outcome"] == "landed"

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import FlightResult
-from perchctl.record import from_exact, read_log
+from perchctl.record import from_exact_json, read_log
 from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SEED, SHORT
 from tests.helpers.results import flown_record
@@ -78,7 +78,7 @@ def test_a_campaign_that_is_killed_goes_on_to_the_same_flights(
     figures = json.loads(resumed.stdout)
     assert (figures["flights"], figures["perched"]) == (2, 2)
     flights, others = (
-        sorted((flown_record(from_exact(FlightResult, r)) for r in _flights(path)), key=_seed)
+        sorted((flown_record(from_exact_json(FlightResult, r)) for r in _flights(path)), key=_seed)
         for path in (out, logs.with_name("out.jsonl"))
     )
     assert flights == others

@@ -42,7 +42,7 @@ from perchctl.calibration import profile_camera  # noqa: E402
 from perchctl.display import (  # noqa: E402
     LivePage,
     Sketch,
-    sketch_of,
+    make_sketch,
 )
 from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import panel  # noqa: E402
@@ -121,7 +121,7 @@ class Flight:
     def sketch(self, frame: Frame) -> Sketch:
         """The frame with what the pipeline finds in it."""
         _, output = step(PipelineState(), frame, None, self.pipeline)
-        return sketch_of(frame, output, self.profile.target.large.side_m)
+        return make_sketch(frame, output, self.profile.target.large.side_m)
 
     def tick(self, index: int) -> Tick:
         """What the displays showed at that tick."""

@@ -1,4 +1,4 @@
-from .compare import Comparison as Comparison
+from .compare import FlightComparison as FlightComparison
 from .compare import profile_differences as profile_differences
 from .film import write_film as write_film
 from .flight import FlightAnalysis as FlightAnalysis

@@ -8,14 +8,14 @@ from functools import cached_property
 from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis, Measures
-from perchctl.analysis.show import hung, plain
+from perchctl.analysis.show import printable, with_hanging_indent
 
 _NAME, _CELL = 32, 14
 _NOT_THERE = "not there"
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class FlightComparison:
     """Two flights side by side, A and B."""
 
     flights: tuple[FlightAnalysis, FlightAnalysis]
@@ -41,7 +41,7 @@ class Comparison:
 
     @cached_property
     def differences(self) -> dict[str, Any]:
-        """By the names of `Measures`: B's value less A's; None where one is not known."""
+        """Each of `Measures` by its name: B's value minus A's; None if either is unknown."""
         a, b = (asdict(flight.measures) for flight in self.flights)
         return {
             name: None if a[name] is None or b[name] is None else b[name] - a[name] for name in a
@@ -65,8 +65,10 @@ class Comparison:
     def _lines(self) -> Iterator[str]:
         for name, flight in zip("AB", self.flights, strict=True):
             log, end = flight.log, flight.summary
-            yield from hung(f"{name}:  ", f"{log.path} ({log.setup_text})")
-            yield from hung("    ", f"{end.outcome.upper()}: {end.reason}".rstrip(": "))
+            yield from with_hanging_indent(f"{name}:  ", f"{log.path} ({log.setup_text})")
+            yield from with_hanging_indent(
+                "    ", f"{end.outcome.upper()}: {end.reason}".rstrip(": ")
+            )
         yield ""
         yield _row("", "A", "B", "B - A")
         yield from self._measure_rows()
@@ -75,12 +77,14 @@ class Comparison:
             yield "time in each phase [s]"
         for each in self.phases:
             a_s, b_s = each["a_s"], each["b_s"]
-            yield _row(f"  {plain(each['phase'])}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
+            yield _row(
+                f"  {printable(each['phase'])}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}"
+            )
         yield ""
         yield "profile keys that differ, A and B" if self.profile else "their profiles are the same"
         for key, values in self.profile.items():
             a, b = ("none" if value is None else value for value in values)
-            yield from hung(f"  {plain(key):<{_NAME - 2}}  ", f"{a}  {b}")
+            yield from with_hanging_indent(f"  {printable(key):<{_NAME - 2}}  ", f"{a}  {b}")
 
     def _measure_rows(self) -> Iterator[str]:
         a, b = (flight.measures for flight in self.flights)

@@ -15,7 +15,7 @@ from typing import Any
 from perchctl.errors import InvalidValue
 from perchctl.mission import Observation, PlannerState, Turn, step_mission
 from perchctl.profile import Profile
-from perchctl.record import FlightLog, to_exact
+from perchctl.record import FlightLog, to_exact_json
 from perchctl.vehicle import Command
 
 FieldDifference = tuple[str, Any, Any]
@@ -23,11 +23,11 @@ FieldDifference = tuple[str, Any, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Decided:
-    """One turn, decided again.
+class ReplayedDecision:
+    """Result of replaying the planner on one turn.
 
     Attributes:
-        tick: how many turns were flown before it.
+        tick: number of turns that were flown before it.
         difference: the first field in which it differs; None without one. A log before version 4
             does not hold what the planner raised and has no difference there.
         error: the name of what the planner raised, None where it did not.
@@ -39,7 +39,7 @@ class Decided:
     error: str | None = None
 
 
-def whole_turns(log: FlightLog) -> tuple[list[Turn], str]:
+def replayable_turns(log: FlightLog) -> tuple[list[Turn], str]:
     """Return what can be replayed of a log: its turns up to the first that is missing, and a
     sentence about that one, empty where none is. Errors: InvalidValue."""
     if not log.turn_records:
@@ -57,14 +57,14 @@ def whole_turns(log: FlightLog) -> tuple[list[Turn], str]:
     return log.turns, ""
 
 
-def decide(
+def replay_decisions(
     turns: Iterable[Turn],
     profile: Profile,
     seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
-) -> Iterator[Decided]:
-    """Decide each turn of the planner in order, with the observation that `seen` gives for it: by
-    default the recorded one. A turn that was decided anew is decided, but does not count. The one
-    on which the planner raises is the last, in a flight as here."""
+) -> Iterator[ReplayedDecision]:
+    """Replay the planner turn by turn, with the observation that `seen` returns for each turn: by
+    default the recorded one. Only flown turns advance the planner's state. The replay ends with
+    the first turn on which the planner raises, as a flight does."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
@@ -75,16 +75,16 @@ def decide(
             new, command = step_mission(state, obs, profile)
         except Exception as error:
             name = type(error).__name__
-            yield Decided(tick, turn, first_differing("error", turn.error, name), name)
+            yield ReplayedDecision(tick, turn, field_difference("error", turn.error, name), name)
             return  # what came after it cannot be decided
-        yield Decided(tick, turn, _difference(turn, new, command))
+        yield ReplayedDecision(tick, turn, _difference(turn, new, command))
         if turn.role == "flown":
             state, tick = new, tick + 1
 
 
 def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDifference | None:
     if turn.role == "failed":
-        return first_differing("error", turn.error, None)
+        return field_difference("error", turn.error, None)
     if turn.command is None:
         return None
     replayed = {
@@ -96,23 +96,23 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
     }
     if turn.reason is not None:  # not in a log before version 4
         replayed |= {"outcome": state.outcome, "reason": state.reason}
-    return first_differing_of((n, getattr(turn, n), value) for n, value in replayed.items())
+    return first_field_difference((n, getattr(turn, n), value) for n, value in replayed.items())
 
 
 # --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---
 
 
-def first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:
+def field_difference(name: str, one: Any, other: Any) -> FieldDifference | None:
     """Return the first field in which two values differ; None where nothing does. Of two kinds of
     command the whole values are shown, with their class."""
     if type(one) is not type(other):
         return name, _shown(one), _shown(other)
-    return _first_differing(name, to_exact(one), to_exact(other))
+    return _first_differing(name, to_exact_json(one), to_exact_json(other))
 
 
-def first_differing_of(fields: Iterable[FieldDifference]) -> FieldDifference | None:
+def first_field_difference(fields: Iterable[FieldDifference]) -> FieldDifference | None:
     """Return the first difference among the fields, each with its recorded and replayed value."""
-    return next((d for field in fields if (d := first_differing(*field)) is not None), None)
+    return next((d for field in fields if (d := field_difference(*field)) is not None), None)
 
 
 def _first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:
@@ -129,5 +129,5 @@ def _first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:
 
 
 def _shown(value: Any) -> Any:
-    exact = to_exact(value)
+    exact = to_exact_json(value)
     return {type(value).__name__: exact} if dataclasses.is_dataclass(value) else exact

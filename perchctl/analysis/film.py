@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import draw_thrust
 from perchctl.errors import InvalidValue
-from perchctl.files import cannot_be_written, whole_file
+from perchctl.files import atomic_write, cannot_be_written
 from perchctl.geometry import Array
 from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, PURPLE, SKY, VERMILLION, new_figure
 
@@ -61,7 +61,7 @@ def write_film(
     drawn = _film_pictures(flight, pictures or iter(()), times_s, width_px)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_video
     try:
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             write(drawn, part, period)
     except OSError as error:
         raise cannot_be_written(path, error) from None

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.analysis.sight import Frames, Loss, frames_of, losses_of, percentile
+from perchctl.analysis.sight import Frames, TargetLoss, frames_of, percentile, target_losses
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
@@ -131,7 +131,7 @@ class FlightAnalysis:
     def notes(self) -> list[tuple[float, str]]:
         """The log's notes, each with its time."""
         return [
-            (self.log.since(float(event["t_s"])), str(event.get("reason") or ""))
+            (self.log.to_flight_s(float(event["t_s"])), str(event.get("reason") or ""))
             for event in self.log.events
             if event.get("event") == "note"
         ]
@@ -144,14 +144,14 @@ class FlightAnalysis:
         return frames_of(self.log)
 
     @cached_property
-    def losses(self) -> tuple[Loss, ...]:
+    def losses(self) -> tuple[TargetLoss, ...]:
         """When the target was out of sight while it was needed."""
-        return losses_of(self.log, self.frames)
+        return target_losses(self.log, self.frames)
 
     @cached_property
     def takeovers(self) -> tuple[Takeover, ...]:
         """What was sent in the loop's place, each go by itself."""
-        return takeovers_of(self.log)
+        return group_takeovers(self.log)
 
     @cached_property
     def measures(self) -> Measures:
@@ -176,7 +176,7 @@ class FlightAnalysis:
             battery_end_v=float(volts[-1]) if volts.size else None,
             battery_used_mah=float(used_mah[-1]) if used_mah.size else None,
             frames=len(frames.t_s),
-            frames_unseen=len(frames.unseen_s),
+            frames_unseen=len(frames.times_without_target_s),
             frame_rate_hz=_known(frames.rate_hz),
             frame_age_s=_known(frames.age_s),
             frame_gaps=len(gaps_s),
@@ -188,10 +188,10 @@ class FlightAnalysis:
 
     def _settled(self) -> tuple[float | None, float | None]:
         """Compute the RMS errors before the last contact: horizontal (m) and heading (rad)."""
-        ascent = last_ascent(self.log.phases)
+        ascent = contact_ascent(self.log.phases)
         if ascent is None:
             return None, None
-        inside = self.log.within(max(ascent.start_s, ascent.end_s - SETTLED_S), ascent.end_s)
+        inside = self.log.tick_slice(max(ascent.start_s, ascent.end_s - SETTLED_S), ascent.end_s)
         x_m, y_m, yaw_rad = (self.log.column(k)[inside] for k in ("ex_m", "ey_m", "eyaw_rad"))
         known = np.isfinite(x_m + y_m + yaw_rad)
         if not known.any():
@@ -216,7 +216,7 @@ class FlightAnalysis:
         return float(value)
 
 
-def last_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
+def contact_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
     """Return the ascent from which the last contact was begun; None without a contact."""
     ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
     return ascents[-1] if ascents else None
@@ -250,7 +250,7 @@ class Takeover:
         return ", ".join(f"{name} ({count})" for name, count in self.commands.items())
 
 
-def takeovers_of(log: FlightLog) -> tuple[Takeover, ...]:
+def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
     """Group what was sent in the loop's place by sender and time, oldest first."""
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
@@ -261,8 +261,8 @@ def takeovers_of(log: FlightLog) -> tuple[Takeover, ...]:
     return tuple(
         Takeover(
             go[0].by,
-            log.since(go[0].t_s),
-            log.since(go[-1].t_s),
+            log.to_flight_s(go[0].t_s),
+            log.to_flight_s(go[-1].t_s),
             dict(Counter(_BETWEEN.sub(" ", type(each.command).__name__).lower() for each in go)),
         )
         for go in goes

@@ -96,11 +96,11 @@ def flight_figure(flight: FlightAnalysis) -> Figure:
     for ax in (axes[-1], last_ax):
         ax.set_xlabel("time [s]")
     figure.align_ylabels([*axes, last_ax])
-    figure.suptitle(fill(title_of(flight), TITLE_COLUMNS), fontsize=12)
+    figure.suptitle(fill(figure_title(flight), TITLE_COLUMNS), fontsize=12)
     return figure
 
 
-def title_of(flight: FlightAnalysis) -> str:
+def figure_title(flight: FlightAnalysis) -> str:
     """Return profile, seed, outcome, and the miss where it is known, as one line."""
     end = flight.summary
     parts = [flight.log.setup_text, end.outcome]
@@ -119,7 +119,7 @@ def _draw_raw_and_filtered(
 ) -> None:
     # A frame is some 100 ms old when it is measured; the estimate is carried to the present.
     log = flight.log
-    frame_s = log.since(log.column("frame_t_s"))
+    frame_s = log.to_flight_s(log.column("frame_t_s"))
     for source, marker, colour, text in RAW:
         raw = scale * log.column(f"{source}{key}")
         ax.plot(frame_s, raw, marker, markersize=3, color=colour, label=text)
@@ -172,10 +172,14 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
     """The contact's approach in millimetres: single frames and the estimate, up to the last frame
     with the target. Returns from when to when."""
     log, frames = flight.log, flight.frames
-    end_s = float(frames.seen_s[-1]) if frames.seen_s.size else flight.log.end_s
+    end_s = (
+        float(frames.times_with_target_s[-1])
+        if frames.times_with_target_s.size
+        else flight.log.end_s
+    )
     low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.log.end_s, 0.1))
     inside = (flight.log.t_s >= low_s) & (flight.log.t_s <= high_s)
-    t_s, frame_s = flight.log.t_s[inside], log.since(log.column("frame_t_s"))
+    t_s, frame_s = flight.log.t_s[inside], log.to_flight_s(log.column("frame_t_s"))
     near = (frame_s >= low_s) & (frame_s <= high_s)
     span_mm = [LEAST_SPAN_MM]
     for axis, colour in (("x", BLUE), ("y", ORANGE)):
@@ -199,7 +203,7 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
 
 
 def _mark_lost(ax: Axes, flight: FlightAnalysis) -> None:
-    unseen_s, bottom = flight.frames.unseen_s, ax.get_xaxis_transform()
+    unseen_s, bottom = flight.frames.times_without_target_s, ax.get_xaxis_transform()
     ax.vlines(unseen_s, 0.0, LOST_SHARE, transform=bottom, color=BLACK, linewidth=0.7)
     for start_s, end_s in flight.frames.gaps_s:
         ax.axvspan(start_s, end_s, 0.0, LOST_SHARE, color=VERMILLION, linewidth=0.0)

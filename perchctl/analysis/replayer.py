@@ -9,8 +9,13 @@ from typing import Any
 
 import perchctl
 from perchctl.analysis.compare import profile_differences
-from perchctl.analysis.decide import Decided, decide, first_differing_of, whole_turns
-from perchctl.analysis.sense import Picture, PictureMissing, Sensed, sense
+from perchctl.analysis.decide import (
+    ReplayedDecision,
+    first_field_difference,
+    replay_decisions,
+    replayable_turns,
+)
+from perchctl.analysis.sense import Picture, PictureMissing, ReplayedInputs, replay_inputs
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import FlightInputs
@@ -47,17 +52,17 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What the senses made of the recorded pictures, telemetry and times.
+class PerceptionReplay:
+    """Result of replaying perception on the recorded pictures, telemetry and times.
 
     Attributes:
-        turns: each, seen again, up to where a picture is missing.
+        turns: the replayed turns, up to the first missing picture.
         differences: of the turns in which a pose, or what the planner sees, differs.
         frames_flown: how many frames the flight looked at.
         missing: what ended it before the flight; None where nothing did.
     """
 
-    turns: Sequence[Sensed]
+    turns: Sequence[ReplayedInputs]
     differences: Sequence[Difference]
     frames_flown: int
     missing: PictureMissing | None
@@ -68,20 +73,20 @@ class Seen:
         return _frames_of(each.turn for each in self.turns)
 
     @property
-    def ended(self) -> str:
+    def end_reason(self) -> str:
         """Why it ends before the flight does, or empty."""
         return f"{self.missing}: what came after it cannot be seen again" if self.missing else ""
 
     @property
-    def same(self) -> bool:
-        """True if nothing differs. What is not recorded, or cannot be read, tells of no
-        difference."""
+    def is_identical(self) -> bool:
+        """True if no replayed value differs. A picture that is missing or unreadable does not
+        count as a difference."""
         return not (self.differences or (self.missing is not None and self.missing.is_another))
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A log decided again, and seen again where there are pictures.
+    """Replay of a log through the planner, and through perception if pictures were recorded.
 
     Attributes:
         decided: each turn of the planner, decided again; `differences` are of those that were
@@ -92,9 +97,9 @@ class Replay:
     """
 
     log: FlightLog
-    decided: Sequence[Decided]
+    decided: Sequence[ReplayedDecision]
     differences: Sequence[Difference]
-    seen: Seen | None = None
+    seen: PerceptionReplay | None = None
     changed: tuple[str, ...] = ()
     gap: str = ""
 
@@ -104,9 +109,9 @@ class Replay:
         return sum(each.turn.role == "flown" for each in self.decided)
 
     @property
-    def same(self) -> bool:
+    def is_identical(self) -> bool:
         """True if no decision and nothing that was seen differs."""
-        return not self.differences and (self.seen is None or self.seen.same)
+        return not self.differences and (self.seen is None or self.seen.is_identical)
 
     @property
     def notes(self) -> list[str]:
@@ -124,9 +129,9 @@ class Replay:
             )
         if self.log.truncated:
             found.append("the log ends in the flight, without its summary: replayed is its rest")
-        ended = "" if self.seen is None else self.seen.ended
+        ended = "" if self.seen is None else self.seen.end_reason
         found += [note for note in (self.gap, ended) if note]
-        if self.changed and not self.same:
+        if self.changed and not self.is_identical:
             found.append(CAUTION)
         for each in self.decided:
             if each.error is not None:
@@ -143,12 +148,12 @@ class Replay:
         pictures = seen and {
             "frames": seen.frames,
             "frames_flown": seen.frames_flown,
-            "ended": seen.ended or None,
+            "ended": seen.end_reason or None,
             **_counted(seen.differences),
         }
         return {
             "log": str(self.log.path),
-            "same": self.same,
+            "same": self.is_identical,
             "ticks": self.ticks,
             **_counted(self.differences),
             "pictures": pictures,
@@ -167,7 +172,7 @@ class Replay:
         if (seen := self.seen) is None:
             return lines
         text = f"{seen.frames} frames"
-        if seen.ended:
+        if seen.end_reason:
             text = f"seen up to frame {seen.frames} of {seen.frames_flown}"
         if seen.differences:
             text += f", {len(seen.differences)} turns see something else"
@@ -190,28 +195,28 @@ def replay(
 ) -> Replay:
     """Replay the flight by its own profile; or, with `profile`, by another one.
 
-    As it was flown the planner is given the recorded observations, and the pictures are compared
-    for themselves; with another profile it is given what that sees in the pictures. `pipeline`
-    looks at them; by default the profile's, with the flown calibration and mask.
+    With the flown profile the planner gets the recorded observations, and perception is compared
+    separately. With another profile it gets what that profile's perception finds in the pictures.
+    `pipeline` processes them: by default the profile's, with the flown calibration and mask.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
     flown = log.flown_profile
-    turns, gap = whole_turns(log)
+    turns, gap = replayable_turns(log)
     used = profile or flown
     changed = changed_keys(flown, used)
     seen = None
     if pictures is not None:
-        pipeline = pipeline or pipeline_of(log, used, changed)
+        pipeline = pipeline or replay_pipeline(log, used, changed)
         seen = _seen(log, turns, flown, used, pictures, pipeline)
     observations: dict[int, Observation | None] = {}
     if seen is not None and changed and seen.frames:
         observations = {each.turn.number: each.observation for each in seen.turns}
         turns = turns[: len(seen.turns)]
     decided = list(
-        decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
+        replay_decisions(turns, used, lambda turn: observations.get(turn.number, turn.observation))
     )
     differences = [
-        Difference(each.tick, log.since(each.turn.t_s), *each.difference)
+        Difference(each.tick, log.to_flight_s(each.turn.t_s), *each.difference)
         for each in decided
         if each.difference is not None
     ]
@@ -225,7 +230,7 @@ def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
     return tuple(key for key in found if key not in ("name", "description", "date"))
 
 
-def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
+def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
     """Return the pipeline with the flown calibration and mask, unless the changed keys name others.
     Errors: InvalidValue, NotFound."""
     camera = log.flown_camera
@@ -249,21 +254,21 @@ def _seen(
     profile: Profile,
     pictures: Iterable[Picture],
     pipeline: Pipeline,
-) -> Seen:
+) -> PerceptionReplay:
     # A source takes the latency off the time at which a picture came.
     later_s = flown.camera.start_latency_s - profile.camera.start_latency_s
-    found: list[Sensed] = []
+    found: list[ReplayedInputs] = []
     missing: PictureMissing | None = None
     try:
-        for each in sense(turns, profile, pipeline, pictures, later_s):
+        for each in replay_inputs(turns, profile, pipeline, pictures, later_s):
             found.append(each)
     except PictureMissing as error:
         missing = error
-    return Seen(found, list(_differing(log, turns, found)), _frames_of(turns), missing)
+    return PerceptionReplay(found, list(_differing(log, turns, found)), _frames_of(turns), missing)
 
 
 def _differing(
-    log: FlightLog, turns: Sequence[Turn], found: Iterable[Sensed]
+    log: FlightLog, turns: Sequence[Turn], found: Iterable[ReplayedInputs]
 ) -> Iterator[Difference]:
     tick = -sum(turn.role == "waiting" for turn in turns)
     for each in found:
@@ -271,9 +276,9 @@ def _differing(
         fields: list[tuple[str, Any, Any]] = [("poses", each.turn.poses, each.poses)]
         if was is not None and seen is not None:
             fields += [(n, getattr(was, n), getattr(seen, n)) for n in FlightInputs.SENSED]
-        difference = first_differing_of(fields)
+        difference = first_field_difference(fields)
         if difference is not None:
-            yield Difference(tick, log.since(each.turn.t_s), *difference)
+            yield Difference(tick, log.to_flight_s(each.turn.t_s), *difference)
         tick += each.turn.role in ("waiting", "flown")
 
 

@@ -22,7 +22,7 @@ from perchctl.analysis.film import write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.story import Sentence, count, length, story_of
+from perchctl.analysis.story import Sentence, count_text, length_text, tell_story
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
@@ -45,8 +45,8 @@ def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = Fals
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
-    report = Report(tuple(reported_flight(path) for path in log_paths))
-    write_files({output: page_of(report.flights, with_film).encode("utf-8")})
+    report = Report(tuple(read_reported_flight(path) for path in log_paths))
+    write_files({output: report_html(report.flights, with_film).encode("utf-8")})
     return report
 
 
@@ -61,7 +61,7 @@ class Report:
         """``1 flight: 1 perched``, ``4 flights: 3 perched, 1 landed``."""
         outcomes = [told.outcome for told in self.flights]
         each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))
-        return f"{count(len(outcomes), 'flight')}: {each}"
+        return f"{count_text(len(outcomes), 'flight')}: {each}"
 
     def record(self) -> list[dict[str, Any]]:
         """The flights as JSON's own types."""
@@ -83,13 +83,13 @@ class ReportedFlight:
     `picture_problem` says why some could not be read."""
 
     flight: FlightAnalysis
-    pictures: tuple[Shown, ...] | None = None
+    pictures: tuple[DecisionPicture, ...] | None = None
     picture_problem: str = ""
 
     @cached_property
     def story(self) -> tuple[Sentence, ...]:
         """What happened."""
-        return story_of(self.flight)
+        return tell_story(self.flight)
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -112,16 +112,16 @@ class ReportedFlight:
         """How it ended, and by how much it missed the target's centre."""
         miss_m = self.flight.summary.miss_m
         title = TITLES.get(self.outcome, self.outcome)
-        return title if miss_m is None else f"{title}, {length(miss_m)} off centre"
+        return title if miss_m is None else f"{title}, {length_text(miss_m)} off centre"
 
     @property
-    def when(self) -> str:
+    def start_text(self) -> str:
         """When the flight began, in UTC; a simulated flight in lockstep has no date."""
         started = self.flight.log.header.get("started_utc")
         return utc_text(started) if started else "without a date"
 
     @property
-    def faults(self) -> list[str]:
+    def log_defects(self) -> list[str]:
         """What the log lacks, a sentence each."""
         end, log = self.flight.summary, self.flight.log
         found = []
@@ -136,7 +136,7 @@ class ReportedFlight:
             found.append(f"Its last {log.ignored_bytes} bytes could not be read and are left out.")
         if end.lost_records:
             why = end.log_problem or "no reason is known"
-            found.append(f"The log lacks {count(end.lost_records, 'record')}: {why}.")
+            found.append(f"The log lacks {count_text(end.lost_records, 'record')}: {why}.")
         elif end.log_problem:
             found.append(f"The log may lack its last records: {end.log_problem}.")
         return found
@@ -148,7 +148,7 @@ POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-
 """No script, nothing from elsewhere: the browser holds the page to it."""
 
 
-def page_of(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
+def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
     """Return the page of at least one flight as HTML that needs no other file. Raises InvalidValue
     for a value that no flight writes."""
     articles = []
@@ -191,12 +191,12 @@ def _templates() -> jinja2.Environment:
     templates.globals.update(
         seven_phases=[phase.value for phase in tuple(Phase)[:7]],
         plot_of=lambda flight: _address("image/png", flight_png(flight)),
-        film_of=film_address,
+        film_of=film_data_url,
     )
     return templates
 
 
-def film_address(flight: FlightAnalysis) -> tuple[str, str]:
+def film_data_url(flight: FlightAnalysis) -> tuple[str, str]:
     """Return the flight's film as a `data:` address, and why it, or its camera pictures, are
     missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
@@ -233,19 +233,19 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 
 @dataclass(frozen=True)
-class Shown:
-    """The picture of a decision as a JPEG, with the markers drawn as they were found. The last
-    centimetres are flown without one: the caption has the time of the picture."""
+class DecisionPicture:
+    """Camera picture behind a decision of the mission, as a JPEG with the detected markers drawn.
+    The last centimetres are flown without pictures: the caption has the time of this one."""
 
     caption: str
     jpeg: bytes
 
     @property
-    def address(self) -> str:
+    def data_url(self) -> str:
         return _address("image/jpeg", self.jpeg)
 
 
-def reported_flight(log_path: Path) -> ReportedFlight:
+def read_reported_flight(log_path: Path) -> ReportedFlight:
     """Read one flight, with what was recorded beside its log. A recording that cannot be read
     costs the pictures only.
 
@@ -254,30 +254,30 @@ def reported_flight(log_path: Path) -> ReportedFlight:
     flight = FlightAnalysis(read_log(log_path))
     if not path_beside(log_path, ".mcap").is_file():
         return ReportedFlight(flight)
-    shown: list[Shown] = []
+    shown: list[DecisionPicture] = []
     try:
         with log_values(log_path):
-            decisions = decisions_of(flight)
+            decisions = decision_frames(flight)
         for picture in recorded_pictures(log_path, decisions):
             caption, record = decisions[picture.number]
-            shown.append(Shown(caption, _jpeg(record, picture.image)))
+            shown.append(DecisionPicture(caption, _jpeg(record, picture.image)))
     except PerchError as error:
         return ReportedFlight(flight, tuple(shown), _without_folder(error, log_path))
     return ReportedFlight(flight, tuple(shown))
 
 
-def decisions_of(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
-    """Find where the mission went on because of what was seen: by the number of the newest frame
-    then, a caption and the record of the frame's tick."""
+def decision_frames(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
+    """Find the frames on which the mission entered a new phase. Return by frame number a caption
+    and the log record of the frame's tick."""
     log = flight.log
     found = {}
     for stay in log.phases:
         until_then = log.records[log.index_at(stay.start_s) :: -1]
         record = next((r for r in until_then if r.get("frame") is not None), None)
         if stay.phase in DECIDED and record is not None:
-            caption = f"{DECIDED[stay.phase]}, {log.since(float(record['t_s'])):.1f} s"
+            caption = f"{DECIDED[stay.phase]}, {log.to_flight_s(float(record['t_s'])):.1f} s"
             if record.get("ez_m") is not None:
-                caption += f", {length(float(record['ez_m']))} below"
+                caption += f", {length_text(float(record['ez_m']))} below"
             found[int(record["frame"])] = caption, record
     return found
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import FlightInputs
-from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
+from perchctl.mission import FrameRecord, Observation, Turn, TurnInputs, UnfilteredPose
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, Pipeline
@@ -37,12 +37,12 @@ class _PictureIsAnother(PictureMissing):
 
 
 @dataclass(frozen=True, eq=False)
-class Sensed:
-    """One turn, seen again: `observation` with what the replay sees in the place of what was
-    seen, None before there is any telemetry."""
+class ReplayedInputs:
+    """Inputs of one turn as the replay computes them. `observation` is the recorded one with the
+    replayed perception in it; None before the first telemetry."""
 
     turn: Turn
-    poses: dict[str, PoseSeen]
+    poses: dict[str, UnfilteredPose]
     observation: Observation | None
 
 
@@ -100,14 +100,14 @@ class _Given:
     def close(self) -> None:
         return None
 
-    def _picture_of(self, seen: FrameSeen) -> NDArray[np.uint8]:
+    def _picture_of(self, seen: FrameRecord) -> NDArray[np.uint8]:
         if self._taken.problem is not None:  # nobody looked at it
             return np.zeros((1, 1), np.uint8)
         image = self._repeated_picture(seen) if seen.repeated else self._recorded(seen)
         self._shown = (seen.checksum, image)
         return image
 
-    def _repeated_picture(self, seen: FrameSeen) -> NDArray[np.uint8]:
+    def _repeated_picture(self, seen: FrameRecord) -> NDArray[np.uint8]:
         """Return a picture that the source repeated, which is not recorded."""
         if self._shown is None:
             raise PictureMissing(f"the picture that frame {seen.index} repeats was not recorded")
@@ -117,7 +117,7 @@ class _Given:
             image.flat[0] ^= 1
         return image
 
-    def _recorded(self, seen: FrameSeen) -> NDArray[np.uint8]:
+    def _recorded(self, seen: FrameRecord) -> NDArray[np.uint8]:
         for index, t_s, image in self._pictures:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
@@ -129,28 +129,28 @@ class _Given:
         raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
 
 
-def sense(
+def replay_inputs(
     turns: Iterable[Turn],
     profile: Profile,
     pipeline: Pipeline,
     pictures: Iterable[Picture],
     later_s: float = 0.0,
-) -> Iterator[Sensed]:
-    """See each turn again, in order, from the first before take-off on. `later_s` is added to the
-    time at which a live source's pictures were taken.
+) -> Iterator[ReplayedInputs]:
+    """Replay perception turn by turn, from the first turn before take-off. `later_s` is added to
+    the exposure times of a live source.
 
-    Raises PictureMissing where a frame was taken whose picture is not there, is another one or
-    cannot be read: from then on the pipeline would remember another flight.
+    Raises PictureMissing at the first frame whose picture is missing, differs or cannot be read:
+    after it the pipeline's state would differ from the flight's.
     """
     given = _Given(pictures, pipeline.camera.size_px, later_s)
     inputs = FlightInputs(given, given, pipeline, profile, recorded=True)
     with _one_thread():
         for turn in turns:
             given.turn(turn)
-            inputs.take_in(turn.began_s, look=turn.taken.look)
+            inputs.poll_inputs(turn.began_s, look=turn.taken.look)
             if turn.t_s != turn.began_s:
-                inputs.present(turn.began_s, turn.t_s)
-            yield Sensed(turn, inputs.poses, _observed(turn, inputs))
+                inputs.catch_up(turn.began_s, turn.t_s)
+            yield ReplayedInputs(turn, inputs.poses, _observed(turn, inputs))
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:

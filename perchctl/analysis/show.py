@@ -59,11 +59,11 @@ def show_text(flight: FlightAnalysis) -> str:
             lines += ["", f"  at [s]  for [s]  {head}"]
         for part, name, text in rows:
             span = f"{part.start_s + 0.0:8.2f} {part.end_s - part.start_s:8.2f}"
-            lines += hung(f"{span}  {plain(name):<9} ", text)
+            lines += with_hanging_indent(f"{span}  {printable(name):<9} ", text)
     if flight.notes:
         lines += ["", "  at [s]  note"]
     for at_s, note in flight.notes:
-        lines += hung(f"{at_s:8.2f}  ", note)
+        lines += with_hanging_indent(f"{at_s:8.2f}  ", note)
     return "\n".join(lines)
 
 
@@ -75,7 +75,7 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
     log = flight.log
     end = replace(flight.summary, battery_min_v=None)
     first, *others = end.text().splitlines()
-    yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
+    yield from wrap(printable(first), COLUMNS, subsequent_indent="  ")
     for line in others:
         name, _, text = line.partition(":")
         yield from _named(name, text.strip())
@@ -139,22 +139,26 @@ def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
             yield from _named(name, line.format_map(texts))
 
 
-def plain(text: str) -> str:
-    """Return the text without characters that a terminal would obey."""
+def printable(text: str) -> str:
+    """Return the text with control characters, which a terminal would execute, as ``?``."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def _named(name: str, text: str) -> list[str]:
-    return hung(f"{name + ':':<{_HANG}}", text)
+    return with_hanging_indent(f"{name + ':':<{_HANG}}", text)
 
 
-def hung(begin: str, text: str) -> list[str]:
-    """Return the text behind its begin, its further lines below it."""
-    room = " " * len(begin)
+def with_hanging_indent(prefix: str, text: str) -> list[str]:
+    """Wrap the text into lines: the first follows `prefix`, the others are indented by it."""
+    room = " " * len(prefix)
     lines = wrap(
-        plain(text), COLUMNS, initial_indent=begin, subsequent_indent=room, break_on_hyphens=False
+        printable(text),
+        COLUMNS,
+        initial_indent=prefix,
+        subsequent_indent=room,
+        break_on_hyphens=False,
     )
-    return lines or [begin.rstrip()]
+    return lines or [prefix.rstrip()]
 
 
 # --- Which logs a folder holds, the newest first, and how each ended ---

@@ -47,12 +47,12 @@ class Frames:
     age_s: float
 
     @property
-    def seen_s(self) -> Array:
+    def times_with_target_s(self) -> Array:
         """Times of the frames that showed the target."""
         return self.t_s[self.seen]
 
     @property
-    def unseen_s(self) -> Array:
+    def times_without_target_s(self) -> Array:
         """Times of the frames that did not show the target."""
         return self.t_s[~self.seen]
 
@@ -60,7 +60,7 @@ class Frames:
 def frames_of(log: FlightLog) -> Frames:
     """Read the frames of a flight; the median period decides what is a gap."""
     records = [record for record in log.records if record.get("frame_t_s") is not None]
-    times_s = log.since(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
+    times_s = log.to_flight_s(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
     age_s, gaps_s = percentile(ages_s, 50), np.empty((0, 2))
     if records:
@@ -101,7 +101,7 @@ AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
 
 @dataclass(frozen=True)
-class Loss:
+class TargetLoss:
     """The target was out of sight while it was needed: from the last frame that showed it to the
     next, or to the flight's end.
 
@@ -119,18 +119,20 @@ class Loss:
         return self.end_s - self.start_s
 
 
-def losses_of(log: FlightLog, frames: Frames) -> tuple[Loss, ...]:
-    """Find all losses in order. A vehicle at the ceiling looks at nothing, and loses nothing."""
+def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
+    """Find all losses in order. At the ceiling no picture is evaluated, so there are none."""
     stays = log.phases
-    starts_s = [float(t_s) for t_s in frames.seen_s]
+    starts_s = [float(t_s) for t_s in frames.times_with_target_s]
     ends_s = [*starts_s[1:], log.end_s]
     found = []
     for start_s, next_s in zip(starts_s, ends_s, strict=False):
         end_s = _end_of_loss(start_s, next_s, stays)
         if end_s is not None:
-            unseen = (frames.unseen_s > start_s) & (frames.unseen_s < end_s)
+            unseen = (frames.times_without_target_s > start_s) & (
+                frames.times_without_target_s < end_s
+            )
             regained = start_s != starts_s[-1]
-            found.append(Loss(start_s, end_s, regained, int(np.count_nonzero(unseen))))
+            found.append(TargetLoss(start_s, end_s, regained, int(np.count_nonzero(unseen))))
     return tuple(found)
 
 

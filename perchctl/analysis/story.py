@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from perchctl.analysis.flight import FlightAnalysis
-from perchctl.analysis.sight import Loss
+from perchctl.analysis.sight import TargetLoss
 from perchctl.mission import Phase
 from perchctl.record import PhaseSpan
 
@@ -44,7 +44,7 @@ class Sentence:
     grade: str = "step"
 
 
-def story_of(flight: FlightAnalysis) -> tuple[Sentence, ...]:
+def tell_story(flight: FlightAnalysis) -> tuple[Sentence, ...]:
     """Tell the whole flight in order; empty for a log without ticks."""
     if not flight.log.records:
         return ()
@@ -88,13 +88,13 @@ def _where(flight: FlightAnalysis, t_s: float) -> str:
     aside_m = math.hypot(flight.at(t_s, "ex_m"), flight.at(t_s, "ey_m"))
     if not math.isfinite(up_m + aside_m):
         return ""
-    return f", {length(up_m)} below the target and {length(aside_m)} off centre"
+    return f", {length_text(up_m)} below the target and {length_text(aside_m)} off centre"
 
 
-def _loss(loss: Loss) -> Sentence:
+def _loss(loss: TargetLoss) -> Sentence:
     for_s = f"for {loss.duration_s:.1f} s" if loss.regained else "and not seen again"
     if loss.frames:
-        text = f"The target was lost {for_s}: {count(loss.frames, 'frame')} without it"
+        text = f"The target was lost {for_s}: {count_text(loss.frames, 'frame')} without it"
     else:
         text = f"No picture that could be used came {for_s if loss.regained else 'any more'}"
     return Sentence(loss.start_s, text, "warn")
@@ -130,7 +130,7 @@ def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
         text = f"The log ends here, in {phases[-1].phase if phases else '?'}"
         height_m = flight.at(end_s, "z_m") - flight.at(0.0, "z_m")
         if phases and phases[-1].phase in FLYING | {"LANDING"} and math.isfinite(height_m):
-            text += f" at {length(height_m)}"
+            text += f" at {length_text(height_m)}"
         text += ": how the flight ended is not known, its program was ended"
         yield Sentence(end_s, text, "bad")
     if end.locked:
@@ -149,7 +149,7 @@ def _upper(sentence: str) -> str:
 # --- Figures as people read them --------------------------------------
 
 
-def length(metres: float) -> str:
+def length_text(metres: float) -> str:
     """``1.7 mm``, ``8.4 cm``, ``31 cm``, ``1.83 m``."""
     size = abs(metres)
     if not math.isfinite(size):
@@ -163,6 +163,6 @@ def length(metres: float) -> str:
     return f"{metres:.2f} m"
 
 
-def count(number: int, noun: str) -> str:
+def count_text(number: int, noun: str) -> str:
     """``1 frame``, ``14 frames``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

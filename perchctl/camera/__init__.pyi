@@ -1,7 +1,7 @@
 from .credentials import profile_record as profile_record
 from .credentials import without_password as without_password
 from .device import find_cameras as find_cameras
-from .files import Recording as Recording
+from .files import RecordedSource as RecordedSource
 from .files import decode_picture as decode_picture
 from .files import image_files as image_files
 from .health import VERDICT_TEXTS as VERDICT_TEXTS

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera.jpeg import grey_pixels, jpeg_extent
+from perchctl.camera.jpeg import decode_grey, jpeg_extent
 from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
@@ -63,7 +63,7 @@ class _Picture:
         if not self.is_jpeg:
             return np.frombuffer(data, np.uint8).reshape(shape)
         is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
-        image = grey_pixels(data) if is_whole else None
+        image = decode_grey(data) if is_whole else None
         return image if image is not None and image.shape == shape else None
 
 
@@ -164,7 +164,7 @@ def has_mosaic(image: NDArray[np.uint8]) -> bool:
     return max(means) - min(means) > max(LEAST_SHARE * sum(means) / 4.0, LEAST_LEVELS)
 
 
-def without_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return each pixel's grey with its neighbours: a quarter red, half green, a quarter blue.
 
     The weights 1 2 1 along rows and columns cancel whatever repeats every two pixels, so it holds
@@ -182,4 +182,4 @@ class MosaicFilter:
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self._in_a_row < PICTURES_IN_A_ROW:
             self._in_a_row = self._in_a_row + 1 if has_mosaic(image) else 0
-        return without_mosaic(image) if self._in_a_row else image
+        return remove_mosaic(image) if self._in_a_row else image

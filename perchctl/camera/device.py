@@ -12,7 +12,7 @@ from typing import Any
 
 import cv2
 
-from perchctl.camera.source import Clock, LiveSource, one_line
+from perchctl.camera.source import Clock, LiveSource, describe_error
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 
@@ -22,7 +22,9 @@ REOPEN_EVERY_S = 1.0
 """Between two attempts to open a camera that was lost: an attempt takes a driver some 0.1 s."""
 
 
-def open_capture(place: str, size_px: tuple[int, int] | None, config: CameraConfig | None) -> Any:
+def open_video_capture(
+    place: str, size_px: tuple[int, int] | None, config: CameraConfig | None
+) -> Any:
     """Return an opened cv2.VideoCapture of `camera_number(place)`, set to that size and to the
     profile's format and rate. Raises NotFound with the cameras that exist."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
@@ -35,11 +37,13 @@ def open_capture(place: str, size_px: tuple[int, int] | None, config: CameraConf
             f"camera:{number} exists but cannot be opened; close other programs that use it "
             f"and check that you may read /dev/video{number}"
         )
-    set_up(capture, size_px, config)
+    configure_capture(capture, size_px, config)
     return capture
 
 
-def set_up(capture: Any, size_px: tuple[int, int] | None, config: CameraConfig | None) -> None:
+def configure_capture(
+    capture: Any, size_px: tuple[int, int] | None, config: CameraConfig | None
+) -> None:
     """Set format, then size, then rate, as what each may be hangs on the one before."""
     if config is not None and config.format is not None:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.format.ljust(4)))
@@ -56,11 +60,11 @@ class DeviceSource(LiveSource):
 
     A picture that cannot be read or decoded is dropped. After `LOST_AFTER_FAILURES` in a row the
     camera counts as lost: it is released, and opened again as soon as it is back. `opener` returns
-    anything with read() and release(), as `open_capture` does, and its errors.
+    anything with read() and release(), as `open_video_capture` does, and its errors.
     """
 
     reconnect_wait_s = REOPEN_EVERY_S
-    most_failed = math.inf
+    max_failures = math.inf
     retry_s = RETRY_S
 
     def __init__(
@@ -81,7 +85,7 @@ class DeviceSource(LiveSource):
                         failures = 0
                         continue
                 except Exception as error:  # whatever a damaged picture does to OpenCV
-                    why = f"gives pictures that cannot be decoded ({one_line(error)})"
+                    why = f"gives pictures that cannot be decoded ({describe_error(error)})"
                 failures += 1
                 if failures >= LOST_AFTER_FAILURES:
                     raise NotFound(f"{self._name} {why}; plug it in again, or name another camera")

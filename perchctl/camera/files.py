@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import grey_pixels, jpeg_extent
+from perchctl.camera.jpeg import decode_grey, jpeg_extent
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
@@ -21,7 +21,7 @@ DEFAULT_RATE_HZ = 30.0
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
 
 
-class Recording:
+class RecordedSource:
     """What the two recordings share; `_read` gives the next picture and its time, or None.
 
     `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown. `paths`:
@@ -69,7 +69,7 @@ class Recording:
         raise NotImplementedError
 
 
-class VideoSource(Recording):
+class VideoSource(RecordedSource):
     """A video file; times from the container where they rise, else from its rate."""
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
@@ -104,7 +104,7 @@ class VideoSource(Recording):
         self._capture.release()
 
 
-class ImagesSource(Recording):
+class ImagesSource(RecordedSource):
     """The pictures of a folder or a glob, or those named one by one, in natural order (2
     before 10), at `rate_hz`."""
 
@@ -142,7 +142,7 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
     jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_extent(data) is not None
     if not (png_ends and jpeg_ends):
         raise ValueError("is cut off")
-    image = grey_pixels(data)
+    image = decode_grey(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
     return image

@@ -59,10 +59,10 @@ class FrameHealth:
         if live and frame.repeated:
             return "repeated"
         self._changed_s = frame.t_s
-        return content(frame.image)
+        return picture_kind(frame.image)
 
 
-def content(image: NDArray[np.uint8]) -> Kind:
+def picture_kind(image: NDArray[np.uint8]) -> Kind:
     """Return what the picture shows, judged by every eighth line and the second after it."""
     height = image.shape[0]
     first = image[: max(height - 2, 1) : 8]

@@ -97,7 +97,7 @@ class JpegSplitter:
             self._buffer.clear()
 
 
-def grey_pixels(data: bytes) -> NDArray[np.uint8] | None:
+def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
     """Return the grey picture of any file's bytes; None if OpenCV cannot decode them. Whatever the
     bytes are, it raises nothing."""
     if not data:

@@ -26,7 +26,7 @@ from urllib.request import (
     parse_keqv_list,
 )
 
-from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels
+from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, decode_grey
 from perchctl.camera.source import Clock, LiveSource
 from perchctl.errors import NotFound
 
@@ -108,7 +108,7 @@ class MjpegSource(LiveSource):
                 return
             # If the network delivered several at once only the newest is worth decoding.
             for picture, (width, height) in reversed(splitter.feed(data)):
-                image = grey_pixels(picture) if width * height <= MOST_STREAM_PX else None
+                image = decode_grey(picture) if width * height <= MOST_STREAM_PX else None
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
@@ -138,17 +138,17 @@ _OPTIONS = {
 
 
 class TransferDelay:
-    """Tells how long a picture was under way beyond the fastest of the last ten seconds.
+    """Estimates a picture's extra transfer time over the fastest one of the last ten seconds.
 
-    Pure. The camera's own time of a picture shows the delay. What piles up behind a radio that
-    stalls comes in a heap, and would look as if it had just been taken.
+    Pure. The camera's timestamp of a picture shows the delay. Pictures that queue behind a stalled
+    radio arrive in a burst, and would look as if they had just been taken.
     """
 
     def __init__(self) -> None:
         self._camera_s = -math.inf
         self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
 
-    def waited_s(self, camera_s: float | None, arrival_s: float) -> float:
+    def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
         """Return the delay beyond the fastest picture's, s; 0 where the camera gives no time."""
         if camera_s is None:
             return 0.0
@@ -215,7 +215,7 @@ class RtspSource(LiveSource):
                 continue
             damaged = 0
             for image, time_s in frames:
-                self._put(image, waited_s=delay.waited_s(time_s, self._clock()))
+                self._put(image, waited_s=delay.extra_delay_s(time_s, self._clock()))
         return "the stream ended"
 
 

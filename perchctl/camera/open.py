@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import AiDeckSource
 from perchctl.camera.credentials import without_password
-from perchctl.camera.device import DeviceSource, open_capture
+from perchctl.camera.device import DeviceSource, open_video_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource, WrappedSource, unmirror_frame
@@ -152,7 +152,7 @@ def _live(
 ) -> LiveSource:
     """Return a camera or stream that is not opened yet."""
     if name.scheme == "camera":
-        opener = partial(open_capture, name.place, size_px, config)
+        opener = partial(open_video_capture, name.place, size_px, config)
         return DeviceSource(str(name), latency_s, clock, opener)
     if name.scheme in STREAMS:
         return STREAMS[name.scheme](name.spec, latency_s, clock)
@@ -165,7 +165,7 @@ def _live(
 def _started(source: LiveSource, timeout_s: float) -> FrameSource:
     """Wait for the first frame. Raises the source's failure, or TimedOut, with it closed."""
     source.begin()
-    if source.wait_first(timeout_s):
+    if source.wait_first_frame(timeout_s):
         return source
     source.close()
     raise source.failure or TimedOut(

@@ -19,11 +19,11 @@ from perchctl.vision import CameraModel, Frame
 
 
 class NewestSlot:
-    """Keeps the newest picture, at the time at which it came first.
+    """Keeps the newest picture, with the time of its first arrival.
 
-    One that a receiver gives out again takes no new one's place: it would make it look younger
-    than it is. Where the new one has been taken already it comes with the same index, and
-    `Frame.repeated`: a sign of life, and no measurement.
+    A repeat by the receiver does not replace a picture that was not taken yet: it would look
+    younger than it is. After that picture was taken, the repeat has the same index and
+    `Frame.repeated`: a sign of life, not a measurement.
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
     )
 
 
-def one_line(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Describe an unforeseen error within a sentence: its class, and its text without passwords."""
     if isinstance(error, URLError) and isinstance(error.reason, Exception):
         error = error.reason
@@ -128,7 +128,7 @@ class LiveSource:
     """Newest-frame slot between a reading thread and the loop.
 
     A subclass has `_connection`, which opens the camera and reads it. It is called again
-    `reconnect_wait_s` after it ended, until `most_failed` of them in a row have brought no picture.
+    `reconnect_wait_s` after it ended, until `max_failures` in a row have brought no picture.
     """
 
     live = True
@@ -136,7 +136,7 @@ class LiveSource:
     connect_timeout_s = 3.0
     read_timeout_s = 2.0
     reconnect_wait_s = 0.3
-    most_failed = 5.0
+    max_failures = 5.0
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = without_password(name)
@@ -176,7 +176,7 @@ class LiveSource:
         """Connect, and read in a thread."""
         self._thread.start()
 
-    def wait_first(self, timeout_s: float) -> bool:
+    def wait_first_frame(self, timeout_s: float) -> bool:
         """Wait until the first frame is there; False when it fails or stays away so long."""
         self._first.wait(timeout_s)
         return self._arrived > 0
@@ -204,10 +204,10 @@ class LiveSource:
                 reason = str(error)
             except Exception as error:
                 # Whatever damaged bytes do to a library: a new connection may bring whole ones.
-                reason = one_line(error)
+                reason = describe_error(error)
             self._why_silent = reason
             failed = 0 if self._arrived > before else failed + 1
-            if failed >= self.most_failed:
+            if failed >= self.max_failures:
                 self._fail(TimedOut(f"{self._name} gave no picture in {failed} attempts: {reason}"))
                 return
             self._stop.wait(self.reconnect_wait_s)

@@ -12,9 +12,9 @@ from .pool import flight_processes as flight_processes
 from .results import CampaignFlight as CampaignFlight
 from .results import FlightResult as FlightResult
 from .results import align_columns as align_columns
+from .results import all_refused_error as all_refused_error
 from .results import campaign_summary as campaign_summary
 from .results import campaign_table as campaign_table
-from .results import none_took_off as none_took_off
 from .results import rate_record as rate_record
 from .results import rate_text as rate_text
 from .results_file import campaign_results as campaign_results

@@ -23,7 +23,7 @@ from perchctl.campaign.results import (
     LEVEL,
     FlightResult,
     align_columns,
-    miss_record,
+    miss_percentiles,
     rate_record,
     rate_text,
 )
@@ -48,7 +48,9 @@ def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> FlightResul
     return replace(fly_seed(profiles[number], seed), variant=number)
 
 
-def whole_seeds(results: Iterable[FlightResult], profiles: int) -> list[tuple[FlightResult, ...]]:
+def results_by_seed(
+    results: Iterable[FlightResult], profiles: int
+) -> list[tuple[FlightResult, ...]]:
     """Return, in the order of the seeds, the results of each seed that all profiles have flown."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
@@ -92,15 +94,15 @@ MISS = ("miss_m",)
 
 def compare_variants(results: Iterable[FlightResult]) -> Comparison:
     """Return the comparison of two profiles by the seeds that both have flown."""
-    return compare_pairs([(a, b) for a, b in whole_seeds(results, 2)])
+    return compare_pairs([(a, b) for a, b in results_by_seed(results, 2)])
 
 
 def compare_pairs(
-    pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), times_asked: int = 1
+    pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """Return the comparison of two flights per seed. `times_asked`: the number of comparisons
+    """Return the comparison of two flights per seed. `comparisons`: the number of comparisons
     that share the 5 %."""
-    questions = times_asked * (1 + len(figures))
+    questions = comparisons * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
         "flights": len(pairs),
@@ -197,7 +199,7 @@ class Sweep:
         value, for JSON. `best`: the value with the most successes, of these the one with the
         smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,
         None where they are the same."""
-        seeds = whole_seeds(results, len(self.profiles))
+        seeds = results_by_seed(results, len(self.profiles))
         own = len(self.profiles) - 1
         cells = [
             {"value": profile_value(profile, self.key), "own": number == own}
@@ -208,7 +210,7 @@ class Sweep:
         against = None
         if best != own:
             pairs = [(flown[own], flown[best]) for flown in seeds]
-            against = compare_pairs(pairs, MISS, times_asked=own)
+            against = compare_pairs(pairs, MISS, comparisons=own)
         return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
 
     def text(self, record: dict[str, Any]) -> str:
@@ -249,7 +251,7 @@ def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
     good = sum(not r.is_bad for r in results)
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
     rate = rate_record(good, len(results))
-    return {"flights": len(results), "good": good, **rate, "miss_m": miss_record(misses)}
+    return {"flights": len(results), "good": good, **rate, "miss_m": miss_percentiles(misses)}
 
 
 def _rank(cell: dict[str, Any]) -> tuple[float, ...]:

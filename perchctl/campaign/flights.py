@@ -73,7 +73,7 @@ def fly_seed(
             if log is not None:
                 log.abandon(str(error))
             return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
-        summary = None if log is None else flight.conclude(log)
+        summary = None if log is None else flight.close_log(log)
         return FlightResult(
             seed=seed,
             outcome=OUTCOMES[flight.end],

@@ -22,11 +22,11 @@ WORST = 5
 
 @dataclass(frozen=True)
 class CampaignFlight:
-    """What the results of all kinds of campaigns have.
+    """Result of one flight: the fields that campaigns of all kinds share.
 
     Attributes:
         log, log_problem: the flight's log, and what it lacks; None without.
-        cpu_s: what it took of a core.
+        cpu_s: CPU time of the flight, s.
         scenario: what the seed drew.
     """
 
@@ -89,12 +89,12 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
         "rates": {end: rate_record(count, len(results)) for end, count in ends.items()},
         "locked": sum(r.locked for r in results),
         "fell": sum(r.fell for r in results),
-        "miss_m": miss_record(misses) | {"max": round(max(misses), 6) if misses else None},
+        "miss_m": miss_percentiles(misses) | {"max": round(max(misses), 6) if misses else None},
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
 
-def miss_record(misses_m: Sequence[float]) -> dict[str, float | None]:
+def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
     """Return the median and the 95th percentile of misses for JSON; None without any."""
     if not misses_m:
         return {"median": None, "p95": None}
@@ -108,7 +108,7 @@ def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
     return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
 
 
-def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
+def all_refused_error(results: Sequence[FlightResult]) -> SafetyAbort | None:
     """Return the error of a campaign whose flights were all refused, which no seed can cause;
     None for any other."""
     if not results or any(r.outcome != "refused" for r in results):

@@ -17,21 +17,21 @@ from typing import Any, BinaryIO, Generic, TypeVar
 import perchctl
 from perchctl.campaign.results import CampaignFlight
 from perchctl.errors import InvalidValue
-from perchctl.files import cannot_be_written, check_place
+from perchctl.files import cannot_be_written, check_writable
 from perchctl.profile import Profile
 from perchctl.record import (
     camera_record,
-    from_exact,
+    from_exact_json,
     json_line,
-    to_exact,
+    to_exact_json,
 )
 
 R = TypeVar("R", bound=CampaignFlight)
 
 
 class CampaignResults(Generic[R]):
-    """The results of a campaign's seeds: `earlier` were read from its file, `left` are the seeds
-    still to be flown."""
+    """The results of a campaign's seeds: `earlier` were read from its file, `remaining` are
+    the seeds still to be flown."""
 
     def __init__(
         self,
@@ -40,14 +40,14 @@ class CampaignResults(Generic[R]):
         file: BinaryIO | None = None,
     ) -> None:
         self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
-        self.left = [seed for seed in seeds if seed not in earlier]
+        self.remaining = [seed for seed in seeds if seed not in earlier]
         self._file = file
 
-    def note(self, result: R) -> None:
+    def write_result(self, result: R) -> None:
         """Write the result of a flight, which is on the disk when this returns. Errors:
         InvalidValue."""
         if self._file is not None:
-            _write(self._file, {"kind": "flight", **to_exact(result)})
+            _write(self._file, {"kind": "flight", **to_exact_json(result)})
 
 
 @contextmanager
@@ -69,7 +69,7 @@ def campaign_results(
     `log_dir` that cannot be written to.
     """
     if log_dir is not None:
-        check_place(log_dir / "flight.jsonl", force=True)
+        check_writable(log_dir / "flight.jsonl", force=True)
     if out is None:
         yield CampaignResults(seeds, {})
         return
@@ -78,7 +78,7 @@ def campaign_results(
             f"{out} exists already; add --resume to go on with it, --force to replace it, or name "
             f"another"
         )
-    check_place(out, force=True)
+    check_writable(out, force=True)
     header = campaign_header(profile, faults)
     earlier: dict[int, R] = {}
     good = 0
@@ -172,7 +172,7 @@ def _read(path: Path, header: dict[str, Any], kind: type[R], earlier: dict[int, 
             )
         if any(flight.pop("kind") != "flight" for flight in flights):
             raise ValueError("a line of it is no flight")
-        results = [from_exact(kind, flight) for flight in flights]
+        results = [from_exact_json(kind, flight) for flight in flights]
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(
             f"{path}: not the lines of a campaign's results ({error}): take the original, or name "

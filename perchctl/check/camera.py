@@ -16,15 +16,15 @@ from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import (
     Finding,
     Row,
-    ask,
-    ask_all,
-    by_limits,
+    evaluate_row,
+    evaluate_rows,
     failed,
+    limits_finding,
     passed,
-    skip_all,
     skipped,
+    skipped_rows,
     warned,
-    worst,
+    worst_finding,
 )
 from perchctl.errors import PerchError
 from perchctl.flight import GroundCriteria, out_of_view
@@ -51,13 +51,13 @@ _ADVICE = {
 }
 
 
-def refused_rows(error: PerchError, profile: Profile) -> list[Row]:
+def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
     """Return the rows of a camera that gives no picture."""
     found, semicolon, advice = str(error).rpartition("; ")
     if not semicolon:
         found, advice = str(error), "see docs/check.md; perchctl check --cameras lists the cameras"
-    names = ("size", *names_of(profile))
-    return [Row("camera", *failed(found, advice)), *skip_all(names, "no picture comes")]
+    names = ("size", *picture_row_names(profile))
+    return [Row("camera", *failed(found, advice)), *skipped_rows(names, "no picture comes")]
 
 
 def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) -> Finding:
@@ -73,11 +73,11 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
     """Judge what the pictures of a rehearsal show."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
-        first, *rest = names_of(profile)
-        return [Row(first, *failed(why, _AGAIN)), *skip_all(rest, why)]
-    rows = ask_all(PICTURES, rehearsal, profile)
+        first, *rest = picture_row_names(profile)
+        return [Row(first, *failed(why, _AGAIN)), *skipped_rows(rest, why)]
+    rows = evaluate_rows(PICTURES, rehearsal, profile)
     if profile.positioning.by == "target":
-        rows.append(ask(IN_VIEW, _in_view, rehearsal, profile, camera))
+        rows.append(evaluate_row(IN_VIEW, _in_view, rehearsal, profile, camera))
     return rows
 
 
@@ -90,7 +90,7 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
         return skipped("too few pictures" if rehearsal.live else "a recording has none of its own")
     hz = 1.0 / period_s
     advice = "more light, a smaller picture, or a shorter cable"
-    return by_limits(-hz, -RATE_WARN_HZ, -RATE_FAIL_HZ, f"{hz:.0f} Hz", advice)
+    return limits_finding(-hz, -RATE_WARN_HZ, -RATE_FAIL_HZ, f"{hz:.0f} Hz", advice)
 
 
 def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -106,7 +106,7 @@ def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
     longest_s, limit_s = max(gaps_s), profile.safety.camera_hold_s
     found = f"the longest gap is {1e3 * longest_s:.0f} ms"
     advice = "bring the receiver nearer, turn its antenna, choose another channel"
-    return by_limits(longest_s, GAP_WARN * limit_s, limit_s, found, advice)
+    return limits_finding(longest_s, GAP_WARN * limit_s, limit_s, found, advice)
 
 
 def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -117,7 +117,7 @@ def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
     latency_ms = 1e3 * profile.camera.start_latency_s
     found = f"95 % within {1e3 * age_s:.0f} ms, {latency_ms:.0f} of them by camera.latency_s"
     advice = "measure camera.latency_s; use a faster receiver or computer"
-    return by_limits(age_s, 0.6 * limit_s, limit_s, found, advice)
+    return limits_finding(age_s, 0.6 * limit_s, limit_s, found, advice)
 
 
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -135,7 +135,7 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
-    return by_limits(share, 0.05, 0.5, found, _ADVICE.get(text, "see docs/check.md"))
+    return limits_finding(share, 0.05, 0.5, found, _ADVICE.get(text, "see docs/check.md"))
 
 
 def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -144,7 +144,7 @@ def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
         why = "measured by the target's edges, and no target was seen"
         return skipped(why, "put the camera under the target")
     advice = "turn the lens until perchctl track --view shows the target sharp"
-    return by_limits(blur_px, 1.6, 2.5, f"blur sigma {blur_px:.1f} px", advice)
+    return limits_finding(blur_px, 1.6, 2.5, f"blur sigma {blur_px:.1f} px", advice)
 
 
 def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -156,7 +156,7 @@ def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
         away_m = math.hypot(*(float(e) for e in target.e_m))
         spread_mm = 1e3 * float(max(target.sigma_m))
         found += f", {away_m:.2f} m from the gear (+- {spread_mm:.0f} mm)"
-        if problem := GroundCriteria.too_near(target):
+        if problem := GroundCriteria.target_too_near(target):
             return failed(problem.found, problem.advice)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
         return warned(found, "nearer, sharper, or more light: see focus")
@@ -206,7 +206,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
 IN_VIEW = "in view"
 
 
-def names_of(profile: Profile) -> tuple[str, ...]:
+def picture_row_names(profile: Profile) -> tuple[str, ...]:
     """Return the names of the pictures' rows, in their order."""
     return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
 
@@ -232,7 +232,7 @@ def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
     advice = "close other programs, use a smaller picture, or a faster computer"
     if latest_s > profile.safety.loop_late_hold_s:
         return failed(found, advice)
-    return worst(
-        by_limits(work_s / period_s, 0.7, 1.0, found, advice),
-        by_limits(late, 0.05, 0.3, found, advice),
+    return worst_finding(
+        limits_finding(work_s / period_s, 0.7, 1.0, found, advice),
+        limits_finding(late, 0.05, 0.3, found, advice),
     )

@@ -26,13 +26,13 @@ from perchctl.check.row import (
     Finding,
     Row,
     Verdict,
-    by_limits,
     failed,
+    limits_finding,
     passed,
-    skip_all,
     skipped,
+    skipped_rows,
     warned,
-    worst,
+    worst_finding,
 )
 from perchctl.flight import GroundCriteria
 from perchctl.geometry import Array, nearest_axis, rotation_from_rpy, rpy_from_rotation
@@ -41,7 +41,7 @@ from perchctl.perception import History, attitude_at
 from perchctl.positioning import (
     CaptureFrame,
     CaptureSource,
-    Placed,
+    VehiclePose,
     load_comparison,
     save_comparison,
 )
@@ -57,31 +57,31 @@ WILD_M = 0.1
 
 
 @dataclass(frozen=True)
-class Listened:
-    """What came while it was listened to: the vehicle's telemetry, the capture's frames, and what
-    the capture complained of."""
+class CaptureSamples:
+    """Samples of one listening period: the vehicle's telemetry, the motion capture's frames, and
+    the capture's problem, None without one."""
 
     telemetry: tuple[Telemetry, ...] = ()
     frames: tuple[CaptureFrame, ...] = ()
     problem: str | None = None
 
-    def places(self, config: PositioningConfig) -> list[Placed]:
+    def body_poses(self, config: PositioningConfig) -> list[VehiclePose]:
         """Return the vehicle's body at the moments of exposure, oldest first."""
         return [
-            Placed.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
+            VehiclePose.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
             for frame in self.frames
             if config.body in frame.bodies
         ]
 
 
-def listen(
+def collect_samples(
     take: Callable[[], list[Telemetry]],
     source: CaptureSource,
     clock: Callable[[], float],
     wait: Callable[[float], None],
     for_s: float = CAPTURE_S,
-) -> Listened:
-    """Hear both for so long."""
+) -> CaptureSamples:
+    """Collect the vehicle's telemetry and the capture's frames for `for_s` seconds."""
     began_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[CaptureFrame] = []
@@ -93,7 +93,7 @@ def listen(
         if frame is not None:
             frames.append(frame)
         wait(POLL_S)
-    return Listened(tuple(telemetry), tuple(frames), source.problem(clock()))
+    return CaptureSamples(tuple(telemetry), tuple(frames), source.problem(clock()))
 
 
 # --- At rest ----------------------------------------------------------
@@ -102,19 +102,19 @@ def listen(
 BODY_ROWS = ("body", "body place")
 
 
-def refused_rows(why: str, config: PositioningConfig) -> list[Row]:
+def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
     """Return the rows of a capture that could not be opened, or sends nothing."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
-    return [Row("capture", *failed(why, advice)), *skip_all(BODY_ROWS, f"no {config.label}")]
+    return [Row("capture", *failed(why, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
 
-def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
-    """Judge what came of a capture while the vehicle stood still."""
+def mocap_rows_at_rest(heard: CaptureSamples, profile: Profile) -> list[Row]:
+    """Judge the samples of a motion capture taken while the vehicle stood still."""
     config = profile.positioning
     if not heard.frames:
-        return refused_rows(heard.problem or f"{config.label} sends no frame", config)
+        return failed_capture_rows(heard.problem or f"{config.label} sends no frame", config)
     first = Row("capture", *passed(f"{config.label} sends"))
-    places = heard.places(config)
+    places = heard.body_poses(config)
     if not places:
         others = sorted({name for frame in heard.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
@@ -124,7 +124,7 @@ def mocap_rows_at_rest(heard: Listened, profile: Profile) -> list[Row]:
     return [first, Row("body", *body), Row("body place", *_place(heard, places, profile))]
 
 
-def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
+def _body(heard: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
@@ -149,24 +149,24 @@ def _body(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
         else "these look like millimetres: set the unit of its stream to metres"
     )
     limit_m = config.position_sigma_m
-    return worst(
-        by_limits(share, 0.02, 0.2, found, hidden),
-        by_limits(-rate_hz, -50.0, -20.0, found, slow),
-        by_limits(gap_s, config.hold_s / 2.0, config.hold_s, found, slow),
-        by_limits(sigma_m, limit_m, NOISE_FAIL * limit_m, found, noisy),
+    return worst_finding(
+        limits_finding(share, 0.02, 0.2, found, hidden),
+        limits_finding(-rate_hz, -50.0, -20.0, found, slow),
+        limits_finding(gap_s, config.hold_s / 2.0, config.hold_s, found, slow),
+        limits_finding(sigma_m, limit_m, NOISE_FAIL * limit_m, found, noisy),
     )
 
 
-def _place(heard: Listened, places: list[Placed], profile: Profile) -> Finding:
+def _place(heard: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
     """Judge the body's place by the criteria of `fly`."""
     newest = heard.telemetry[-1] if heard.telemetry else None
-    place = places[-1].external(pose=True)
+    place = places[-1].to_external(pose=True)
     if newest is None:
         return skipped("it cannot be compared: no telemetry")
     criteria = GroundCriteria(newest, profile)
-    if criteria.tilt or criteria.motion:
+    if criteria.not_level or criteria.not_still:
         return skipped("the vehicle does not stand level and still")
-    problem = criteria.world_problem(place)
+    problem = criteria.position_frame_problem(place)
     if problem is not None:
         return failed(problem.found, problem.advice)
     x, y, z = place.position_m
@@ -204,13 +204,13 @@ class PairedMotion:
     moved_g: float
 
     @property
-    def ways_m(self) -> Array:
-        """The ways of the places from the first, (n, 3)."""
+    def displacements_m(self) -> Array:
+        """Displacement of each place from the first, (n, 3)."""
         return np.asarray(self.place_m - self.place_m[0])
 
 
 @dataclass(frozen=True, eq=False)
-class Turns:
+class FrameAlignment:
     """A and B of the module's text, and the share of a turn that they leave unexplained."""
 
     world: Rotation
@@ -218,12 +218,14 @@ class Turns:
     unexplained: float
 
     @property
-    def up(self) -> Array:
+    def vertical(self) -> Array:
         """The vertical in the capture's world, (3,)."""
         return np.asarray(self.world.as_matrix()[:, 2])
 
 
-def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> PairedMotion | None:
+def pair_motion(
+    telemetry: Sequence[Telemetry], places: Sequence[VehiclePose]
+) -> PairedMotion | None:
     """Pair each place with the vehicle's attitude of its moment, every `EVERY_S`; None of fewer
     than three pairs."""
     if len(telemetry) < 2:
@@ -252,7 +254,7 @@ def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> PairedMo
     )
 
 
-def turns_of(moved: PairedMotion) -> Turns | None:
+def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
     """Solve A and B by all pairs of moments between which it was turned; None where it was turned
     about fewer than two axes."""
     i, j = np.triu_indices(len(moved.own), 1)
@@ -268,7 +270,7 @@ def turns_of(moved: PairedMotion) -> Turns | None:
     world, _ = Rotation.align_vectors(world_seen, world_own)
     body, _ = Rotation.align_vectors(body_own, body_seen)
     left = np.linalg.norm(world_seen - world.apply(world_own), axis=1)
-    return Turns(world, body, float(np.mean(left / size)))
+    return FrameAlignment(world, body, float(np.mean(left / size)))
 
 
 def _has_many_axes(turns: Array) -> bool:
@@ -283,12 +285,12 @@ def _turned_rad(attitudes: Rotation) -> Array:
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
-def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Finding:
+def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) -> Finding:
     """Compare vehicle and capture, and return the gravest finding."""
     if moved is None:
         return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
     own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.own, moved.seen))
-    way_m = float(np.linalg.norm(moved.ways_m, axis=1).max())
+    way_m = float(np.linalg.norm(moved.displacements_m, axis=1).max())
     body = f"rigid body {config.body!r}"
     others = "it is another body's: correct positioning.body"
     if own_rad <= MOVED_RAD and moved.moved_g <= MOVED_G:
@@ -300,7 +302,7 @@ def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Findi
     if way_m > REACH_M:
         found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
         return failed(found, "set the unit of the capture's stream to metres")
-    turns = turns_of(moved)
+    turns = solve_alignment(moved)
     if turns is None:
         turned_deg = math.degrees(own_rad)
         return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
@@ -310,22 +312,25 @@ def hand_finding(moved: PairedMotion | None, config: PositioningConfig) -> Findi
     return _world_finding(turns, moved) or _body_finding(turns, moved, config)
 
 
-def _risen_m(turns: Turns, moved: PairedMotion) -> Array:
+def _risen_m(turns: FrameAlignment, moved: PairedMotion) -> Array:
     """Return the way (3,) from the first place to the one farthest along the capture's vertical,
     or, where that is too near for a lift, to the farthest of all."""
-    ways_m = moved.ways_m
-    risen_m = ways_m[int(np.argmax(np.abs(ways_m @ turns.up)))]
+    displacements_m = moved.displacements_m
+    risen_m = displacements_m[int(np.argmax(np.abs(displacements_m @ turns.vertical)))]
     if float(np.linalg.norm(risen_m)) < LIFTED_M:
-        risen_m = ways_m[int(np.argmax(np.linalg.norm(ways_m, axis=1)))]
+        risen_m = displacements_m[int(np.argmax(np.linalg.norm(displacements_m, axis=1)))]
     return np.asarray(risen_m)
 
 
-def _world_finding(turns: Turns, moved: PairedMotion) -> Finding | None:
+def _world_finding(turns: FrameAlignment, moved: PairedMotion) -> Finding | None:
     """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
-    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.up[2])))))
+    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > UPRIGHT_DEG:
-        found, axis = f"the capture's world is tilted by {off_deg:.0f} deg", nearest_axis(turns.up)
+        found, axis = (
+            f"the capture's world is tilted by {off_deg:.0f} deg",
+            nearest_axis(turns.vertical),
+        )
         if axis is not None:
             found = f"swapped axes: up is {axis} in the motion capture"
         advice = "set its world to z up, and define the rigid body anew with the vehicle level"
@@ -341,7 +346,7 @@ def _world_finding(turns: Turns, moved: PairedMotion) -> Finding | None:
     )
 
 
-def _body_finding(turns: Turns, moved: PairedMotion, config: PositioningConfig) -> Finding:
+def _body_finding(turns: FrameAlignment, moved: PairedMotion, config: PositioningConfig) -> Finding:
     off_deg = math.degrees(float(turns.body.magnitude()))
     if off_deg > BODY_WARN_DEG:
         profiled = rotation_from_rpy(*(math.radians(a) for a in config.body_rpy_deg))
@@ -353,7 +358,7 @@ def _body_finding(turns: Turns, moved: PairedMotion, config: PositioningConfig) 
             f"set positioning.body_rpy_deg: [{wanted}], or define the body anew",
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
-    risen_m = float(_risen_m(turns, moved) @ turns.up)
+    risen_m = float(_risen_m(turns, moved) @ turns.vertical)
     if risen_m < LIFTED_M:
         return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
     return passed(f"{found}; rose by {risen_m:.2f} m")
@@ -374,7 +379,7 @@ def comparison_rows(
     return [_record_row(config, uri, now)]
 
 
-def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime) -> Row:
+def save_comparison_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime) -> Row:
     """Write down what the hand found, and return its row. A lift that showed nothing is not
     written."""
     passes, vehicle = lifted.verdict is Verdict.PASS, vehicle_uri(uri)
@@ -383,7 +388,7 @@ def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime
     why = save_comparison(config, vehicle, now, passes, lifted.found)
     if why is None:
         return _record_row(config, uri, now)
-    if not passes and load_comparison(config, vehicle).objection(now) is None:
+    if not passes and load_comparison(config, vehicle).flight_objection(now) is None:
         found = f"what was found could not be written, and fly goes by an older pass: {why}"
         advice = "free some space, or give back the right to write there; do not fly before"
         return Row(COMPARED, *failed(found, advice))
@@ -394,7 +399,7 @@ def save_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime
 
 def _record_row(config: PositioningConfig, uri: str, now: datetime) -> Row:
     record = load_comparison(config, vehicle_uri(uri))
-    objection = record.objection(now)
+    objection = record.flight_objection(now)
     if objection is None:
         return Row(COMPARED, *passed(record.text(now)))
     found, advice = objection

@@ -15,18 +15,18 @@ from perchctl.calibration import profile_camera
 from perchctl.check.row import (
     Finding,
     Row,
-    Unknown,
+    Unanswerable,
     Verdict,
-    ask,
-    ask_all,
-    by_limits,
+    evaluate_row,
+    evaluate_rows,
     failed,
+    limits_finding,
     passed,
     skipped,
     warned,
 )
 from perchctl.errors import PerchError, SafetyAbort
-from perchctl.files import check_place
+from perchctl.files import check_writable
 from perchctl.flight import FlyOptions
 from perchctl.places import is_shipped_example
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
@@ -44,18 +44,18 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
     file. Raises nothing.
     """
     plan = _Plan(profile, profile.camera.source if source is None else source)
-    rows = ask_all(JUDGES, plan)
-    rows += [ask(name, _limits, name, profile) for name in DOUBTFUL]
+    rows = evaluate_rows(JUDGES, plan)
+    rows += [evaluate_row(name, _limits, name, profile) for name in DOUBTFUL]
     if profile.positioning.by == "target":
-        rows.append(ask("latency", _latency, plan))
+        rows.append(evaluate_row("latency", _latency, plan))
     return rows
 
 
-def quick_rows(options: FlyOptions) -> list[Row]:
+def offline_rows(options: FlyOptions) -> list[Row]:
     """Return the rows that cost no time, of the computer's disk and the profile. It opens no link
     and no camera."""
     return [
-        ask("log folder", log_finding, options.log_dir),
+        evaluate_row("log folder", log_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),
     ]
 
@@ -64,8 +64,8 @@ def warnings_before_flight(options: FlyOptions) -> list[str]:
     """Return a sentence for each row that warns. Errors: SafetyAbort for the first that fails; of
     the calibration's file InvalidValue, NotFound; of the log's folder InvalidValue."""
     profile_camera(options.profile.camera)
-    check_place(options.log_dir / "flight.jsonl", force=True)
-    rows = quick_rows(options)
+    check_writable(options.log_dir / "flight.jsonl", force=True)
+    rows = offline_rows(options)
     for row in rows:
         if row.verdict is Verdict.FAIL:
             raise SafetyAbort(_sentence(row))
@@ -85,11 +85,11 @@ class _Plan:
 
     @property
     def camera(self) -> CameraModel:
-        """Raises Unknown without a calibration."""
+        """Raises Unanswerable without a calibration."""
         try:
             return profile_camera(self.profile.camera)
         except PerchError as error:
-            raise Unknown(f"no calibration to tell by: {error}") from None
+            raise Unanswerable(f"no calibration to tell by: {error}") from None
 
 
 def _calibration(plan: _Plan) -> Finding:
@@ -170,7 +170,7 @@ def log_finding(folder: Path) -> Finding:
     """Judge whether logs can be written to the folder, without making it, and the free space."""
     whole = folder.absolute()
     try:
-        check_place(folder / "flight.jsonl", force=True)
+        check_writable(folder / "flight.jsonl", force=True)
         usage = shutil.disk_usage(next(p for p in (whole, *whole.parents) if p.exists()))
     except PerchError as error:
         return failed(str(error), "name another with --log-dir, or set log.directory")
@@ -179,6 +179,6 @@ def log_finding(folder: Path) -> Finding:
     if not usage.total:
         return skipped(f"{folder} is on no disk")
     found = f"{folder}, {usage.free / 1e6:,.0f} MB free"
-    return by_limits(
+    return limits_finding(
         -usage.free, -500e6, -50e6, found, "free some space: a flight's log has some 5 MB a minute"
     )

@@ -38,7 +38,7 @@ class Rehearsal:
         work_s: of the turns that looked at a picture; late_s: of all turns.
         ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
         problems: why pictures were no good, or were remarkable, with their number.
-        looked: the newest few; found: of how many pictures there was a target.
+        newest_outputs: the newest few; found: of how many pictures there was a target.
         silent_s: since the last picture, at the end.
         target: where it was at the end; None where it was not seen then.
         blur_px: sigma of the edges of the target's markers; None where it could not be measured.
@@ -51,7 +51,7 @@ class Rehearsal:
     late_s: list[float] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
-    looked: list[tuple[Frame, PipelineOutput]] = field(default_factory=list)
+    newest_outputs: list[tuple[Frame, PipelineOutput]] = field(default_factory=list)
     pictures: int = 0
     repeats: int = 0
     found: int = 0
@@ -94,7 +94,7 @@ class _TelemetryOnly:
         return [replace(t, position_m=feet_m, velocity_mps=(0.0, 0.0, 0.0)) for t in samples]
 
 
-def telemetry_for(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
+def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
     """Return the link's telemetry as a rehearsal uses it."""
     by_target = profile.positioning.by == "target"
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
@@ -115,14 +115,14 @@ def rehearse(
     move.
     """
     noted = _Noted(source)
-    senses = FlightInputs(telemetry_for(take, profile), noted, pipeline, profile)
+    senses = FlightInputs(rehearsal_telemetry(take, profile), noted, pipeline, profile)
     done = Rehearsal(source.live)
     prints = PrintCheck(pipeline.camera, profile.target)
     period_s = 1.0 / profile.link.loop_hz
     due_s = start_s = clock.now()
     while due_s < start_s + duration_s and not source.finished:
         began_s, mark_s = clock.now(), stopwatch()
-        senses.take_in(began_s)
+        senses.poll_inputs(began_s)
         work_s = stopwatch() - mark_s
         done.late_s.append(max(0.0, began_s - due_s))
         if noted.newest is not None:
@@ -137,7 +137,7 @@ def rehearse(
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
     done.print_verdict = prints.verdict() if prints.judged else None
-    done.blur_px = _blur_px(done.looked, pipeline)
+    done.blur_px = _blur_px(done.newest_outputs, pipeline)
     return done
 
 
@@ -165,13 +165,15 @@ def _note(
     seen = output.detections
     done.found += seen.large is not None or seen.small is not None
     prints.add(output)
-    done.looked = [*done.looked[1 - KEPT_FRAMES :], (frame, output)]
+    done.newest_outputs = [*done.newest_outputs[1 - KEPT_FRAMES :], (frame, output)]
 
 
-def _blur_px(looked: Sequence[tuple[Frame, PipelineOutput]], pipeline: Pipeline) -> float | None:
+def _blur_px(
+    newest_outputs: Sequence[tuple[Frame, PipelineOutput]], pipeline: Pipeline
+) -> float | None:
     """Measure the blur by the target's own edges; None where it was not seen."""
     found_px = []
-    for frame, output in looked:
+    for frame, output in newest_outputs:
         for name in MARKERS:
             seen = output.detections.get(name)
             if seen is None:

@@ -42,7 +42,7 @@ class Finding(NamedTuple):
     advice: str = ""
 
 
-class Unknown(Exception):
+class Unanswerable(Exception):
     """A question could not be answered; `finding` is the skipped one."""
 
     def __init__(self, why: str, advice: str = "") -> None:
@@ -53,52 +53,52 @@ class Unknown(Exception):
 P = ParamSpec("P")
 
 
-def ask(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
-    """Return the row of that name: what `judge` finds, skipped where it raises `Unknown`."""
+def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
+    """Return the row of that name: what `judge` finds, skipped where it raises `Unanswerable`."""
     try:
         return Row(name, *judge(*args, **kwargs))
-    except Unknown as unknown:
+    except Unanswerable as unknown:
         return Row(name, *unknown.finding)
 
 
-def ask_all(
+def evaluate_rows(
     judges: Mapping[str, Callable[P, Finding]], *args: P.args, **kwargs: P.kwargs
 ) -> list[Row]:
     """Return a row for each judge, by its name, in the mapping's order."""
-    return [ask(name, judge, *args, **kwargs) for name, judge in judges.items()]
+    return [evaluate_row(name, judge, *args, **kwargs) for name, judge in judges.items()]
 
 
-def skip_all(names: Iterable[str], why: str, advice: str = "") -> list[Row]:
+def skipped_rows(names: Iterable[str], why: str, advice: str = "") -> list[Row]:
     """Return a skipped row for each name, all for one reason."""
     return [Row(name, *skipped(why, advice)) for name in names]
 
 
 def passed(found: str) -> Finding:
-    """Return a pass."""
+    """Return the finding of a question that passes; `found` is what was seen, with units."""
     return Finding(Verdict.PASS, found)
 
 
 def warned(found: str, advice: str) -> Finding:
-    """Return a warning, with what to do."""
+    """Return the finding of a question that warns, with what to do."""
     return Finding(Verdict.WARN, found, advice)
 
 
 def failed(found: str, advice: str) -> Finding:
-    """Return a fail, with what to do."""
+    """Return the finding of a question that fails, with what to do."""
     return Finding(Verdict.FAIL, found, advice)
 
 
 def skipped(why: str, advice: str = "") -> Finding:
-    """Return a question that could not be answered, with why."""
+    """Return the finding of a question that could not be answered, with the reason."""
     return Finding(Verdict.SKIPPED, why, advice)
 
 
-def by_problem(problem: Problem | None, found: str) -> Finding:
+def problem_finding(problem: Problem | None, found: str) -> Finding:
     """Judge by a criterion of `fly`: fail with its problem, or pass with `found`."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 
-def by_limits(
+def limits_finding(
     value: float, warn_above: float, fail_above: float, found: str, advice: str
 ) -> Finding:
     """Judge by a figure that is the better the smaller it is; one that is no number fails."""
@@ -107,7 +107,7 @@ def by_limits(
     return (warned if value <= fail_above else failed)(found, advice)
 
 
-def worst(*findings: Finding) -> Finding:
+def worst_finding(*findings: Finding) -> Finding:
     """Return the gravest finding, the first of several."""
     order = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
     return max(findings, key=lambda finding: order.index(finding.verdict))

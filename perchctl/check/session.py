@@ -11,11 +11,11 @@ from datetime import datetime
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, open_camera, without_password
 from perchctl.check import camera, capture, vehicle
-from perchctl.check.profile import quick_rows
+from perchctl.check.profile import offline_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
-from perchctl.check.row import Finding, Row, ask, failed, passed, skip_all, skipped
+from perchctl.check.row import Finding, Row, evaluate_row, failed, passed, skipped, skipped_rows
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
-from perchctl.flight import FlyOptions, WallClock, check_options, simulated_vehicle
+from perchctl.flight import FlyOptions, WallClock, check_options, start_simulated_vehicle
 from perchctl.link import ProbeLink, check_uri, find_vehicles
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
@@ -24,16 +24,16 @@ from perchctl.vision import Pipeline, make_pipeline
 
 @dataclass(frozen=True)
 class CheckScope:
-    """What is looked at beyond what can be seen at rest, and for how long, s.
+    """Extent of a check: whether the vehicle is lifted by hand, and how long each part takes, s.
 
-    `tell` says what goes on; `open_capture` opens a motion capture.
+    `announce` is called with a sentence on each step; `open_capture` opens a motion capture.
     """
 
     lift: bool = False
     listen_s: float = vehicle.LISTEN_S
     rehearse_s: float = REHEARSED_S
     lift_s: float = vehicle.LIFT_S
-    tell: Callable[[str], None] = lambda text: None
+    announce: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
     capture_s: float = capture.CAPTURE_S
 
@@ -43,7 +43,7 @@ def scan_rows(uri: str | None) -> list[Row]:
     InvalidValue."""
     if uri is not None:
         check_uri(uri)
-    return vehicle.answering_rows(*find_vehicles(uri or ""))
+    return vehicle.radio_scan_rows(*find_vehicles(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
@@ -55,8 +55,8 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     with contextlib.ExitStack() as stack:
         uri, spec, profile = options.uri, options.source, options.profile
         if options.simulated:
-            scope.tell("starting the simulated vehicle")
-            simulated = stack.enter_context(simulated_vehicle(options, calibrated))
+            scope.announce("starting the simulated vehicle")
+            simulated = stack.enter_context(start_simulated_vehicle(options, calibrated))
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
             if simulated.capture is not None:
@@ -69,19 +69,19 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         session = VehicleSession(probe, options.uri, profile, room, scope)
         take = yield from session.rows()
         shown = without_password(options.source)
-        scope.tell(f"opening the camera {shown}")
+        scope.announce(f"opening the camera {shown}")
         rehearsal: Rehearsal | None = None
         try:
             size_px, asked = calibrated.size_px, options.profile.camera
             source = open_camera(spec, time.monotonic, asked, size_px=size_px)
         except PerchError as error:
-            yield from camera.refused_rows(error, options.profile)
+            yield from camera.failed_camera_rows(error, options.profile)
         else:
             stack.callback(source.close)
             yield Row("camera", *passed(f"{shown} gives pictures"))
             rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
-    yield ask("loop", camera.loop_finding, rehearsal, options.profile)
-    yield from quick_rows(options)
+    yield evaluate_row("loop", camera.loop_finding, rehearsal, options.profile)
+    yield from offline_rows(options)
 
 
 Room = CaptureSource | str | None
@@ -92,7 +92,7 @@ def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack)
     config = profile.positioning
     if config.by != "mocap":
         return None
-    scope.tell(f"connecting to {config.label}")
+    scope.announce(f"connecting to {config.label}")
     try:
         opened = scope.open_capture(config)
     except UsageError:
@@ -116,22 +116,24 @@ class VehicleSession:
 
     def rows(self) -> Generator[Row, None, TakeTelemetry]:
         """Yields the rows; returns where telemetry comes from, if only from nowhere."""
-        self.scope.tell(f"connecting to {self.uri}")
+        self.scope.announce(f"connecting to {self.uri}")
         try:
             self.probe.connect()
         except ConnectionFailed as error:
             found, _, advice = str(error).partition("\n")
             advice = advice or "switch it on; perchctl check --scan shows what answers"
             yield Row("address", *failed(found, advice))
-            yield from skip_all([*vehicle.VEHICLE, vehicle.LIFTED], "the vehicle does not answer")
+            yield from skipped_rows(
+                [*vehicle.VEHICLE, vehicle.LIFTED], "the vehicle does not answer"
+            )
             yield from self._room_rows(list)
             yield from self._compared_rows()
             return list
         yield Row("address", *passed(f"{self.uri} answers"))
-        self.scope.tell(f"listening to the vehicle for {self.scope.listen_s:g} s")
-        seen = vehicle.look(self.probe, self.uri, self.scope.listen_s)
+        self.scope.announce(f"listening to the vehicle for {self.scope.listen_s:g} s")
+        seen = vehicle.query_vehicle(self.probe, self.uri, self.scope.listen_s)
         for name, judge in vehicle.VEHICLE.items():
-            yield ask(name, judge, seen, self.profile)
+            yield evaluate_row(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
         yield from self._lift_rows()
         return self.probe.telemetry
@@ -142,10 +144,10 @@ class VehicleSession:
         if self.room is None:
             return []
         if isinstance(self.room, str):
-            return capture.refused_rows(self.room, config)
+            return capture.failed_capture_rows(self.room, config)
         seconds = self.scope.capture_s
-        self.scope.tell(f"listening to {config.label} for {seconds:g} s")
-        seen = capture.listen(take, self.room, time.monotonic, time.sleep, seconds)
+        self.scope.announce(f"listening to {config.label} for {seconds:g} s")
+        seen = capture.collect_samples(take, self.room, time.monotonic, time.sleep, seconds)
         return capture.mocap_rows_at_rest(seen, self.profile)
 
     def _compared_rows(self) -> list[Row]:
@@ -162,10 +164,14 @@ class VehicleSession:
             yield Row(vehicle.LIFTED, *lifted)
             if compared:
                 config = self.profile.positioning
-                compared = [capture.save_row(lifted, config, self.uri, datetime.now().astimezone())]
+                compared = [
+                    capture.save_comparison_row(
+                        lifted, config, self.uri, datetime.now().astimezone()
+                    )
+                ]
         else:
             advice = "add --lift, and lift it by hand when told"
-            yield from skip_all([vehicle.LIFTED], "not asked for", advice)
+            yield from skipped_rows([vehicle.LIFTED], "not asked for", advice)
         yield from compared
 
     def _lift_finding(self) -> Finding:
@@ -173,14 +179,16 @@ class VehicleSession:
         if config.by == "target":
             return skipped("only in flight it gets its position, by the target")
         if room is None:
-            self.scope.tell(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
-            return vehicle.lift_finding(vehicle.watch_lift(self.probe, time.sleep, within_s))
+            self.scope.announce(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
+            return vehicle.lift_finding(vehicle.record_lift(self.probe, time.sleep, within_s))
         if isinstance(room, str):
             return skipped(f"no {config.label}")
-        self.scope.tell(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
+        self.scope.announce(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
         take = self.probe.telemetry
-        seen = capture.listen(take, room, time.monotonic, time.sleep, within_s)
-        return capture.hand_finding(capture.paired(seen.telemetry, seen.places(config)), config)
+        seen = capture.collect_samples(take, room, time.monotonic, time.sleep, within_s)
+        return capture.comparison_finding(
+            capture.pair_motion(seen.telemetry, seen.body_poses(config)), config
+        )
 
 
 def _camera_rows(
@@ -195,9 +203,9 @@ def _camera_rows(
     yield Row("size", *size)
     if size.verdict != "pass":
         why = "pictures of another size cannot be looked at"
-        yield from skip_all(camera.names_of(profile), why)
+        yield from skipped_rows(camera.picture_row_names(profile), why)
         return None
-    scope.tell(f"rehearsing on live pictures for {scope.rehearse_s:g} s")
+    scope.announce(f"rehearsing on live pictures for {scope.rehearse_s:g} s")
     done = rehearse(take, source, pipeline, profile, WallClock(), scope.rehearse_s)
     yield from camera.picture_rows(done, profile, pipeline.camera)
     return done

@@ -1,6 +1,6 @@
 """The vehicle at the other end of the link: what it answers, holds and reports at rest.
 
-`look` takes half a dozen seconds and sends nothing but questions.
+`query_vehicle` takes half a dozen seconds and sends nothing but questions.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 from perchctl.check.row import (
     Finding,
     Row,
-    Unknown,
-    by_limits,
-    by_problem,
+    Unanswerable,
     failed,
+    limits_finding,
     passed,
+    problem_finding,
     skipped,
     warned,
-    worst,
+    worst_finding,
 )
 from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
@@ -38,8 +38,8 @@ Wait = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Vehicle:
-    """What was found out about a vehicle.
+class VehicleStatus:
+    """Answers of a vehicle to the check's questions.
 
     `telemetry` is the newest, with its age, None without any. While it was listened to, its
     position moved by `moved_m`.
@@ -59,9 +59,9 @@ class Vehicle:
 
     @property
     def at_rest(self) -> Telemetry:
-        """The newest telemetry. Raises Unknown without any."""
+        """The newest telemetry. Raises Unanswerable without any."""
         if self.telemetry is None:
-            raise Unknown("no telemetry")
+            raise Unanswerable("no telemetry")
         return self.telemetry
 
     def position_decks(self, profile: Profile) -> tuple[str, ...]:
@@ -69,14 +69,14 @@ class Vehicle:
         return tuple(deck for deck in self.decks if deck in known)
 
 
-def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
-    """Ask a connected vehicle, and listen to it for so long."""
+def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> VehicleStatus:
+    """Query a connected vehicle, and collect its telemetry for `listen_s` seconds."""
     link.telemetry()
     echoes = link.echoes(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
     later = link.telemetry() or samples
-    return Vehicle(
+    return VehicleStatus(
         uri=uri,
         protocol=link.protocol(),
         missing=link.missing,
@@ -94,7 +94,7 @@ def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
 # --- Its rows ---------------------------------------------------------
 
 
-def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
+def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     """Judge the link by its echoes, and a radio's by its quality, too."""
     sent, quality = len(vehicle.echoes), vehicle.quality
     back_s = sorted(filter(math.isfinite, vehicle.echoes))
@@ -106,15 +106,15 @@ def _packets(vehicle: Vehicle, profile: Profile) -> Finding:
         found += f", link quality {quality:.0f} %"
     advice = "bring the radio nearer, choose a channel above 80, close other programs"
     limit_s = profile.safety.proof_age_s
-    return worst(
-        by_limits(lost, 0.01, 0.05, found, advice),
-        by_limits(p95_s, min(0.03, limit_s), limit_s, found, advice),
+    return worst_finding(
+        limits_finding(lost, 0.01, 0.05, found, advice),
+        limits_finding(p95_s, min(0.03, limit_s), limit_s, found, advice),
         # A radio sends again by itself: its losses show in its quality only.
-        by_limits(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
+        limits_finding(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
     )
 
 
-def _telemetry(vehicle: Vehicle, profile: Profile) -> Finding:
+def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if vehicle.telemetry is None:
         return failed("none comes", "see firmware and packets; restart the vehicle")
     wanted_hz = 1.0 / profile.link.telemetry_period_s
@@ -123,10 +123,10 @@ def _telemetry(vehicle: Vehicle, profile: Profile) -> Finding:
     if vehicle.age_s > profile.safety.telemetry_hold_s:
         return failed(found, "see packets; restart the vehicle")
     advice = "use a radio rate of 2M, or raise link.telemetry_period_s"
-    return by_limits(-vehicle.samples_hz / wanted_hz, -0.9, -0.5, found, advice)
+    return limits_finding(-vehicle.samples_hz / wanted_hz, -0.9, -0.5, found, advice)
 
 
-def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
+def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
     found, needed = f"protocol {vehicle.protocol}", ProbeLink.NEEDED_PROTOCOL
     if vehicle.protocol < needed:
         advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
@@ -140,28 +140,30 @@ def _firmware(vehicle: Vehicle, profile: Profile) -> Finding:
     return passed(found)
 
 
-def _supervisor(vehicle: Vehicle, profile: Profile) -> Finding:
+def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.at_rest
     criteria = GroundCriteria(t, profile)
-    return by_problem(criteria.forbidden or criteria.not_allowed, f"ready (0x{t.supervisor:04X})")
+    return problem_finding(
+        criteria.supervisor_fault or criteria.supervisor_not_ready, f"ready (0x{t.supervisor:04X})"
+    )
 
 
-def _positioning(vehicle: Vehicle, profile: Profile) -> Finding:
+def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
     decks = ", ".join(vehicle.position_decks(profile))
     found = {
         "mocap": f"by {profile.positioning.label}, see its rows",
         "target": "by the target, see in view",
         "deck": f"by {decks}",
     }
-    problem = GroundCriteria.unmeasured(vehicle.decks, profile)
-    return by_problem(problem, found[profile.positioning.by])
+    problem = GroundCriteria.no_position_source(vehicle.decks, profile)
+    return problem_finding(problem, found[profile.positioning.by])
 
 
-def _estimator(vehicle: Vehicle, profile: Profile) -> Finding:
+def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.at_rest
     if profile.positioning.by != "deck" and not vehicle.position_decks(profile):
         return skipped(BY_FLY)
-    problem = GroundCriteria(t, profile).unsettled
+    problem = GroundCriteria(t, profile).estimate_unsettled
     if problem is not None:
         return failed(problem.found, "is there a positioning system? wait a little")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
@@ -178,33 +180,33 @@ def _estimator(vehicle: Vehicle, profile: Profile) -> Finding:
     return passed(found)
 
 
-def _ground(vehicle: Vehicle, profile: Profile) -> Finding:
+def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.at_rest
     if profile.positioning.by != "deck":
         return skipped(BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
         return failed("the position is no number", "restart the vehicle")
-    return by_problem(GroundCriteria(t, profile).height, f"at {t.position_m[2]:.2f} m")
+    return problem_finding(GroundCriteria(t, profile).off_ground, f"at {t.position_m[2]:.2f} m")
 
 
-def _level(vehicle: Vehicle, profile: Profile) -> Finding:
+def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
     """Judge whether it stands level and still."""
     t, limit_deg = vehicle.at_rest, profile.safety.start_tilt_deg
     criteria = GroundCriteria(t, profile)
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"
     advice = "put it on level ground; if that is level, restart it there"
-    return worst(
-        by_limits(criteria.tilt_deg, 3.0, limit_deg, found, advice),
-        by_problem(criteria.motion, found),
+    return worst_finding(
+        limits_finding(criteria.tilt_deg, 3.0, limit_deg, found, advice),
+        problem_finding(criteria.not_still, found),
     )
 
 
-def _battery(vehicle: Vehicle, profile: Profile) -> Finding:
+def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.at_rest
     if not t.battery_v >= NO_BATTERY_READING_V:
         return skipped("no reading", "restart the vehicle")
     found = f"{t.battery_v:.2f} V at rest"
-    if problem := GroundCriteria(t, profile).battery:
+    if problem := GroundCriteria(t, profile).battery_too_low:
         return failed(problem.found, problem.advice)
     if t.battery_state == LOW_POWER:
         return failed(f"{found}, but it reports low power", "charge it")
@@ -213,7 +215,7 @@ def _battery(vehicle: Vehicle, profile: Profile) -> Finding:
     return passed(found)
 
 
-VEHICLE: dict[str, Callable[[Vehicle, Profile], Finding]] = {
+VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
     "packets": _packets,
     "telemetry": _telemetry,
     "firmware": _firmware,
@@ -237,8 +239,8 @@ MOVED_G = 0.05
 """A hand that lifts shows in the accelerometer; its noise at rest is a tenth of it."""
 
 
-def watch_lift(link: ProbeLink, wait: Wait, within_s: float = LIFT_S) -> list[Telemetry]:
-    """Return what the vehicle reports for so long."""
+def record_lift(link: ProbeLink, wait: Wait, within_s: float = LIFT_S) -> list[Telemetry]:
+    """Return the vehicle's telemetry of `within_s` seconds, in which somebody lifts it."""
     seen: list[Telemetry] = []
     for _ in range(max(1, round(within_s / 0.1))):
         wait(0.1)
@@ -269,7 +271,7 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
 # --- Which vehicles answer --------------------------------------------
 
 
-def answering_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
+def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
     """Return one row for the radio, and one for each vehicle that answers: what `find_vehicles`
     found."""
     radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")

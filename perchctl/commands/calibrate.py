@@ -44,7 +44,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_result, say
-from perchctl.commands.progress import guide, search_bar
+from perchctl.commands.progress import search_bar, show_guidance
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
@@ -282,7 +282,7 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
-        show = stack.enter_context(guide(page))
+        show = stack.enter_context(show_guidance(page))
         if source.live:
             say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
         found = capture_views(source, board, show, stopped=stop.requested.is_set)

@@ -33,12 +33,12 @@ from perchctl.commands.command_line import (
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
-from perchctl.commands.output import ask, print_lines, print_result, say, with_problem
-from perchctl.commands.progress import guide
+from perchctl.commands.output import add_problem, ask, print_lines, print_result, say
+from perchctl.commands.progress import show_guidance
 from perchctl.display import live_page
 from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, UsageError
-from perchctl.files import check_place
-from perchctl.link import MotionLink, check_uri
+from perchctl.files import check_writable
+from perchctl.link import AttitudeLink, check_uri
 from perchctl.profile import (
     Profile,
     find_profile,
@@ -123,7 +123,7 @@ def mount(
         "profile": written and str(written),
         "profile_before": before and str(before),
     }
-    print_result(with_problem(record, problem) if as_json else measured.keys_text())
+    print_result(add_problem(record, problem) if as_json else measured.keys_text())
     return 0 if problem is None else problem.exit_code
 
 
@@ -158,7 +158,7 @@ def _free_place(name: str) -> Path:
     in vain."""
     stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
     place = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
-    check_place(place, force=False)
+    check_writable(place, force=False)
     return place
 
 
@@ -208,7 +208,7 @@ def _record_live(
 
     Raises:
         Interrupted: Ctrl-C. SafetyAbort: the motors turn.
-        Those of `open_camera`, `MotionLink.connect` and `record_mounting`.
+        Those of `open_camera`, `AttitudeLink.connect` and `record_mounting`.
     """
     recordings: list[MountingRecording] = []
     with contextlib.ExitStack() as stack:
@@ -233,7 +233,7 @@ def _record_live(
             reader = PoseReader(profile, camera, frames.live)
             if frames.live:
                 frames.poll(time.monotonic())  # from before
-            with Stopper().installed() as stop, guide(page) as show:
+            with Stopper().installed() as stop, show_guidance(page) as show:
                 stopped = stop.requested.is_set
                 record_mounting(
                     recording,
@@ -252,7 +252,7 @@ def _record_live(
 @contextlib.contextmanager
 def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
     """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors turn."""
-    link = MotionLink(uri, profile.link, time.monotonic)
+    link = AttitudeLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri}, to read from it and nothing else")
     link.connect()
 

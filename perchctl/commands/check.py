@@ -21,7 +21,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.fly import resolve
+from perchctl.commands.fly import resolve_options
 from perchctl.commands.interrupt import ignore_signals, interruptible
 from perchctl.commands.output import say
 from perchctl.errors import (
@@ -75,16 +75,16 @@ def check(
     when the camera gives no picture, 52 for any other failing row.
     """
     if cameras:
-        return report(camera_rows(), as_json)
+        return print_rows(camera_rows(), as_json)
     if scan:
         say("scanning all channels and rates")
-        return report(scan_rows(uri), as_json)
-    options = resolve(profile, uri, source)
-    scope = CheckScope(lift=lift, tell=say)
-    return report(check_rows(options, scope), as_json)
+        return print_rows(scan_rows(uri), as_json)
+    options = resolve_options(profile, uri, source)
+    scope = CheckScope(lift=lift, announce=say)
+    return print_rows(check_rows(options, scope), as_json)
 
 
-def report(rows: Iterable[Row], as_json: bool) -> int:
+def print_rows(rows: Iterable[Row], as_json: bool) -> int:
     """Print the rows, also so far as Ctrl-C or an error let them come; returns the exit code."""
     found: list[Row] = []
     interrupted = False
@@ -96,13 +96,13 @@ def report(rows: Iterable[Row], as_json: bool) -> int:
         interrupted = True
     except PerchError:
         if found and not as_json:
-            print(table(found, finished=False))
+            print(format_rows(found, finished=False))
         raise
     with ignore_signals():
         if as_json:
             print(json.dumps([asdict(row) for row in found]))
         elif found:
-            print(table(found, finished=not interrupted))
+            print(format_rows(found, finished=not interrupted))
     if interrupted:
         say("Ctrl-C: this is what was found until then")
         return Interrupted.exit_code
@@ -117,7 +117,7 @@ def exit_code(rows: Sequence[Row]) -> int:
     return 0
 
 
-def table(rows: Sequence[Row], finished: bool = True) -> str:
+def format_rows(rows: Sequence[Row], finished: bool = True) -> str:
     """Return the rows at 80 columns: verdict, name, what was found, and below it what to do. Of a
     check that did not come to its end nothing good is said."""
     lines = [line for row in rows for line in _lines(row)]

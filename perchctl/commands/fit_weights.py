@@ -22,7 +22,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import ask, print_result, say, with_problem
+from perchctl.commands.output import add_problem, ask, print_result, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import PerchError, UsageError, no_simulator
 from perchctl.files import check_output, same_file
@@ -95,7 +95,7 @@ def fit(
         say(str(problem))
     if as_json:
         written = None if problem or output is None else str(output)
-        print_result(with_problem(weights_record(result) | {"weights_file": written}, problem))
+        print_result(add_problem(weights_record(result) | {"weights_file": written}, problem))
     return 0 if problem is None else problem.exit_code
 
 
@@ -159,7 +159,7 @@ def _collect_simulated(
 
     session = _open_session(path, frames)
     with count_bar("frames", max(0, positions - session.done) * frames) as advance:
-        SimulatedStand(profile, camera, positions, seed).fill(session, frames, advance)
+        SimulatedStand(profile, camera, positions, seed).fill_session(session, frames, advance)
 
 
 def _collect_with_person(

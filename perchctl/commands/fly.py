@@ -29,7 +29,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import ignore_signals, interruptible, signals_to_operator
+from perchctl.commands.interrupt import ignore_signals, interruptible, operator_signals
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.profile import picture_edges
 from perchctl.display import (
@@ -116,9 +116,9 @@ def fly(
     Without options it flies the simulated vehicle. Ctrl-C once lands, again after half
     a second, or held for two, cuts the motors.
     """
-    options = resolve(profile, uri, source, positioning, seed, log_dir, record)
+    options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:
-        print_result(plan(options) if as_json else plan_text(options))
+        print_result(plan_record(options) if as_json else plan_text(options))
         return 0
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
@@ -129,7 +129,7 @@ def fly(
     return fly_and_report(options, as_json, view, asks)
 
 
-def resolve(
+def resolve_options(
     profile_name: str = "sim",
     uri: str | None = None,
     source: str | None = None,
@@ -202,7 +202,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
-                page.fail(error, log.path if log.begun else None)
+                page.fail(error, log.path if log.has_begun else None)
             log.abandon(str(error) or type(error).__name__)
             raise
         finally:
@@ -213,7 +213,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
         if page is not None:
             page.end(summary, log.path)
     code = exit_code(report.outcome, summary)
-    plot = plot_of(log.path, options.profile)
+    plot = draw_flight_plot(log.path, options.profile)
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
     if as_json:
@@ -221,7 +221,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
     return code
 
 
-def plot_of(log_path: Path, profile: Profile) -> Path | None:
+def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
     """Draw the flight beside its log if the profile asks for it, and return the picture's path.
     A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
     if not profile.log.plot:
@@ -272,7 +272,7 @@ def _session(
     if page is not None:
         watchers = (*watchers, page)
         watched = lambda source: page.watched(log.watched(source))  # noqa: E731
-    with signals_to_operator(switch, say):
+    with operator_signals(switch, say):
         ask = partial(ask_before_arming, options.uri) if asks else None
         return fly_session(options, watchers, switch, watched, log.remarks, ask)
 
@@ -300,7 +300,7 @@ def flight_page(
 _COLUMN, _WIDTH = 13, 80
 
 
-def plan(options: FlyOptions) -> dict[str, Any]:
+def plan_record(options: FlyOptions) -> dict[str, Any]:
     """Return what would be flown, fully resolved; nothing is connected."""
     calibration = find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
@@ -328,7 +328,7 @@ def plan(options: FlyOptions) -> dict[str, Any]:
 def plan_text(options: FlyOptions) -> str:
     """Return the plan for people, at 80 columns: what, where, the way, and which values of the
     profile are implausible."""
-    resolved, profile, planner = plan(options), options.profile, options.profile.planner
+    resolved, profile, planner = plan_record(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""
     turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)

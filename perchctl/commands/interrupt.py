@@ -22,7 +22,7 @@ _NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
 
 
 @contextlib.contextmanager
-def signals_to(handler: Handler) -> Iterator[None]:
+def handle_signals(handler: Handler) -> Iterator[None]:
     """Hand SIGINT and SIGTERM to `handler` during the block (main thread only)."""
     old = {name: signal.signal(name, handler) for name in SIGNALS}
     try:
@@ -33,7 +33,7 @@ def signals_to(handler: Handler) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def signals_to_operator(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
+def operator_signals(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
     """Let Ctrl-C press the switch during a flight, and `LANDING_SIGNALS` land (main thread only).
 
     A thread of its own reads the signals from a socket that the interpreter writes to at
@@ -83,7 +83,7 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
     """Make Ctrl-C and SIGTERM a KeyboardInterrupt during the block."""
-    with signals_to(_interrupt):
+    with handle_signals(_interrupt):
         yield
 
 
@@ -94,7 +94,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 @contextlib.contextmanager
 def ignore_signals() -> Iterator[None]:
     """Ignore Ctrl-C and SIGTERM during the block, but for what an inner block makes of them."""
-    with signals_to(lambda _signal, _frame: None):
+    with handle_signals(lambda _signal, _frame: None):
         yield
 
 
@@ -111,5 +111,5 @@ class Stopper:
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[Stopper]:
-        with signals_to(self.press):
+        with handle_signals(self.press):
             yield self

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from perchctl.analysis import (
-    Comparison,
     FlightAnalysis,
+    FlightComparison,
     newest_logs,
     show_record,
     show_text,
@@ -144,7 +144,7 @@ def compare(
 ) -> None:
     """Compare two flights: what differs, and in which keys their profiles do."""
     with _opened(one) as log, _opened(other) as other_log:
-        found = Comparison((FlightAnalysis(log), FlightAnalysis(other_log)))
+        found = FlightComparison((FlightAnalysis(log), FlightAnalysis(other_log)))
         record, text = found.record(), found.text()
     print_result(record if as_json else text)
 
@@ -226,7 +226,7 @@ def replay(
         for note in found.notes:
             say(note)
         print("\n".join(found.lines()))
-    return 0 if found.same else ReplayDiffers.exit_code
+    return 0 if found.is_identical else ReplayDiffers.exit_code
 
 
 @command(

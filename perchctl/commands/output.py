@@ -55,8 +55,8 @@ def ask_to_confirm(question: str) -> bool:
         return False
 
 
-def with_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
-    """Return a command's one object, with what kept it from its end."""
+def add_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
+    """Return a command's JSON object, with `problem` as its error and exit code if there is one."""
     if problem is None:
         return dict(record)
     return {**record, "error": str(problem), "exit_code": problem.exit_code}

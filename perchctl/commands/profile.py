@@ -196,7 +196,7 @@ def new(
         print_lines(
             f"A new profile: {output}. Enter takes what stands in brackets, {BACK} goes back."
         )
-        answers = ask_person(given)
+        answers = ask_questions(given)
     profile, keys = new_profile(answers, output.stem)
     shown = shlex.quote(str(output))
     write_files({output: (HEAD.format(name=shown) + profile_text(profile, keys)).encode()})
@@ -228,7 +228,7 @@ def default_answer(name: str, answers: Answers) -> str:
     return QUESTIONS[name]
 
 
-def ask_person(given: Answers) -> Answers:
+def ask_questions(given: Answers) -> Answers:
     """Return `given` with what somebody types: each question until its answer is valid, and what
     was answered once more before it is taken. Raises UsageError if the input has ended."""
     names = [name for name in QUESTIONS if name not in given]
@@ -236,7 +236,7 @@ def ask_person(given: Answers) -> Answers:
     while True:
         answers, number = before[-1], len(before)
         if number > len(names):
-            print_lines(summary(answers))
+            print_lines(answers_text(answers))
             question, default = "Enter writes it", ""
         else:
             name = names[number - 1]
@@ -299,7 +299,7 @@ def _shown(name: str, value: str) -> str:
     return f"{' '.join(f'{number:.4g}' for number in numbers)} {unit}"
 
 
-def summary(answers: Answers) -> str:
+def answers_text(answers: Answers) -> str:
     """Return what the profile would say, for a last look."""
     profile, _ = new_profile(answers, "new")
     mirrored = "mirrored" if profile.camera.mirrored else "not mirrored"
@@ -374,7 +374,7 @@ def _height_keys(answers: Answers) -> dict[str, Any]:
     search_m = round(max(low_search_m, ceiling_m - FAR_SIGHT_M), 2)
     most_m = round(ceiling_m + OVER_THE_CEILING_M, 2)
     landing = default.landing
-    down_s = most_m / landing.speed_mps * landing.timeout_s / landing.overdue_s
+    down_s = most_m / landing.speed_mps * landing.timeout_s / landing.setpoint_time_s
     return {
         "planner.takeoff_height_m": min(0.5, search_m),
         "planner.search.max_height_m": search_m,

@@ -30,8 +30,8 @@ _WHOLE_RUN_S = 1e6
 """Over which the time left is estimated: in rich's own 30 s no flight may have ended."""
 
 
-class Ended(Protocol):
-    """A flight's result, of whatever campaign."""
+class FinishedFlight(Protocol):
+    """Result of a flight that has ended, in any kind of campaign."""
 
     @property
     def outcome(self) -> str: ...
@@ -39,8 +39,8 @@ class Ended(Protocol):
 
 @contextlib.contextmanager
 def progress_bar(
-    total: int, earlier: Iterable[Ended] = (), stream: TextIO | None = None
-) -> Iterator[Callable[[Ended], None]]:
+    total: int, earlier: Iterable[FinishedFlight] = (), stream: TextIO | None = None
+) -> Iterator[Callable[[FinishedFlight], None]]:
     """Yield the function to call with each finished flight. `earlier`: flown before."""
     ends = Counter(result.outcome for result in earlier)
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
@@ -50,7 +50,7 @@ def progress_bar(
             counted = " ".join(f"{n} {end}" for end, n in ends.items())
             update(completed=ends.total(), description=counted)
 
-        def advance(result: Ended) -> None:
+        def advance(result: FinishedFlight) -> None:
             ends[result.outcome] += 1
             show()
 
@@ -104,7 +104,7 @@ _GUIDE_HZ = 8
 
 
 @contextlib.contextmanager
-def guide(
+def show_guidance(
     page: LivePage | None, stream: TextIO | None = None
 ) -> Iterator[Callable[[GuidedFrame], None]]:
     """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as a line

@@ -31,8 +31,8 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.fly import with_positioning
-from perchctl.commands.interrupt import signals_to
-from perchctl.commands.output import print_result, say, with_problem
+from perchctl.commands.interrupt import handle_signals
+from perchctl.commands.output import add_problem, print_result, say
 from perchctl.commands.progress import progress_bar
 from perchctl.errors import (
     Interrupted,
@@ -124,7 +124,7 @@ def run(
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
     seeds = range(seed, seed + flights)
-    flyers = executor_of(jobs, cluster, [flown], flights)
+    flyers = make_executor(jobs, cluster, [flown], flights)
     if faults is None:
         names = None
         campaign = _Campaign(
@@ -132,7 +132,7 @@ def run(
             partial(campaigns.fly_in_folder, flown, log_dir, record),
             campaigns.campaign_summary,
             campaigns.campaign_table,
-            campaigns.none_took_off,
+            campaigns.all_refused_error,
         )
     else:
         names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
@@ -144,12 +144,12 @@ def run(
         )
 
     def report(results: list[Any], problem: PerchError | None) -> None:
-        figures = with_problem(campaign.summary(results), problem) if as_json else None
+        figures = add_problem(campaign.summary(results), problem) if as_json else None
         print_result(figures or campaign.table(results))
-        say_where_logs_are(results, log_dir)
+        print_log_folder(results, log_dir)
 
     with (
-        signals_to(stop_handler()),
+        handle_signals(stop_handler()),
         campaigns.campaign_results(
             flown,
             seeds,
@@ -161,13 +161,13 @@ def run(
             log_dir=log_dir,
         ) as kept,
     ):
-        return fly_each(
-            lambda executor, note: campaigns.fly_all(campaign.fly, kept.left, executor, note),
+        return run_campaign(
+            lambda executor, note: campaigns.fly_all(campaign.fly, kept.remaining, executor, note),
             report,
             len(seeds),
             flyers,
             kept.earlier,
-            kept.note,
+            kept.write_result,
             campaign.objection,
         )
 
@@ -215,7 +215,7 @@ def compare(
         if as_json:
             differences = {key: {"a": a, "b": b} for key, (a, b) in keys.items()}
             record = {"a": profile_a, "b": profile_b, **found, "profile": differences}
-            print_result(with_problem(record, problem))
+            print_result(add_problem(record, problem))
             return
         print(campaigns.comparison_text(names, found))
         for key, (a, b) in keys.items():
@@ -251,7 +251,7 @@ def sweep(
 
     def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:
         record = asked.record(results)
-        print_result(with_problem(record, problem) if as_json else asked.text(record))
+        print_result(add_problem(record, problem) if as_json else asked.text(record))
 
     return _fly_by_each(asked.profiles, range(seed, seed + flights), jobs, cluster, report)
 
@@ -263,12 +263,12 @@ def _fly_by_each(
     cluster: str | None,
     report: Callable[[list[campaigns.FlightResult], PerchError | None], None],
 ) -> int:
-    with signals_to(stop_handler()):
-        return fly_each(
+    with handle_signals(stop_handler()):
+        return run_campaign(
             lambda executor, note: campaigns.fly_variants(profiles, seeds, executor, note),
             report,
             len(profiles) * len(seeds),
-            executor_of(jobs, cluster, profiles, len(profiles) * len(seeds)),
+            make_executor(jobs, cluster, profiles, len(profiles) * len(seeds)),
         )
 
 
@@ -281,11 +281,11 @@ def _require_simulator() -> None:
 # --- Who flies, and how it may end ------------------------------------
 
 
-def executor_of(
+def make_executor(
     jobs: int | None, cluster: str | None, profiles: Sequence[Profile], flights: int
 ) -> AbstractContextManager[Executor]:
-    """Return who flies: processes of this computer, or the workers of a cluster. `profiles`: with
-    the files that flights read. Errors: UsageError."""
+    """Return the executor of a campaign: processes of this computer, or the workers of a cluster,
+    which must have the files of `profiles`. Errors: UsageError."""
     if cluster is None:
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -303,7 +303,7 @@ def executor_of(
     return cluster_pool(cluster, profiles)
 
 
-def fly_each(
+def run_campaign(
     campaign: Callable[[Executor, Callable[[Any], None]], object],
     report: Callable[[list[Any], PerchError | None], None],
     total: int,
@@ -315,10 +315,10 @@ def fly_each(
     """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
     by Ctrl-C, or when a flight fails. Returns the exit code.
 
-    `campaign` gets who flies and the function to call with each result; `report` gets the
-    results, and why not all were flown. `earlier`: those that were flown before, which count, too;
-    `keep` writes each of the others. `objection`: what all of them together amount to. Errors:
-    PerchError if none was flown.
+    `campaign` gets the executor and the function to call with each result; `report` gets the
+    results, and the error if not all were flown. `earlier` results are counted, too; `keep` writes
+    each new one. `objection` returns the error that all results together amount to, if any.
+    Errors: PerchError if none was flown.
     """
     results = list(earlier)
     problem: PerchError | None = None
@@ -377,7 +377,7 @@ def stop_handler(
 # --- What is printed --------------------------------------------------
 
 
-def say_where_logs_are(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
+def print_log_folder(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
     """Print on stderr where the logs are, and what they lack."""
     if log_dir is None or not results:
         return

@@ -28,7 +28,7 @@ from perchctl.calibration import load_calibration
 from perchctl.camera import (
     VERDICT_TEXTS,
     FrameSource,
-    Recording,
+    RecordedSource,
     WrappedSource,
     check_size,
     mirrored_note,
@@ -47,7 +47,7 @@ from perchctl.commands.command_line import (
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
-from perchctl.display import live_page, sketch_of
+from perchctl.display import live_page, make_sketch
 from perchctl.errors import Interrupted, NotFound
 from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.perception import Perception
@@ -113,7 +113,7 @@ def track(
         recording = opened.inner if isinstance(opened, WrappedSource) else opened
         paths: Sequence[Path] = ()
         count = None
-        if isinstance(recording, Recording):
+        if isinstance(recording, RecordedSource):
             paths, count = recording.paths, recording.count
         advice = ", the shipped example: give your camera's with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
@@ -135,7 +135,7 @@ def track(
                     # A live result is worth nothing late.
                     print(line, flush=opened.live)
                 if page is not None:
-                    sketch = sketch_of(tracked.picture, tracked.output, flown.target.large.side_m)
+                    sketch = make_sketch(tracked.picture, tracked.output, flown.target.large.side_m)
                     page.show(sketch)
                     page.set_state(partial(track_state, tracked))
             advance()
@@ -186,7 +186,7 @@ class CameraPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackResult:
     """The result of one picture.
 
     Attributes:
@@ -219,7 +219,7 @@ class Tracker:
         self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
         self._target: CameraPose | None = None
 
-    def results(self, frame: Frame, name: str | int) -> list[Tracked]:
+    def results(self, frame: Frame, name: str | int) -> list[TrackResult]:
         """Return the frame's result, or those of its two fields; none for a live source's
         repetition of the last picture."""
         judged = self._perception.health.assess(frame, self._live or not self._stills)
@@ -227,12 +227,12 @@ class Tracker:
             return []
         about = () if judged in ("ok", "repeated") else (VERDICT_TEXTS[judged],)
         if self._live and judged in _NO_PICTURE:
-            return [Tracked(name, frame, notes=about)]
+            return [TrackResult(name, frame, notes=about)]
         results = []
         for picture, output in self._perception.look(frame):
             self._target = camera_pose(output, self._target)
             notes = (*about, *self._notes(output))
-            results.append(Tracked(name, picture, output, self._target, notes))
+            results.append(TrackResult(name, picture, output, self._target, notes))
         return results
 
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
@@ -269,7 +269,7 @@ def camera_pose(output: PipelineOutput, before: CameraPose | None) -> CameraPose
 # --- What is printed --------------------------------------------------
 
 
-def track_record(tracked: Tracked) -> dict[str, Any]:
+def track_record(tracked: TrackResult) -> dict[str, Any]:
     """Return the line of `track --json`; what is not finite becomes None."""
     target, output = tracked.target, tracked.output
     return {
@@ -302,7 +302,7 @@ def _finite(value: Any) -> Any:
     return float(value) if math.isfinite(value) else None
 
 
-def text_line(tracked: Tracked) -> str:
+def text_line(tracked: TrackResult) -> str:
     """Return one line for a terminal, at most 100 columns but for long file names."""
     head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
     return f"{head}  {_target_text(tracked.target)}"
@@ -315,7 +315,7 @@ def _target_text(target: CameraPose | None) -> str:
     return f"x {x}  y {y}  z {z} cm  yaw {math.degrees(target.yaw_rad):+7.2f} deg"
 
 
-def track_state(tracked: Tracked) -> dict[str, Any]:
+def track_state(tracked: TrackResult) -> dict[str, Any]:
     """Return what the live page shows of a frame, ready for JSON."""
     rows = [
         ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
@@ -333,7 +333,7 @@ class TrackSummary:
         self._found: Counter[str] = Counter()
         self._noted: Counter[str] = Counter()
 
-    def add(self, tracked: Tracked) -> None:
+    def add(self, tracked: TrackResult) -> None:
         """Count this result, and print what is new in it."""
         self.frames += 1
         if tracked.output is not None:

@@ -91,8 +91,8 @@ class LivePage:
             self._changed.notify_all()
 
     def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
-        """Show these numbers from now on; they are formatted only when a reader polls. While they
-        are `live`, others are due at once, and the page says when they stay away."""
+        """Show these numbers from now on; they are formatted only when a reader polls. With
+        `live`, updates must keep coming, and the page says when they stop."""
         self._describe = describe
         self._state_s = self._clock() if live else None
 
@@ -115,7 +115,7 @@ class LivePage:
         try:
             described = self._describe()
         except Exception as error:
-            self.remember(error)
+            self.store_error(error)
             described = {}
         if self._on_stop is None:
             stop = "none"
@@ -163,7 +163,7 @@ class LivePage:
         if first and self._on_stop is not None:
             self._on_stop()
 
-    def remember(self, error: BaseException) -> None:
+    def store_error(self, error: BaseException) -> None:
         self.problem = f"{type(error).__name__}: {error}"
 
     def close(self) -> None:
@@ -238,7 +238,7 @@ class PageServer(ThreadingHTTPServer):
         """Keep an error in the page's `problem`, but for a reader that goes away."""
         error = sys.exception()
         if error is not None and not isinstance(error, OSError):
-            self.page.remember(error)
+            self.page.store_error(error)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -360,7 +360,7 @@ class Sketch:
     pose: tuple[Array, Array, float] | None = None
 
 
-def sketch_of(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
+def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
     """Return the frame with the outlines of its markers and the axes of its pose; bare if it was
     not searched. `large_side_m` is the side of the large marker."""
     if output is None or output.detections.frame_index != frame.index:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.display.live import LivePage, Sketch, sketch_of
+from perchctl.display.live import LivePage, Sketch, make_sketch
 from perchctl.display.panel import status_rows
 from perchctl.mission import Event, Phase, Tick
 from perchctl.record import FlightSummary
@@ -49,11 +49,11 @@ class FlightPage:
             frame = self._frame
             if frame is not None:
                 self._frame = None
-                self.page.show(sketch_of(frame, tick.output, self._side_m))
+                self.page.show(make_sketch(frame, tick.output, self._side_m))
             describe = partial(flight_state, tick, self._drawn)
             self.page.set_state(describe, live=not tick.state.phase.is_over)
         except Exception as error:
-            self.page.remember(error)
+            self.page.store_error(error)
 
     def event(self, event: Event) -> None:
         if event.is_rescue:

@@ -29,7 +29,7 @@ LONGEST_S, EVER_SHARE = 30.0, 0.25
 
 
 class DrawInputs(NamedTuple):
-    """What a case is drawn from."""
+    """Inputs of a random draw: the generator, and the scenario of the flight."""
 
     rng: np.random.Generator
     scenario: Scenario
@@ -39,12 +39,12 @@ Draw = Callable[[DrawInputs], Any]
 """Draws one value."""
 
 
-def between(low: float, high: float) -> Draw:
+def uniform(low: float, high: float) -> Draw:
     """Draw a number uniformly from a range."""
     return lambda source: round(float(source.rng.uniform(low, high)), 4)
 
 
-def log_between(low: float, high: float) -> Draw:
+def log_uniform(low: float, high: float) -> Draw:
     """Draw a number log-uniformly from a range."""
     logs = math.log(low), math.log(high)
     return lambda source: round(float(math.exp(source.rng.uniform(*logs))), 4)
@@ -55,11 +55,11 @@ def chance(source: DrawInputs, share: float) -> bool:
     return bool(source.rng.uniform() < share)
 
 
-def lasting(low: float = 0.1) -> Draw:
+def duration_s(low: float = 0.1) -> Draw:
     """Draw a duration log-uniformly from `low` to `LONGEST_S`; one in four lasts for ever."""
 
     def draw(source: DrawInputs) -> float:
-        for_s: float = log_between(low, LONGEST_S)(source)
+        for_s: float = log_uniform(low, LONGEST_S)(source)
         return e.FOR_EVER if chance(source, EVER_SHARE) else for_s
 
     return draw
@@ -86,7 +86,7 @@ def direction(source: DrawInputs) -> tuple[float, float]:
     return math.cos(angle), math.sin(angle)
 
 
-def presses(period: Any, duration: Draw) -> Draw:
+def key_presses(period: Any, duration: Draw) -> Draw:
     """Draw the times of a key that is pressed again and again."""
 
     def draw(source: DrawInputs) -> tuple[float, ...]:
@@ -103,36 +103,36 @@ def _value(value: Any, source: DrawInputs) -> Any:
     return value(source) if callable(value) else value
 
 
-def drawn(act: Callable[..., object], **values: Any) -> Draw:
+def effect(act: Callable[..., object], **values: Any) -> Draw:
     """Draw an effect: `act` with its values, in their order."""
     return lambda source: partial(act, **{name: _value(v, source) for name, v in values.items()})
 
 
 def _jump_xy(source: DrawInputs) -> e.Axes:
     x, y = direction(source)
-    step_m = log_between(0.1, 2.0)(source)
+    step_m = log_uniform(0.1, 2.0)(source)
     return x * step_m, y * step_m, 0.0
 
 
 def _drift(source: DrawInputs) -> e.Axes:
     x, y = direction(source)
-    speed_mps = log_between(0.03, 0.3)(source)
-    return x * speed_mps, y * speed_mps, between(-0.2, 0.2)(source) * speed_mps
+    speed_mps = log_uniform(0.03, 0.3)(source)
+    return x * speed_mps, y * speed_mps, uniform(-0.2, 0.2)(source) * speed_mps
 
 
 def _blow(source: DrawInputs) -> e.Axes:
     """Draw the force of a blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
     x, y = direction(source)
-    z = between(-0.5, 0.5)(source)
-    force_n = source.scenario.mass_kg * between(0.2, 1.0)(source) / 0.04
+    z = uniform(-0.5, 0.5)(source)
+    force_n = source.scenario.mass_kg * uniform(0.2, 1.0)(source) / 0.04
     return x * force_n, y * force_n, z * force_n
 
 
 def _gust(source: DrawInputs) -> e.Axes:
     """Draw a force of up to a fifth of the weight, mostly sideways."""
     x, y = direction(source)
-    z = between(-0.3, 0.3)(source)
-    force_n = source.scenario.mass_kg * GRAVITY_MPS2 * between(0.05, 0.2)(source)
+    z = uniform(-0.3, 0.3)(source)
+    force_n = source.scenario.mass_kg * GRAVITY_MPS2 * uniform(0.05, 0.2)(source)
     return x * force_n, y * force_n, z * force_n
 
 
@@ -143,7 +143,7 @@ def _a_step_aside(source: DrawInputs) -> tuple[float, float]:
 
 def _beside(source: DrawInputs) -> tuple[Neighbour, ...]:
     x, y = direction(source)
-    away_m = between(0.35, 1.2)(source)
+    away_m = uniform(0.35, 1.2)(source)
     return (Neighbour((x * away_m, y * away_m)),)
 
 
@@ -161,7 +161,7 @@ def _one_weak_motor(source: DrawInputs) -> tuple[float, ...]:
 
 
 def _another_thrust(source: DrawInputs) -> tuple[float, ...]:
-    return (round(1.0 / between(0.92, 1.08)(source), 4),) * 4
+    return (round(1.0 / uniform(0.92, 1.08)(source), 4),) * 4
 
 
 def _packet_twice(source: DrawInputs) -> tuple[e.Effect, ...]:
@@ -172,40 +172,40 @@ def _packet_twice(source: DrawInputs) -> tuple[e.Effect, ...]:
 
 def _hung_and_packet_lost(source: DrawInputs) -> tuple[e.Effect, ...]:
     order = one_of("raw", "stop", "land")(source)
-    return HUNG(source), lost(order)(source)
+    return HUNG(source), packet_loss(order)(source)
 
 
-def lost(order: str) -> Draw:
+def packet_loss(order: str) -> Draw:
     """Draw the loss of one packet of an order, or of two."""
-    return drawn(e.packet_lost, order=order, count=either(0.6, 1, 2))
+    return effect(e.packet_lost, order=order, count=either(0.6, 1, 2))
 
 
 def camera(kind: str) -> Draw:
-    return drawn(e.camera_fault, kind=kind, for_s=lasting())
+    return effect(e.camera_fault, kind=kind, for_s=duration_s())
 
 
 def wrong_positions(how: Any) -> Draw:
-    return drawn(e.external_positions, how=how, for_s=lasting())
+    return effect(e.external_positions, how=how, for_s=duration_s())
 
 
-def radio(**values: Any) -> Draw:
-    return drawn(e.radio_loss, for_s=lasting(), **values)
+def radio_effect(**values: Any) -> Draw:
+    return effect(e.radio_loss, for_s=duration_s(), **values)
 
 
-def frozen(*names: str) -> Draw:
+def frozen_logs(*names: str) -> Draw:
     """Draw a freeze of log variables: their packets still arrive, their values do not change."""
-    return drawn(e.log_reads, names=names, value=None, for_s=lasting())
+    return effect(e.log_reads, names=names, value=None, for_s=duration_s())
 
 
-ONCE = drawn(e.operator, presses_s=(0.0,))
-HUNG = drawn(e.hung, for_s=lasting(0.3))
-KICK = drawn(e.push, force_n=_blow, for_s=0.04)
-GUST = drawn(e.push, force_n=_gust, for_s=between(0.5, 1.0))
+ONCE = effect(e.operator, presses_s=(0.0,))
+HUNG = effect(e.hung, for_s=duration_s(0.3))
+KICK = effect(e.push, force_n=_blow, for_s=0.04)
+GUST = effect(e.push, force_n=_gust, for_s=uniform(0.5, 1.0))
 COVERED = camera("covered")
-WEAK_MAGNET = drawn(e.magnet_holds, of_weight=between(0.2, 1.1))
-NO_UPLINK = radio(up=True)
-LOW_VOLTAGE = drawn(e.log_reads, names=("pm.vbat",), value=between(2.6, 3.1), for_s=lasting())
-LOW_STATE = drawn(e.log_reads, names=("pm.state",), value=3.0, for_s=lasting())
+WEAK_MAGNET = effect(e.magnet_holds, of_weight=uniform(0.2, 1.1))
+NO_UPLINK = radio_effect(up=True)
+LOW_VOLTAGE = effect(e.log_reads, names=("pm.vbat",), value=uniform(2.6, 3.1), for_s=duration_s())
+LOW_STATE = effect(e.log_reads, names=("pm.state",), value=3.0, for_s=duration_s())
 STATE = tuple(f"stateEstimate.{axis}" for axis in ("x", "y", "z", "vx", "vy", "vz"))
 
 
@@ -256,38 +256,41 @@ class Fault:
 
 FAULTS: tuple[Fault, ...] = (
     # The link.
-    Fault("downlink-silent", "no telemetry", radio(down="all")),
+    Fault("downlink-silent", "no telemetry", radio_effect(down="all")),
     Fault("uplink-silent", "no command arrives", NO_UPLINK),
-    Fault("link-silent", "both ways silent", radio(up=True, down="all")),
+    Fault("link-silent", "both ways silent", radio_effect(up=True, down="all")),
     Fault(
         "landing-lost",
         "the operator lands, but 1 or 2 landing orders are lost",
-        (lost("land"), ONCE),
+        (packet_loss("land"), ONCE),
         BEFORE_LANDING,
     ),
     Fault(
         "notify-lost",
         "the operator lands, but 1 or 2 notify packets are lost",
-        (lost("notify"), ONCE),
+        (packet_loss("notify"), ONCE),
     ),
-    Fault("stop-lost", "1 or 2 stop packets are lost", lost("stop"), STOPPING),
+    Fault("stop-lost", "1 or 2 stop packets are lost", packet_loss("stop"), STOPPING),
     Fault(
-        "stop-notify-lost", "1 or 2 notify packets after a stop are lost", lost("notify"), STOPPING
+        "stop-notify-lost",
+        "1 or 2 notify packets after a stop are lost",
+        packet_loss("notify"),
+        STOPPING,
     ),
     Fault(
         "emergency-stop-lost",
         "the operator stops, but 1 or 2 orders are lost",
-        (lost("emergency-stop"), drawn(e.operator, presses_s=(0.0, 0.8))),
+        (packet_loss("emergency-stop"), effect(e.operator, presses_s=(0.0, 0.8))),
     ),
     Fault("packet-twice", "a packet arrives twice", _packet_twice),
-    Fault("state-block-dead", "no position and velocity", radio(down="state")),
-    Fault("attitude-block-dead", "no attitude, thrust, supervisor", radio(down="attitude")),
-    Fault("battery-block-dead", "no battery voltage", radio(down="battery")),
-    Fault("variance-block-dead", "no variance", radio(down="variance")),
+    Fault("state-block-dead", "no position and velocity", radio_effect(down="state")),
+    Fault("attitude-block-dead", "no attitude, thrust, supervisor", radio_effect(down="attitude")),
+    Fault("battery-block-dead", "no battery voltage", radio_effect(down="battery")),
+    Fault("variance-block-dead", "no variance", radio_effect(down="variance")),
     Fault(
         "telemetry-delayed",
         "telemetry 50 ms to 2 s late",
-        drawn(e.radio_loss, down="all", delay_s=log_between(0.05, 2.0), for_s=lasting(0.5)),
+        effect(e.radio_loss, down="all", delay_s=log_uniform(0.05, 2.0), for_s=duration_s(0.5)),
     ),
     # The camera.
     Fault("camera-silent", "no picture", camera("silent")),
@@ -299,40 +302,42 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "camera-late",
         "pictures 50 to 600 ms late that look fresh",
-        drawn(e.camera_fault, kind="late", for_s=lasting(1.0), late_s=log_between(0.05, 0.6)),
+        effect(e.camera_fault, kind="late", for_s=duration_s(1.0), late_s=log_uniform(0.05, 0.6)),
     ),
     Fault("camera-out-of-order", "in pairs, the newer one first", camera("out-of-order")),
     Fault(
         "camera-mirrored",
         "mirrored pictures from the start",
-        drawn(e.camera_fault, kind="mirrored", for_s=e.FOR_EVER),
+        effect(e.camera_fault, kind="mirrored", for_s=e.FOR_EVER),
         FROM_THE_START,
     ),
     # The state estimate.
     Fault(
         "estimate-jumps",
         "steps sideways by 0.1 to 2 m",
-        drawn(e.estimate_error, step_m=_jump_xy, for_s=lasting()),
+        effect(e.estimate_error, step_m=_jump_xy, for_s=duration_s()),
     ),
     Fault(
         "height-jumps",
         "steps in height by 0.1 to 1 m",
-        drawn(e.estimate_error, step_m=(0.0, 0.0, signed(log_between(0.1, 1.0))), for_s=lasting()),
+        effect(
+            e.estimate_error, step_m=(0.0, 0.0, signed(log_uniform(0.1, 1.0))), for_s=duration_s()
+        ),
     ),
     Fault(
         "heading-jumps",
         "turns by 10 to 180 deg",
-        drawn(e.estimate_error, turn_deg=signed(log_between(10.0, 180.0)), for_s=lasting()),
+        effect(e.estimate_error, turn_deg=signed(log_uniform(10.0, 180.0)), for_s=duration_s()),
     ),
     Fault(
         "estimate-drifts",
         "slides by 3 to 30 cm/s",
-        drawn(e.estimate_error, drift_mps=_drift, for_s=lasting(2.0)),
+        effect(e.estimate_error, drift_mps=_drift, for_s=duration_s(2.0)),
     ),
     Fault(
         "estimate-nan",
         "position, velocity: NaN",
-        drawn(e.log_reads, names=STATE, value=math.nan, for_s=lasting(0.02)),
+        effect(e.log_reads, names=STATE, value=math.nan, for_s=duration_s(0.02)),
     ),
     Fault(
         "external-position",
@@ -342,67 +347,69 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "external-occluded",
         "the body is hidden",
-        drawn(e.external_positions, how="occluded", for_s=either(0.5, 0.3, lasting(0.5))),
+        effect(e.external_positions, how="occluded", for_s=either(0.5, 0.3, duration_s(0.5))),
     ),
     Fault("external-swapped", "another body takes its name", wrong_positions("swapped")),
     Fault("external-scaled", "positions in millimetres", wrong_positions("millimetres")),
     Fault(
         "external-late",
         "positions come 50 to 150 ms later than they say",
-        drawn(e.external_positions, how="late", late_s=log_between(0.05, 0.15), for_s=lasting(1.0)),
+        effect(
+            e.external_positions, how="late", late_s=log_uniform(0.05, 0.15), for_s=duration_s(1.0)
+        ),
     ),
     # Power and motors.
     Fault(
         "battery-sags",
         "loses 0.2 to 0.6 V at 10 to 100 mV/s",
-        drawn(e.battery_sags, rate_vps=log_between(0.01, 0.1), by_v=between(0.2, 0.6)),
+        effect(e.battery_sags, rate_vps=log_uniform(0.01, 0.1), by_v=uniform(0.2, 0.6)),
     ),
-    Fault("battery-reading-frozen", "its reading stands still", frozen("pm.vbat")),
+    Fault("battery-reading-frozen", "its reading stands still", frozen_logs("pm.vbat")),
     Fault("battery-low", "its reading is low", either(0.5, LOW_VOLTAGE, LOW_STATE)),
-    Fault("motor-weak", "one motor gives 15 % less", drawn(e.thrust_changed, to=_one_weak_motor)),
+    Fault("motor-weak", "one motor gives 15 % less", effect(e.thrust_changed, to=_one_weak_motor)),
     # What pushes.
     Fault("kick", "a blow of 0.2 to 1 m/s", KICK),
     Fault("gust", "5 to 20 % of the weight, for 0.5 to 1 s", GUST),
     # The magnet.
-    Fault("no-magnet", "nothing holds", drawn(e.magnet_holds, of_weight=0.0), AT_CONTACT),
+    Fault("no-magnet", "nothing holds", effect(e.magnet_holds, of_weight=0.0), AT_CONTACT),
     Fault("weak-magnet", "carries 0.2 to 1.1 of the weight", WEAK_MAGNET, AT_CONTACT),
     Fault(
         "magnet-lets-go",
         "lets go 1 to 25 s after the contact",
-        drawn(e.magnet_lets_go, after_s=log_between(1.0, 25.0)),
+        effect(e.magnet_lets_go, after_s=log_uniform(1.0, 25.0)),
         AT_CONTACT,
     ),
     # The room and the target.
     Fault(
         "ceiling-beside-its-plane",
         "the target lies 2 to 20 cm above or below it",
-        drawn(e.room, target_above_ceiling_m=signed(log_between(0.02, 0.2))),
+        effect(e.room, target_above_ceiling_m=signed(log_uniform(0.02, 0.2))),
         FROM_THE_START,
     ),
     Fault(
         "ceiling-unusual",
         "at 1.1 to 1.6 m or at 2.7 to 3.4 m",
-        drawn(e.room, ceiling_z_m=either(0.5, between(1.1, 1.6), between(2.7, 3.4))),
+        effect(e.room, ceiling_z_m=either(0.5, uniform(1.1, 1.6), uniform(2.7, 3.4))),
         FROM_THE_START,
     ),
-    Fault("bare-ceiling", "no target", drawn(e.room, no_target=True), FROM_THE_START),
+    Fault("bare-ceiling", "no target", effect(e.room, no_target=True), FROM_THE_START),
     Fault(
         "low-bare-ceiling",
         "no target, at 0.35 to 1.3 m",
-        drawn(e.room, ceiling_z_m=between(0.35, 1.3), no_target=True),
+        effect(e.room, ceiling_z_m=uniform(0.35, 1.3), no_target=True),
         FROM_THE_START,
     ),
-    Fault("target-moves", "by 0.3 m", drawn(e.target_moves, by_m=_a_step_aside), TARGET_SEEN),
+    Fault("target-moves", "by 0.3 m", effect(e.target_moves, by_m=_a_step_aside), TARGET_SEEN),
     Fault(
         "second-target",
         "the same sheet 0.35 to 1.2 m away",
-        drawn(e.room, neighbours=_beside),
+        effect(e.room, neighbours=_beside),
         FROM_THE_START,
     ),
     Fault(
         "camera-turned",
         "mounted 90, 180 or -90 deg off",
-        drawn(e.room, T_body_cam_true=_turned_camera),
+        effect(e.room, T_body_cam_true=_turned_camera),
         FROM_THE_START,
     ),
     # The operator.
@@ -410,48 +417,54 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "operator-twice",
         "Ctrl-C, and again 0.6 to 10 s later",
-        drawn(e.operator, presses_s=(0.0, log_between(0.6, 10.0))),
+        effect(e.operator, presses_s=(0.0, log_uniform(0.6, 10.0))),
     ),
     Fault(
         "operator-held",
         "Ctrl-C held for 0.1 to 1.8 s: it repeats every 30 ms",
-        drawn(e.operator, presses_s=presses(0.03, log_between(0.1, 1.8))),
+        effect(e.operator, presses_s=key_presses(0.03, log_uniform(0.1, 1.8))),
     ),
-    Fault("hang-up", "the terminal is closed", drawn(e.operator, presses_s=(0.0,), hang_up=True)),
+    Fault("hang-up", "the terminal is closed", effect(e.operator, presses_s=(0.0,), hang_up=True)),
     # The program.
-    Fault("killed", "killed at once", drawn(e.killed)),
-    Fault("suspended", "suspended for 0.3 to 5 s", drawn(e.suspended, for_s=log_between(0.3, 5.0))),
+    Fault("killed", "killed at once", effect(e.killed)),
+    Fault(
+        "suspended", "suspended for 0.3 to 5 s", effect(e.suspended, for_s=log_uniform(0.3, 5.0))
+    ),
     Fault("hung", "the loop is stuck", HUNG),
     Fault(
         "slow",
         "turns take 0.1 to 0.4 s",
-        drawn(e.slow, tick_s=between(0.1, 0.4), for_s=lasting(0.5)),
+        effect(e.slow, tick_s=uniform(0.1, 0.4), for_s=duration_s(0.5)),
     ),
-    Fault("disk-full", "the log cannot be written", drawn(e.disk_full, for_s=lasting())),
+    Fault("disk-full", "the log cannot be written", effect(e.disk_full, for_s=duration_s())),
     # Readings that stand still.
-    Fault("position-frozen", "position, velocity stand still", frozen(*STATE)),
+    Fault("position-frozen", "position, velocity stand still", frozen_logs(*STATE)),
     Fault(
         "attitude-frozen",
         "roll, pitch and yaw stand still",
-        frozen("stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw"),
+        frozen_logs("stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw"),
     ),
     Fault(
-        "acceleration-frozen", "the acceleration stands still", frozen("acc.x", "acc.y", "acc.z")
+        "acceleration-frozen",
+        "the acceleration stands still",
+        frozen_logs("acc.x", "acc.y", "acc.z"),
     ),
-    Fault("thrust-frozen", "the thrust stands still", frozen("stabilizer.thrust")),
-    Fault("supervisor-frozen", "the supervisor's word stands still", frozen("supervisor.info")),
+    Fault("thrust-frozen", "the thrust stands still", frozen_logs("stabilizer.thrust")),
+    Fault(
+        "supervisor-frozen", "the supervisor's word stands still", frozen_logs("supervisor.info")
+    ),
     # What nothing announces.
     Fault(
         "thrust-changed",
         "hovers with up to 8 % more or less",
-        drawn(e.thrust_changed, to=_another_thrust),
+        effect(e.thrust_changed, to=_another_thrust),
     ),
     Fault("external-mirrored", "positions come mirrored", wrong_positions("mirrored")),
-    Fault("exception", "an exception ends the loop", drawn(e.raises)),
+    Fault("exception", "an exception ends the loop", effect(e.raises)),
     Fault(
         "operator-hammers",
         "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s",
-        drawn(e.operator, presses_s=presses(between(0.08, 0.25), between(2.5, 4.0))),
+        effect(e.operator, presses_s=key_presses(uniform(0.08, 0.25), uniform(2.5, 4.0))),
     ),
     # Two at once.
     Fault("covered-and-kick", "a blow; the target is hidden", (COVERED, KICK), BY_CAMERA),
@@ -472,13 +485,13 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "latency-falls",
         "pictures come 100 to 200 ms sooner than before",
-        drawn(e.camera_fault, kind="sooner", for_s=e.FOR_EVER, late_s=between(0.1, 0.2)),
+        effect(e.camera_fault, kind="sooner", for_s=e.FOR_EVER, late_s=uniform(0.1, 0.2)),
     ),
-    Fault("brown-out", "the vehicle starts again", drawn(e.reboots, boots_s=between(0.5, 1.5))),
+    Fault("brown-out", "the vehicle starts again", effect(e.reboots, boots_s=uniform(0.5, 1.5))),
     Fault(
         "deck-silent",
         "the deck's positions end",
-        drawn(e.deck_silent, for_s=lasting(0.3), acc_z_mps2=signed(between(0.03, 0.08))),
+        effect(e.deck_silent, for_s=duration_s(0.3), acc_z_mps2=signed(uniform(0.03, 0.08))),
     ),
 )
 
@@ -519,19 +532,21 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
     rng = np.random.default_rng([seed, STREAM])
     fault = faults[int(rng.integers(len(faults)))]
     phase = fault.phases[int(rng.integers(len(fault.phases)))]
-    return case_of(fault, phase, rng, scenario)
+    return draw_fault_case(fault, phase, rng, scenario)
 
 
-def case_of(fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario) -> Case:
+def draw_fault_case(
+    fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario
+) -> Case:
     """Return a case of the given fault and phase with everything else drawn."""
     source = DrawInputs(rng, scenario)
-    moment_s = between(0.0, USUAL_S[phase])(source)
+    moment_s = uniform(0.0, USUAL_S[phase])(source)
     effects = _value(fault.draw, source)
     landed_from, after_s, first_hold = None, 0.0, None
     if phase is Phase.LANDING:
         landed_from = one_of(*LANDED_FROM)(source)
-        after_s = between(0.0, USUAL_S[landed_from])(source)
+        after_s = uniform(0.0, USUAL_S[landed_from])(source)
     if phase is Phase.RECOVER:
-        first_hold = between(0.0, 0.6)(source)
+        first_hold = uniform(0.0, 0.6)(source)
     several = effects if isinstance(effects, tuple) else (effects,)
     return Case(fault, phase, moment_s, several, landed_from, after_s, first_hold)

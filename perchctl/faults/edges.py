@@ -23,7 +23,7 @@ from perchctl.vision import Frame
 # --- The radio: what arrives, what does not, and what comes late ------
 
 
-def order_of(packet: Packet) -> str:
+def packet_kind(packet: Packet) -> str:
     """Return the kind of a packet, by which a fault names it, or the empty string."""
     kind = packet.data[0] if packet.data else None
     match packet.port, packet.channel, kind:
@@ -68,7 +68,7 @@ class FaultyRadio(Radio):
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
         if self.cut or not self._air.uplink_arrives(packet, now_s):
             return False
-        order = order_of(packet)
+        order = packet_kind(packet)
         if self.lost.get(order, 0) > 0:
             self.lost[order] -= 1
             return False
@@ -282,7 +282,7 @@ class Edges:
     each: list[Callable[[float], None]] = field(default_factory=list)
     _later: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
 
-    def at(self, t_s: float, act: Callable[[], None]) -> None:
+    def call_at(self, t_s: float, act: Callable[[], None]) -> None:
         """Call a function at that time."""
         self._later.append((t_s, act))
         self._later.sort(key=lambda entry: entry[0])
@@ -290,9 +290,9 @@ class Edges:
     def set_until(self, end_s: float, owner: Any, name: str, value: Any, after: Any) -> None:
         """Set an attribute now, and set it to `after` at `end_s`."""
         setattr(owner, name, value)
-        self.at(end_s, partial(setattr, owner, name, after))
+        self.call_at(end_s, partial(setattr, owner, name, after))
 
-    def pass_time(self, t_s: float) -> None:
+    def call_due(self, t_s: float) -> None:
         """Call what is due by then, and each function of `each`; called every `SAMPLE_S`."""
         while self._later and self._later[0][0] <= t_s:
             self._later.pop(0)[1]()

@@ -23,7 +23,7 @@ Axes = tuple[float, float, float]
 """World axes."""
 FOR_EVER = 1e6
 SAMPLE_S = 0.01
-"""Between two calls of `Injector.each` and `Edges.pass_time`."""
+"""Between two calls of `Injector.each` and `Edges.call_due`."""
 LIGHTHOUSE = "deck.bcLighthouse4"
 CAPTURE_FAULTS = {
     "frozen": CaptureFault(frozen=True),
@@ -53,7 +53,7 @@ def radio_loss(
 
 
 def packet_lost(edges: Edges, t_s: float, order: str, count: int) -> None:
-    """Lose the next `count` packets of an order (`order_of` of `perchctl.faults.edges`)."""
+    """Lose the next `count` packets of an order (`packet_kind` of `perchctl.faults.edges`)."""
     edges.radio.lost[order] = count
 
 
@@ -84,7 +84,7 @@ def external_positions(
     """Let the motion capture by which a vehicle without a deck flies fail as `CAPTURE_FAULTS` has
     it, or be late by `late_s`."""
     assert edges.vehicle.capture is not None
-    edges.vehicle.capture.lay(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
+    edges.vehicle.capture.begin_fault(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
 
 
 def deck_silent(edges: Edges, t_s: float, for_s: float, acc_z_mps2: float) -> None:
@@ -128,7 +128,7 @@ def log_reads(
     firmware = edges.vehicle.firmware
     for name in names:
         firmware.log_overrides[name] = firmware.log_value(name) if value is None else value
-    edges.at(t_s + for_s, firmware.log_overrides.clear)
+    edges.call_at(t_s + for_s, firmware.log_overrides.clear)
 
 
 def battery_sags(edges: Edges, t_s: float, rate_vps: float, by_v: float) -> None:
@@ -183,7 +183,7 @@ def target_moves(edges: Edges, t_s: float, by_m: tuple[float, float]) -> None:
 def operator(edges: Edges, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False) -> None:
     """Let the operator press Ctrl-C at these times, or close the terminal (`hang_up`)."""
     for press_s in presses_s:
-        edges.at(t_s + press_s, edges.hang_up if hang_up else edges.press)
+        edges.call_at(t_s + press_s, edges.hang_up if hang_up else edges.press)
 
 
 def killed(edges: Edges, t_s: float) -> None:
@@ -326,4 +326,4 @@ def _measure(edges: Edges, noise: random.Random, _now_s: float) -> None:
     world, firmware = edges.vehicle.world, edges.vehicle.firmware
     sigma_m = firmware.scenario.estimate_noise_m
     x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
-    firmware.estimator.external((x_m, y_m, z_m))
+    firmware.estimator.take_external((x_m, y_m, z_m))

@@ -42,7 +42,7 @@ class ExpectedOutcome:
 
 
 def _killed_in_landing(facts: Facts) -> float | None:
-    return facts.killed_s if facts.does(killed) and facts.own_landing else None
+    return facts.killed_s if facts.has_effect(killed) and facts.own_landing else None
 
 
 def _let_go_later(facts: Facts) -> float | None:
@@ -55,17 +55,17 @@ def _too_low(facts: Facts) -> float | None:
 
 def _knocked_off(facts: Facts) -> float | None:
     slipped_s, begin_s = facts.slipped_s, facts.begin_s
-    if slipped_s is None or begin_s is None or not (facts.toppled and facts.does(push)):
+    if slipped_s is None or begin_s is None or not (facts.toppled and facts.has_effect(push)):
         return None
     return slipped_s if 0.0 <= slipped_s - begin_s <= PUSHED_OFF_S else None
 
 
 def _too_weak(facts: Facts) -> float | None:
-    return facts.weak_s if facts.does(thrust_changed) else None
+    return facts.weak_s if facts.has_effect(thrust_changed) else None
 
 
 def _sagged_too_fast(facts: Facts) -> float | None:
-    if facts.weak_s is None or not facts.does(battery_sags):
+    if facts.weak_s is None or not facts.has_effect(battery_sags):
         return None
     down_s = NOTICED_S + facts.low_m / DOWN_MPS
     in_time = facts.low_s is not None and facts.weak_s - facts.low_s >= down_s
@@ -128,7 +128,7 @@ EXPECTED_OUTCOMES = (
 )
 
 
-def unexpected(flags: Mapping[Flag, float], facts: Facts) -> tuple[Flag, ...]:
+def unexpected_flags(flags: Mapping[Flag, float], facts: Facts) -> tuple[Flag, ...]:
     """Return the flags that no expected outcome covers: those that count."""
     return tuple(
         flag

@@ -20,23 +20,23 @@ from perchctl.faults.edges import (
     PlantedError,
     ProgramKilled,
 )
-from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES, unexpected
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES, unexpected_flags
 from perchctl.faults.oracle import (
     REFUSAL_CLAIMS,
     Oracle,
     Sample,
-    claims_of,
-    claims_of_rescue,
-    last_row,
+    last_transition,
+    report_claims,
+    rescue_claims,
 )
 from perchctl.faults.results import FaultResult
 from perchctl.faults.truth import (
     DescentBound,
     FactsRecorder,
-    PlaceBound,
-    UnfeltDrift,
+    PositionBound,
+    UndetectedDrift,
     WatchedVehicle,
-    sample_of,
+    true_sample,
 )
 from perchctl.flight import (
     FlightParts,
@@ -49,7 +49,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.profile import Profile
-from perchctl.record import LogWatcher, to_exact
+from perchctl.record import LogWatcher, to_exact_json
 from perchctl.sim import Scenario, draw_capture
 from perchctl.vision import make_pipeline
 
@@ -111,9 +111,9 @@ class FaultyFlight:
         )
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
         self._oracle = Oracle(safety.max_height_m, safety.max_tilt_deg, radius_m)
-        self._place_bound = PlaceBound(scenario, profile)
+        self._place_bound = PositionBound(scenario, profile)
         by_target = profile.positioning.by == "target"
-        self._drift = UnfeltDrift(case.effects, scenario, by_target=by_target)
+        self._drift = UndetectedDrift(case.effects, scenario, by_target=by_target)
         self._descent_bound = DescentBound(case.effects, profile)
         self._facts = FactsRecorder(vehicle, profile, case.effects)
         self._touched = False  # the ceiling, since the fault began
@@ -132,9 +132,9 @@ class FaultyFlight:
             end, reason, report = "gone", "", None
         self._vehicle.camera = None
         end_s = self._link.now_s
-        self._oracle.ended(end_s, crashed=self._crashed, endless=self._clock.endless)
+        self._oracle.note_end(end_s, crashed=self._crashed, endless=self._clock.endless)
         self._vehicle.advance_to(end_s + AFTER_S)
-        if self._oracle.in_the_air:
+        if self._oracle.is_airborne:
             self._vehicle.advance_to(end_s + AFTER_IN_THE_AIR_S)
         return self._result(end, reason, report, end_s)
 
@@ -145,7 +145,7 @@ class FaultyFlight:
 
     def event(self, event: Event) -> None:
         """Give the claims of a rescue's note to the oracle."""
-        self._oracle.claims(claims_of_rescue(event), event.t_s)
+        self._oracle.add_claims(rescue_claims(event), event.t_s)
 
     def _mission(self) -> tuple[str, str, FlightReport | None]:
         try:
@@ -154,42 +154,42 @@ class FaultyFlight:
             return "failed", str(error), None
         except Exception as error:
             if isinstance(error, PerchError) and self._injector.flown is None:
-                self._oracle.claims(REFUSAL_CLAIMS, self._link.now_s)
+                self._oracle.add_claims(REFUSAL_CLAIMS, self._link.now_s)
                 return "refused", str(error), None
             self._crashed = True
             return "failed", f"{type(error).__name__}: {error}", None
         self._vehicle.camera = None  # nobody looks any more
-        self._oracle.claims(claims_of(report), self._link.now_s)
+        self._oracle.add_claims(report_claims(report), self._link.now_s)
         return END_OF[report.phase], report.reason, report
 
     def _press(self) -> None:
-        self._oracle.pressed(self._link.now_s)
+        self._oracle.note_press(self._link.now_s)
         self._switch.press()
 
     def _each(self, t_s: float) -> None:
         for injector in self._injectors:
             injector.each(t_s)
-        self._edges.pass_time(t_s)
+        self._edges.call_due(t_s)
         self._facts.begin_s = self._injector.begin_s
         sample = self._sample(t_s)
-        self._oracle.see(sample)
-        self._facts.see(sample)
+        self._oracle.update(sample)
+        self._facts.update(sample)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.floor and not sample.motors_on:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
 
     def _sample(self, t_s: float) -> Sample:
-        sample, world = sample_of(self._vehicle), self._vehicle.world
+        sample, world = true_sample(self._vehicle), self._vehicle.world
         begin_s, phase = self._injector.begin_s, self._injector.flown
         place = (sample.x_m, sample.y_m)
         if not self._scenario.no_target:
-            self._place_bound.target_at(world.magnet.target_xy_m)
+            self._place_bound.add_target(world.magnet.target_xy_m)
         self._place_bound.enter(phase, place)
         astray_m = self._place_bound.astray_m(place)
         if begin_s is not None:
             self._descent_bound.begin(begin_s, phase)
-            astray_m -= self._drift.after_m(t_s - begin_s, phase)
-            self._touched = self._touched or sample.hanging or world.contacts()[0] > 0.0
+            astray_m -= self._drift.update_m(t_s - begin_s, phase)
+            self._touched = self._touched or sample.hanging or world.contact_state()[0] > 0.0
         uplink = not self._is_suspended(t_s) and self._radio.uplink_arrives(PROBE, t_s)
         overdue = self._descent_bound.is_overdue(
             t_s,
@@ -199,7 +199,7 @@ class FaultyFlight:
             uplink=uplink,
             lands=self._vehicle.firmware.planner.active,
         )
-        wrong = begin_s is not None and self._facts.does(e.log_reads)
+        wrong = begin_s is not None and self._facts.has_effect(e.log_reads)
         heard = not wrong and all(self._is_heard(block, t_s) for block in MockLink.FAST_BLOCKS)
         return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
 
@@ -231,12 +231,12 @@ class FaultyFlight:
             outcome=end,
             reason=reason,
             flags=oracle.flags,
-            counted=unexpected(oracle.flags, facts),
+            counted=unexpected_flags(oracle.flags, facts),
             time_s=end_s,
             miss_m=self._vehicle.world.gear_miss_m() if perched else None,
             drop_m=oracle.drop_m,
             way=() if report is None else tuple(x.phase.value for x in report.history if x.phase),
-            row="" if report is None else last_row(report),
+            row="" if report is None else last_transition(report),
             expected=tuple(x.name for x in EXPECTED_OUTCOMES if x.cause(facts) is not None),
             astray_m=oracle.astray_m,
         )
@@ -286,7 +286,7 @@ def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
 
 
 def _parameters(case: Case) -> dict[str, Any]:
-    found = {effect.func.__name__: to_exact(effect.keywords) for effect in case.effects}
+    found = {effect.func.__name__: to_exact_json(effect.keywords) for effect in case.effects}
     if case.landed_from is not None:
         found["landed_from"] = case.landed_from.value
         found["landed_after_s"] = case.landed_after_s

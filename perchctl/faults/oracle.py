@@ -114,7 +114,7 @@ class _Lasting:
     def __init__(self, for_s: float) -> None:
         self._for_s, self._since_s = for_s, math.inf
 
-    def see(self, holds: bool, t_s: float) -> bool:
+    def update(self, holds: bool, t_s: float) -> bool:
         self._since_s = min(self._since_s, t_s) if holds else math.inf
         return self.holds(t_s)
 
@@ -170,15 +170,15 @@ class Oracle:
         self._muted_s = -math.inf  # when last nothing arrived
         self._end_s = math.inf
 
-    def claims(self, claims: Iterable[Claim], t_s: float) -> None:
+    def add_claims(self, claims: Iterable[Claim], t_s: float) -> None:
         """Note claims that the program made at `t_s`."""
         self._claims |= dict.fromkeys(claims, t_s)
 
-    def pressed(self, t_s: float) -> None:
+    def note_press(self, t_s: float) -> None:
         """Note that the operator pressed Ctrl-C."""
         self._presses_s.append(t_s)
 
-    def ended(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
+    def note_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
         """Note that the program ended: `crashed` by an exception that no fault planted,
         `endless` if it had to be ended from outside."""
         self._end_s = t_s
@@ -192,7 +192,7 @@ class Oracle:
         """The time at which the operator asked for the emergency stop, or None."""
         return second_press_s(self._presses_s)
 
-    def see(self, s: Sample) -> None:
+    def update(self, s: Sample) -> None:
         """Judge the next sample."""
         self.newest = s
         if s.hanging:
@@ -211,7 +211,7 @@ class Oracle:
         self._before = s
 
     @property
-    def in_the_air(self) -> bool:
+    def is_airborne(self) -> bool:
         """True if the vehicle flies or falls."""
         s = self.newest
         return s is not None and _airborne(s) and not (s.hanging and not s.motors_on)
@@ -225,8 +225,8 @@ class Oracle:
 
     def _watch_unpowered(self, s: Sample) -> None:
         free = _airborne(s) and not s.hanging and not self._from_hanging(s)
-        unpowered = self._unpowered.see(free and not s.motors_on, s.t_s)
-        weightless = self._weightless.see(free and s.acc_g < FREE_FALL_G, s.t_s)
+        unpowered = self._unpowered.update(free and not s.motors_on, s.t_s)
+        weightless = self._weightless.update(free and s.acc_g < FREE_FALL_G, s.t_s)
         if unpowered or weightless:
             self._raise("fell", s.t_s)
 
@@ -248,7 +248,7 @@ class Oracle:
         too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
         if unpowered and (too_deep or s.floor):
             self._raise("fell", s.t_s)
-        slow_again = fall.slow.see(sinking < FAST_MPS, s.t_s)
+        slow_again = fall.slow.update(sinking < FAST_MPS, s.t_s)
         caught = sinking < CAUGHT_MPS or slow_again
         if s.floor or caught:
             self._fall = None
@@ -267,7 +267,7 @@ class Oracle:
     def _watch_pressing(self, s: Sample) -> None:
         if s.pressing:
             self._press_s = s.t_s
-        if self._pressed.see(s.t_s - self._press_s <= RELEASED_S, s.t_s) and s.pressing:
+        if self._pressed.update(s.t_s - self._press_s <= RELEASED_S, s.t_s) and s.pressing:
             self._raise("pressed", s.t_s)
 
     def _watch_place(self, s: Sample) -> None:
@@ -288,7 +288,7 @@ class Oracle:
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
         at_rest = not s.motors_on and (s.hanging or not _airborne(s))
-        self._seen_down.see(at_rest and s.heard, s.t_s)
+        self._seen_down.update(at_rest and s.heard, s.t_s)
         for claim, claimed_s in list(self._claims.items()):
             if self._is_true(claim, s):
                 del self._claims[claim]
@@ -384,19 +384,19 @@ REFUSAL_CLAIMS: Claims = {"stands"}
 """A refusal claims that no motor was started."""
 
 
-def last_row(report: FlightReport) -> str:
+def last_transition(report: FlightReport) -> str:
     """Return the name of the transition that ended the flight; empty without one."""
     return report.history[-1].row if report.history else ""
 
 
-def claims_of(report: FlightReport) -> Claims:
+def report_claims(report: FlightReport) -> Claims:
     """Return all claims that a report makes about the vehicle."""
-    claims = ROW_CLAIMS.get(last_row(report), set()) | PHASE_CLAIMS.get(report.phase, set())
+    claims = ROW_CLAIMS.get(last_transition(report), set()) | PHASE_CLAIMS.get(report.phase, set())
     locked = {"locked"} if report.locked else set()
     return claims | OUTCOME_CLAIMS[report.outcome] | locked
 
 
-def claims_of_rescue(event: Event) -> Claims:
+def rescue_claims(event: Event) -> Claims:
     """Return the claims of a rescue's note; none for any other event."""
     if not event.is_rescue:
         return set()

@@ -35,7 +35,7 @@ class FaultResult(CampaignFlight):
         expected: the names of the expected outcomes whose cause came, whether or not a flag was
             raised.
         begin_s: when the fault began; None when the flight was over before.
-        row: of the mission's table, that ended the flight; empty where none did.
+        row: name of the mission's transition that ended the flight; empty without one.
         drop_m: the deepest fall until caught, in the simulation's truth.
         astray_m: in the air, the farthest from where it should have been.
     """

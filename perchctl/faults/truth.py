@@ -19,7 +19,7 @@ from perchctl.sim import (
     CaptureSettings,
     Scenario,
     SimulatedVehicle,
-    most_thrust_n,
+    max_thrust_n,
 )
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
@@ -52,7 +52,7 @@ class WatchedVehicle(SimulatedVehicle):
                 self.each(self.t_s)
 
 
-def sample_of(vehicle: SimulatedVehicle) -> Sample:
+def true_sample(vehicle: SimulatedVehicle) -> Sample:
     """Return the true state of the vehicle now; the fields that depend on the fault stay at
     their defaults."""
     world, firmware = vehicle.world, vehicle.firmware
@@ -60,7 +60,7 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
     _, qx, qy, _ = world.quaternion
     up_z = 1.0 - 2.0 * (qx * qx + qy * qy)
     target_z_m = vehicle.scenario.ceiling_z_m + vehicle.scenario.target_above_ceiling_m
-    ceiling_n, floor = world.contacts()
+    ceiling_n, floor = world.contact_state()
     motors_on = max(firmware.motors) > 0.0
     lift_n = sum(world.powertrain.forces_n)
     pushing = motors_on and (
@@ -140,7 +140,7 @@ class Facts:
     low_s: float | None = None
     low_m: float = 0.0
 
-    def does(self, act: Callable[..., None]) -> bool:
+    def has_effect(self, act: Callable[..., None]) -> bool:
         """Return True if that is one of the effects."""
         return any(effect.func is act for effect in self.effects)
 
@@ -162,14 +162,14 @@ class FactsRecorder(Facts):
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
 
-    def see(self, s: Sample) -> None:
+    def update(self, s: Sample) -> None:
         """Note the next sample; `begin_s` is set by then if the fault has begun."""
         before = self._before
         self._note_silence(s)
         self._note_hanging(s)
         if self.begin_s is not None:
             flew = before is not None and before.motors_on and not before.floor
-            if not self._begun and flew and self.does(e.reboots):
+            if not self._begun and flew and self.has_effect(e.reboots):
                 self.rebooted_s = self.begin_s
             self._begun = True
             self._note_power(s)
@@ -210,7 +210,7 @@ class FactsRecorder(Facts):
         weakest motor gives."""
         vehicle, world = self._vehicle, self._vehicle.world
         weakest = min(world.powertrain.strength or (1.0,))
-        lift_n = min(4.0 * MOTOR_FORCE_N, weakest * most_thrust_n(world.battery_rest_v))
+        lift_n = min(4.0 * MOTOR_FORCE_N, weakest * max_thrust_n(world.battery_rest_v))
         weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
         if self.weak_s is None and lift_n < LEAST_LIFT * weight_n:
             self.weak_s = s.t_s
@@ -245,7 +245,7 @@ LOW_M = 0.3
 """Where a landing hands over, and slows down."""
 
 
-class PlaceBound:
+class PositionBound:
     """The horizontal places where the vehicle may be, by phase: above its start (or
     `planner.approach_xy_m`) during take-off; on the way between there and a target in search,
     estimate, alignment and recovery; under a target in ascent, press and completion; and from the
@@ -257,11 +257,11 @@ class PlaceBound:
     def __init__(self, scenario: Scenario, profile: Profile) -> None:
         approach = profile.planner.approach_xy_m
         self._starts: list[Place] = [] if approach is None else [approach]
-        self._targets = list(targets_of(scenario))
+        self._targets = list(target_places(scenario))
         self._phase: Phase | None = None
         self._down_at: Place | None = None
 
-    def target_at(self, place: Place) -> None:
+    def add_target(self, place: Place) -> None:
         """Add a place at which a target hangs."""
         if place not in self._targets:
             self._targets.append(place)
@@ -302,7 +302,7 @@ def _nearest_between(a: Place, b: Place, place: Place) -> Place:
     return a[0] + part * dx, a[1] + part * dy
 
 
-def targets_of(scenario: Scenario) -> list[Place]:
+def target_places(scenario: Scenario) -> list[Place]:
     """Return the places of the own target and of those that look like it; none if there is none."""
     if scenario.no_target:
         return []
@@ -316,7 +316,7 @@ def targets_of(scenario: Scenario) -> list[Place]:
     return found
 
 
-class UnfeltDrift:
+class UndetectedDrift:
     """How far (m) a fault may push the vehicle sideways with no sensor noticing.
 
     A drift of the estimate counts while the vehicle does not steer by a visible target. A force
@@ -339,7 +339,7 @@ class UnfeltDrift:
         ]
         self._slid_m = self._fault_s = 0.0
 
-    def after_m(self, fault_s: float, phase: Phase | None) -> float:
+    def update_m(self, fault_s: float, phase: Phase | None) -> float:
         """Return the distance so far, `fault_s` after the fault began; call it with rising
         times."""
         before_s, self._fault_s = self._fault_s, fault_s

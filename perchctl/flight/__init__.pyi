@@ -12,4 +12,4 @@ from .preflight import out_of_view as out_of_view
 from .session import FlyOptions as FlyOptions
 from .session import check_options as check_options
 from .session import fly_session as fly_session
-from .session import simulated_vehicle as simulated_vehicle
+from .session import start_simulated_vehicle as start_simulated_vehicle

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.errors import distinct_figures
+from perchctl.errors import distinct_texts
 from perchctl.geometry import (
     nearest_axis,
     rotation_from_quaternion,
@@ -73,11 +73,11 @@ class GroundCriteria:
     profile: Profile
 
     @property
-    def forbidden(self) -> Problem | None:
-        """A supervisor's report that waiting will not mend."""
+    def supervisor_fault(self) -> Problem | None:
+        """A fault that the supervisor reports and that waiting does not cure, such as a crash."""
         raw = f"0x{self.telemetry.supervisor:04X}"
         for bit, what, advice in _FORBIDDEN:
-            if self.telemetry.has(bit):
+            if self.telemetry.has_bit(bit):
                 return Problem(f"the vehicle {what} (supervisor {raw})", advice)
         if self.telemetry.supervisor & ~KNOWN_SUPERVISOR_BITS:
             return Problem(
@@ -87,26 +87,26 @@ class GroundCriteria:
         return None
 
     @property
-    def not_allowed(self) -> Problem | None:
+    def supervisor_not_ready(self) -> Problem | None:
         """A supervisor that does not allow flight (yet)."""
-        if self.telemetry.has(CAN_FLY):
+        if self.telemetry.has_bit(CAN_FLY):
             return None
         return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart it")
 
     @property
-    def battery(self) -> Problem | None:
+    def battery_too_low(self) -> Problem | None:
         """A battery too low to take off; a missing reading is no problem here."""
         rests_v, needed_v = self.telemetry.battery_v, self.profile.safety.min_rest_v
         if not NO_BATTERY_READING_V <= rests_v < needed_v:
             return None
-        rests, needed = distinct_figures(rests_v, needed_v, 2)
+        rests, needed = distinct_texts(rests_v, needed_v, 2)
         return Problem(
             f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
             "charge it",
         )
 
     @property
-    def unsettled(self) -> Problem | None:
+    def estimate_unsettled(self) -> Problem | None:
         """A state estimate whose variance is too large, or no number."""
         variance = self.telemetry.position_variance_m2
         most = self.profile.safety.estimator_variance_m2
@@ -115,11 +115,11 @@ class GroundCriteria:
         advice = "is there a positioning system?"
         if self.profile.positioning.by == "target":
             advice = "do the positions arrive, and does the target stay in view?"
-        found, allowed = distinct_figures(variance, most, 2)
+        found, allowed = distinct_texts(variance, most, 2)
         return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
 
     @property
-    def height(self) -> Problem | None:
+    def off_ground(self) -> Problem | None:
         """A vehicle off the ground by its settled estimate: it hangs, or is held."""
         return self._off_the_ground(
             self.telemetry.position_m[2],
@@ -143,18 +143,18 @@ class GroundCriteria:
         return math.degrees(float(angles_rad.max()))
 
     @property
-    def tilt(self) -> Problem | None:
+    def not_level(self) -> Problem | None:
         """A vehicle that does not stand level enough to take off."""
         most_deg = self.profile.safety.start_tilt_deg
         if self.tilt_deg <= most_deg:
             return None
-        found, allowed = distinct_figures(self.tilt_deg, most_deg, 0)
+        found, allowed = distinct_texts(self.tilt_deg, most_deg, 0)
         return Problem(
             f"tilted by {found} deg, at most {allowed} allowed", "put it on level ground"
         )
 
     @property
-    def motion(self) -> Problem | None:
+    def not_still(self) -> Problem | None:
         """A vehicle that is moved or vibrates: its accelerometer does not read one g."""
         acc_z_g = self.telemetry.acc_z_g
         if abs(acc_z_g - 1.0) <= REST_ACC_G:
@@ -162,7 +162,7 @@ class GroundCriteria:
         return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
     @staticmethod
-    def unmeasured(decks: Sequence[str], profile: Profile) -> Problem | None:
+    def no_position_source(decks: Sequence[str], profile: Profile) -> Problem | None:
         """A vehicle without any position source, which would fly by a sum of accelerations."""
         config = profile.positioning
         if config.by != "deck" or {*decks} & {*POSITION_DECKS, *config.decks}:
@@ -176,20 +176,20 @@ class GroundCriteria:
         return Problem("no positioning deck", advice)
 
     @staticmethod
-    def too_near(target: TargetEstimate | None) -> Problem | None:
+    def target_too_near(target: TargetEstimate | None) -> Problem | None:
         """A target that is too near for a vehicle on the ground."""
         if target is None or not target.tracked:
             return None
         away_m = math.hypot(*(float(e) for e in target.e_m))
         if away_m >= WITHIN_REACH_M:
             return None
-        away, needed = distinct_figures(away_m, WITHIN_REACH_M, 2)
+        away, needed = distinct_texts(away_m, WITHIN_REACH_M, 2)
         return Problem(
             f"the target is only {away} m away, at least {needed} m are needed",
             "the vehicle hangs, or stands too close under it; take it down first",
         )
 
-    def world_problem(self, place: ExternalPosition) -> Problem | None:
+    def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
         """An external position in another unit, with another axis up, or elsewhere, which waiting
         will not mend. By the target the world is the vehicle's own, so only the fence counts."""
         x, y, z = place.position_m
@@ -207,7 +207,7 @@ class GroundCriteria:
             "swapped axes, another rigid body or zero, or millimetres: perchctl check --lift "
             "tells; safety.ground_z_m is the height that it has where it stands",
         )
-        return with_another_up(place, self.telemetry) or standing or self._unreachable(place)
+        return up_axis_problem(place, self.telemetry) or standing or self._unreachable(place)
 
     def _unreachable(self, place: ExternalPosition) -> Problem | None:
         """A place from which no flight reaches the expected target: perhaps another vehicle's."""
@@ -225,7 +225,7 @@ class GroundCriteria:
         )
 
 
-def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
+def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
     """Return the problem of a capture whose up is not the vehicle's, by its own attitude."""
     if place.quaternion is None:
         return None
@@ -252,13 +252,15 @@ def measurer(profile: Profile) -> str:
     return "the sight of the target" if by_target else "the motion capture"
 
 
-class AtRest:
+class RestCheck:
     """Finds a body that moves in the capture while the vehicle stands still: another's."""
 
     def __init__(self) -> None:
         self._from: ExternalPosition | None = None
 
-    def strange(self, place: ExternalPosition | None, profile: Profile) -> Problem | None:
+    def moved_body_problem(
+        self, place: ExternalPosition | None, profile: Profile
+    ) -> Problem | None:
         """Return the problem of a body that has moved since the vehicle stands still.
 
         To be called in each turn with fresh telemetry and a fresh position; `place` None begins

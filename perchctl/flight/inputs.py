@@ -11,13 +11,13 @@ from typing import ClassVar, Protocol, runtime_checkable
 from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
 from perchctl.mission import (
     ExternalPositions,
-    FrameSeen,
+    FrameRecord,
     Observation,
     PlannerState,
-    PoseSeen,
     SentCommand,
     Turn,
     TurnInputs,
+    UnfilteredPose,
     Watcher,
 )
 from perchctl.perception import (
@@ -26,7 +26,7 @@ from perchctl.perception import (
     add_samples,
     attitude_at,
 )
-from perchctl.positioning import FeedStatus, SightFeed
+from perchctl.positioning import FeedStatus, TargetFeed
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, SendPosition, Telemetry
@@ -41,7 +41,7 @@ from perchctl.vision import (
 HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
 
 
-class GivesTelemetry(Protocol):
+class TelemetrySource(Protocol):
     """The part of a `perchctl.link.Link` that is read here."""
 
     def telemetry(self) -> list[Telemetry]: ...
@@ -72,7 +72,7 @@ class FlightInputs:
     ENDED_TEXT: ClassVar = " has ended"
     """Follows the source's description in the camera's problem of a recording that is over."""
 
-    link: GivesTelemetry
+    link: TelemetrySource
     source: FrameSource
     pipeline: Pipeline
     profile: Profile
@@ -100,7 +100,7 @@ class FlightInputs:
     def history(self) -> History:
         return self.perception.history
 
-    def take_in(self, now_s: float, *, look: bool = True) -> None:
+    def poll_inputs(self, now_s: float, *, look: bool = True) -> None:
         """Take in telemetry and at most one frame. Without `look`, at the ceiling, the frame only
         shows that the camera lives."""
         perception, positioning = self.perception, self._positioning
@@ -111,10 +111,10 @@ class FlightInputs:
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
-        seen: FrameSeen | None = None
+        seen: FrameRecord | None = None
         if frame is not None:
             times_s = frame.t_s, frame.t_arrival_s
-            seen = FrameSeen(frame.index, *times_s, frame.fields, frame.repeated)
+            seen = FrameRecord(frame.index, *times_s, frame.fields, frame.repeated)
         self.taken = TurnInputs(
             tuple(samples),
             frame=seen,
@@ -145,7 +145,7 @@ class FlightInputs:
         if look:
             for _, self.output in perception.look(frame, used_s):
                 if positioning is not None and self._is_heard(now_s):
-                    positioning.see(perception.state.measured.surest, self.history, now_s)
+                    positioning.add_pose(perception.state.measured.surest, self.history, now_s)
         mirrored = perception.is_mirrored
         self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
 
@@ -158,7 +158,7 @@ class FlightInputs:
         newest = self.history.newest
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
-    def present(self, began_s: float, now_s: float) -> None:
+    def catch_up(self, began_s: float, now_s: float) -> None:
         """Take in what has arrived while camera or vision hung, since the tick of `began_s`."""
         late = self.link.telemetry()
         self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
@@ -189,17 +189,17 @@ class FlightInputs:
         )
 
     @property
-    def poses(self) -> dict[str, PoseSeen]:
+    def poses(self) -> dict[str, UnfilteredPose]:
         """The unfiltered poses of this tick's picture."""
         poses = {} if self.output is None else self.output.poses
-        return {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
+        return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
         """Return the target's estimate at the present. The filter coasts by frames: while none are
         searched, its target is a remembered place, and not tracked."""
         target = self.perception.target(now_s, spread=self.recorded)
         if self._positioning is not None:  # else the estimate runs away
-            target = self._positioning.steered(target, self.history)
+            target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.blind or stale):
             return replace(target, tracked=False)
@@ -243,7 +243,7 @@ class TargetPositioning:
     """The target as the positioning system of one flight."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
-        self.feed = SightFeed(send, profile, pipeline.pose)
+        self.feed = TargetFeed(send, profile, pipeline.pose)
         self._touches = False
 
     def begin(self, history: History, now_s: float, *, touches: bool) -> None:
@@ -252,25 +252,27 @@ class TargetPositioning:
         self._touches = touches
         if newest is None or not is_supported(history, now_s):
             return
-        touching_m = self.feed.touching(newest.yaw_rad)
+        touching_m = self.feed.contact_position(newest.yaw_rad)
         if touching_m is None:
-            self.feed.stand(now_s)
+            self.feed.send_origin(now_s)
         elif touches:
-            self.feed.known(touching_m, now_s)
+            self.feed.send_known(touching_m, now_s)
 
-    def see(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
+    def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
         """Send the position by a picture, unless the vehicle is pressed or hangs."""
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
         if then is not None and now is not None:
-            self.feed.see(pose, then, now, now_s, at_rest=is_supported(history, now_s))
+            self.feed.add_pose(pose, then, now, now_s, at_rest=is_supported(history, now_s))
 
-    def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
+    def with_fixed_target(
+        self, target: TargetEstimate | None, history: History
+    ) -> TargetEstimate | None:
         """Return the estimate with the target where it stands; as seen until its place is known."""
         newest = history.newest
         now = None if newest is None else attitude_at(history, newest.t_s)
-        return target if target is None or now is None else self.feed.steered(target, now)
+        return target if target is None or now is None else self.feed.with_fixed_target(target, now)
 
 
 def is_supported(history: History, now_s: float) -> bool:
@@ -289,7 +291,7 @@ def is_supported(history: History, now_s: float) -> bool:
 
 
 @runtime_checkable
-class LogKeeper(Watcher, Protocol):
+class TurnWatcher(Watcher, Protocol):
     """A watcher of all that a flight log holds: of the turns without a tick, too, which are those
     before take-off and those decided anew, and of what is sent in the loop's place."""
 
@@ -302,17 +304,17 @@ class LogKeeper(Watcher, Protocol):
 Decision = tuple[PlannerState, Command, FeedStatus | None]
 
 
-class Turns:
+class TurnReporter:
     """Counts the loop's turns, and reports them to their watchers."""
 
     def __init__(self, watchers: Iterable[Watcher]) -> None:
-        self._watchers = [w for w in watchers if isinstance(w, LogKeeper)]
+        self._watchers = [w for w in watchers if isinstance(w, TurnWatcher)]
         self._count = 0
         self._began_s = 0.0
         self._open: tuple[Observation, Decision | None] | None = None  # observed, not yet reported
 
     @property
-    def are_watched(self) -> bool:
+    def has_watchers(self) -> bool:
         """True if somebody records them."""
         return bool(self._watchers)
 
@@ -320,7 +322,9 @@ class Turns:
         """Note when a turn of the loop begins."""
         self._began_s = now_s
 
-    def waiting(self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None) -> None:
+    def report_waiting(
+        self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None
+    ) -> None:
         """Report a turn before take-off."""
         turn = Turn(
             self._counted(),
@@ -333,23 +337,23 @@ class Turns:
         )
         self._report(turn)
 
-    def observed(self, obs: Observation) -> None:
+    def note_observation(self, obs: Observation) -> None:
         """Note what the planner is about to decide on."""
         self._open = obs, None
 
-    def decided(
+    def note_decision(
         self, obs: Observation, new: PlannerState, command: Command, outside: FeedStatus | None
     ) -> None:
         """Note that the planner has decided: what fails from now on is not its fault."""
         self._open = obs, (new, command, outside)
 
-    def redone(
+    def report_redone(
         self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
     ) -> None:
         """Report a turn that is not sent, and decided anew in the next one."""
         self._report(replace(self.flown(inputs, obs, new, command, None), role="redone"))
 
-    def failed(self, inputs: FlightInputs, error: BaseException) -> None:
+    def report_failure(self, inputs: FlightInputs, error: BaseException) -> None:
         """Report the turn in which the flight broke off. It holds what the planner was given, and
         what it had decided unless it raised: the command may have been sent."""
         if self._open is None:

@@ -14,7 +14,7 @@ from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
 from perchctl.mission import FlightReport, Operator, Phase, Tick, Watcher
-from perchctl.positioning import Placed, PositionFeed
+from perchctl.positioning import PositionFeed, VehiclePose
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
 from perchctl.sim import (
@@ -103,7 +103,7 @@ class Truth(Watcher):
     def tick(self, tick: Tick) -> None:
         world = self._vehicle.world
         on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
-        _, is_down = world.contacts()
+        _, is_down = world.contact_state()
         if is_down and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
         if is_down and not self._was_down:
@@ -111,7 +111,7 @@ class Truth(Watcher):
         self._was_down = is_down
         self._sink_mps = -world.vz_mps
 
-    def for_log(self) -> tuple[tuple[float, float, float], float]:
+    def position_and_miss(self) -> tuple[tuple[float, float, float], float]:
         world = self._vehicle.world
         return (world.x_m, world.y_m, world.z_m), world.gear_miss_m()
 
@@ -138,7 +138,7 @@ class LockstepFlight:
         """The phase in which it ended, ABORTED for one that fell."""
         return Phase.ABORTED if self.fell else self.report.phase
 
-    def conclude(self, log: LogWatcher) -> FlightSummary | None:
+    def close_log(self, log: LogWatcher) -> FlightSummary | None:
         """Write the flight's summary and close its log. Returns the summary."""
         return log.close(self.report, self.perched_miss_m, self.fell)
 
@@ -176,7 +176,7 @@ def fly_lockstep(
     truth = Truth(vehicle)
     watchers = (truth, *watchers)
     if log is not None:
-        log.truth = truth.for_log
+        log.truth = truth.position_and_miss
         watchers = (*watchers, log)
         source = log.watched(source)
     parts = FlightParts(
@@ -206,7 +206,7 @@ def fly_lockstep(
         scenario=scenario,
     )
     if opened is not None:
-        flight.conclude(opened)
+        flight.close_log(opened)
     return flight
 
 
@@ -223,13 +223,13 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
     capture, config = link.vehicle.capture, profile.positioning
     if config.by == "target":
         origin_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
-        link.settle(config, Placed(link.now_s, origin_m, np.eye(3)))
+        link.settle(config, VehiclePose(link.now_s, origin_m, np.eye(3)))
         return None
     if capture is None or config.by != "mocap":
         return None
     config = config.model_copy(update={"system": capture.SYSTEM, "host": "sim"})
-    feed = PositionFeed(capture, link.external, config)
-    link.each(PositionFeed.PERIOD_S, feed.turn)
+    feed = PositionFeed(capture, link.send_external, config)
+    link.call_every(PositionFeed.PERIOD_S, feed.turn)
     end_s = link.now_s + FIRST_FRAME_S
     while (place := feed.place()) is None:
         if link.now_s >= end_s:

@@ -14,14 +14,14 @@ from typing import Protocol
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
-from perchctl.flight.criteria import AtRest
-from perchctl.flight.inputs import FlightInputs, LogKeeper, Turns
+from perchctl.flight.criteria import RestCheck
+from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
 from perchctl.flight.preflight import (
     out_of_view,
     refuse,
     refuse_forbidden,
-    refuse_strange,
-    refuse_unmeasured,
+    refuse_without_positions,
+    refuse_wrong_positions,
     still_waiting_for,
 )
 from perchctl.flight.watchdog import Watchdog, rescue
@@ -49,7 +49,7 @@ HUNG_S = 0.25
 """A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
 
 
-class GivesPositions(Protocol):
+class PositionSource(Protocol):
     """What the loop needs of a `perchctl.positioning.PositionFeed`."""
 
     def status(self, now_s: float) -> FeedStatus: ...
@@ -71,7 +71,7 @@ class FlightParts:
     pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    positions: GivesPositions | None = None
+    positions: PositionSource | None = None
     remarks: Callable[[], Sequence[str]] = tuple
 
     def position_age_s(self, now_s: float) -> float:
@@ -85,14 +85,14 @@ def fly(parts: FlightParts) -> FlightReport:
     Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
     `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue.
     """
-    turns = Turns(parts.watchers)
+    turns = TurnReporter(parts.watchers)
     inputs = FlightInputs(
         parts.link,
         parts.source,
         parts.pipeline,
         parts.profile,
-        send=parts.link.external,
-        recorded=turns.are_watched,
+        send=parts.link.send_external,
+        recorded=turns.has_watchers,
     )
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
@@ -100,7 +100,7 @@ def fly(parts: FlightParts) -> FlightReport:
     try:
         return _mission(parts, inputs, watchdog, turns)
     except BaseException as error:
-        watchdog.rescuing()
+        watchdog.note_rescue()
         rest = rescue(
             parts.link,
             parts.clock,
@@ -113,7 +113,7 @@ def fly(parts: FlightParts) -> FlightReport:
             inputs.perception.motion.motion,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
-            turns.failed(inputs, error)
+            turns.report_failure(inputs, error)
         for watcher in parts.watchers:
             with contextlib.suppress(Exception):  # it may be the one that failed
                 watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
@@ -122,7 +122,7 @@ def fly(parts: FlightParts) -> FlightReport:
 
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     """Return a callback that passes on what is sent in the loop's place to those who watch it."""
-    told = [watcher for watcher in parts.watchers if isinstance(watcher, LogKeeper)]
+    told = [watcher for watcher in parts.watchers if isinstance(watcher, TurnWatcher)]
 
     def tell(sent: SentCommand) -> None:
         for watcher in told:
@@ -132,19 +132,19 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     return tell
 
 
-def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) -> None:
-    refuse_unmeasured(parts.link, parts.profile, positions=parts.positions is not None)
-    started_s, at_rest = parts.clock.now(), AtRest()
+def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnReporter) -> None:
+    refuse_without_positions(parts.link, parts.profile, positions=parts.positions is not None)
+    started_s, at_rest = parts.clock.now(), RestCheck()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
             raise Interrupted("interrupted before take-off: nothing was started")
-        inputs.take_in(now_s)
+        inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_forbidden(newest, parts.profile)
         outside = _outside(parts, inputs, now_s)
-        refuse_strange(outside, newest, parts.profile, now_s, at_rest)
-        turns.waiting(inputs, now_s, outside)
+        refuse_wrong_positions(outside, newest, parts.profile, now_s, at_rest)
+        turns.report_waiting(inputs, now_s, outside)
         waiting = still_waiting_for(
             newest,
             inputs.frames > 0,
@@ -171,7 +171,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) ->
 
 
 def _mission(
-    parts: FlightParts, inputs: FlightInputs, watchdog: Watchdog, turns: Turns
+    parts: FlightParts, inputs: FlightInputs, watchdog: Watchdog, turns: TurnReporter
 ) -> FlightReport:
     period_s = 1.0 / parts.profile.link.loop_hz
     clock = parts.clock
@@ -184,21 +184,21 @@ def _mission(
         began_s = now_s = clock.now()
         turns.begin(began_s)
         # Against the ceiling the picture shows no target and steers nothing.
-        inputs.take_in(began_s, look=state is None or state.phase is not Phase.COMPLETE)
+        inputs.poll_inputs(began_s, look=state is None or state.phase is not Phase.COMPLETE)
         if clock.now() - began_s > HUNG_S:  # a setpoint for the time before the hang is stale
             now_s = clock.now()
-            inputs.present(began_s, now_s)
+            inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
         outside = _outside(parts, inputs, now_s)
         obs = _observe(parts, inputs, now_s, late_s, outside)
-        turns.observed(obs)
+        turns.note_observation(obs)
         before = state
         new, command = step_mission(before, obs, parts.profile)
-        turns.decided(obs, new, command, outside)
+        turns.note_decision(obs, new, command, outside)
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
-            turns.redone(inputs, obs, new, command)
+            turns.report_redone(inputs, obs, new, command)
             continue
         state, redone = new, False
         if not isinstance(command, Idle):
@@ -207,7 +207,7 @@ def _mission(
         inputs.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
-            inputs.perception.drop_sights()
+            inputs.perception.drop_sightings()
         events = Event.of_tick(before, state, obs, parts.profile)
         notes = [*parts.remarks()]
         if obs.log_problem is not None and not log_noted:

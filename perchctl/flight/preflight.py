@@ -9,9 +9,9 @@ import numpy as np
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
-    AtRest,
     GroundCriteria,
     Problem,
+    RestCheck,
     apart,
     measurer,
     missing,
@@ -33,27 +33,27 @@ def refuse(problem: Problem | None) -> None:
 
 
 def refuse_forbidden(telemetry: Telemetry | None, profile: Profile) -> None:
-    """Raises SafetyAbort for what waiting will not mend."""
+    """Raises SafetyAbort for a supervisor fault or a low battery, which waiting does not cure."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
-        refuse(criteria.forbidden or criteria.battery)
+        refuse(criteria.supervisor_fault or criteria.battery_too_low)
 
 
-def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
+def refuse_without_positions(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
     capture are being sent."""
     if profile.positioning.by == "deck":
-        refuse(GroundCriteria.unmeasured(link.decks(), profile))
+        refuse(GroundCriteria.no_position_source(link.decks(), profile))
     elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
 
-def refuse_strange(
+def refuse_wrong_positions(
     status: FeedStatus | None,
     telemetry: Telemetry | None,
     profile: Profile,
     now_s: float,
-    at_rest: AtRest | None = None,
+    at_rest: RestCheck | None = None,
 ) -> None:
     """Raises SafetyAbort for positions in another unit, or of another world or body. A tilted or
     moved vehicle is not judged, nor anything old. `at_rest`: the turns before."""
@@ -62,16 +62,16 @@ def refuse_strange(
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
         return  # unknown: not judged, and nothing is forgotten
     criteria = GroundCriteria(telemetry, profile)
-    stands = criteria.tilt is None and criteria.motion is None
+    stands = criteria.not_level is None and criteria.not_still is None
     # The last position before a problem may have been elsewhere.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
         return
     place = status.measured if stands else None
     if place is not None:
-        refuse(criteria.world_problem(place))
+        refuse(criteria.position_frame_problem(place))
     if at_rest is not None:
-        refuse(at_rest.strange(place, profile))
+        refuse(at_rest.moved_body_problem(place, profile))
 
 
 def still_waiting_for(
@@ -97,19 +97,19 @@ def still_waiting_for(
     waiting = _first(
         {
             "positions of the motion capture": None if by_sight else unsent,
-            "the state estimate to settle": criteria.unsettled,
+            "the state estimate to settle": criteria.estimate_unsettled,
             f"the state estimate to agree with {measurer(profile)}": None
             if seen is None
             else apart(seen, telemetry),
         }
     )
     if not waiting:
-        refuse(criteria.height)
+        refuse(criteria.off_ground)
         waiting = _first(
             {
-                "the vehicle to stand level": criteria.tilt,
-                "the vehicle to stand still": criteria.motion,
-                "the supervisor to allow flight": criteria.not_allowed,
+                "the vehicle to stand level": criteria.not_level,
+                "the vehicle to stand still": criteria.not_still,
+                "the supervisor to allow flight": criteria.supervisor_not_ready,
             }
         )
     if not waiting and not has_frame:
@@ -117,7 +117,7 @@ def still_waiting_for(
         limit_s = profile.camera.start_timeout_s
     waiting = waiting or _first({"a sight of the target, which measures the position": unsent})
     if not waiting:
-        refuse(criteria.too_near(target))
+        refuse(criteria.target_too_near(target))
         return ""
     return _bounded(waiting, waited_s, limit_s)
 
@@ -169,7 +169,7 @@ def out_of_view(
     return None
 
 
-def target_from(
+def target_view_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
     """Return the target as seen from a level vehicle at a place in its world."""
@@ -187,14 +187,14 @@ def target_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """Return the target as `target_from` gives it for a vehicle that leans so that the target moves
-    to the picture's edge, as if it stood farther away."""
-    level = target_from(body_m, yaw_rad, target, profile, camera)
+    """Return the target as `target_view_from` gives it for a vehicle that leans so that the target
+    moves to the picture's edge, as if it stood farther away."""
+    level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.whole and aside_m > 1e-9):
         return level
     away = -rot_z(yaw_rad)[:2, :2] @ np.array(level.aside_m) / aside_m
     leant_m = level.height_m * math.tan(math.radians(LEAN_DEG))
     x, y = np.array(body_m[:2]) + leant_m * away
-    leaning = target_from((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
+    leaning = target_view_from((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
     return replace(level, whole=leaning.whole)

@@ -103,7 +103,7 @@ def fly_session(
         uri, spec, simulated = options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()
         if options.simulated:
-            simulated = stack.enter_context(simulated_vehicle(options, camera))
+            simulated = stack.enter_context(start_simulated_vehicle(options, camera))
             clock = SimulatedClock(simulated.shared_time)
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
@@ -119,7 +119,9 @@ def fly_session(
             link.connect()
             if before_arming is not None:
                 before_arming()
-            positions = started_feed(stack, link, positioning, clock, profile.safety.ground_z_m)
+            positions = start_position_feed(
+                stack, link, positioning, clock, profile.safety.ground_z_m
+            )
             switch.listening = True
             parts = FlightParts(
                 link,
@@ -151,7 +153,7 @@ def _true_miss_m(simulated: SimProcess | None) -> float | None:
     return None
 
 
-def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
+def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
     """Start the simulated vehicle with its camera's stream. Raises UsageError without
     the simulator."""
     if find_spec("mujoco") is None:
@@ -175,12 +177,14 @@ def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) 
     right."""
     if config.by != "mocap" or simulated:
         return
-    objected = load_comparison(config, vehicle_uri(uri)).objection(datetime.now().astimezone())
+    objected = load_comparison(config, vehicle_uri(uri)).flight_objection(
+        datetime.now().astimezone()
+    )
     if objected is not None:
         raise SafetyAbort(": ".join(objected))
 
 
-def started_feed(
+def start_position_feed(
     stack: contextlib.ExitStack,
     link: CflibLink,
     config: PositioningConfig,
@@ -197,7 +201,7 @@ def started_feed(
         return None
     capture = open_capture(config, clock.now)
     stack.callback(capture.close)
-    feed = PositionFeed(capture, link.external, config)
+    feed = PositionFeed(capture, link.send_external, config)
     stack.callback(feed.close)
     feed.start(clock.now)
     link.settle(feed)

@@ -26,7 +26,7 @@ from perchctl.mission import (
     PlannerState,
     SentCommand,
     VisualInertialMotion,
-    rest_of,
+    rest_text,
     step_landing,
 )
 from perchctl.perception import History, add_samples
@@ -39,8 +39,8 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     Telemetry,
-    is_cut,
-    knows_its_position,
+    has_fresh_position,
+    is_emergency_stopped,
 )
 
 REPEAT_AFTER_S = 0.3  # the vehicle levels out by itself at 0.5 s
@@ -101,7 +101,7 @@ class Watchdog:
             self._cut_ordered = True
         self._last = LastTick(due_s, state, self._streamed or command, obs)
 
-    def rescuing(self) -> None:
+    def note_rescue(self) -> None:
         """Note that the loop has ended by an error: only the operator's stop is left."""
         self._closing = True
 
@@ -146,7 +146,7 @@ class Watchdog:
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
         """Return the emergency stop until the vehicle is seen to be locked. Bounded."""
         due = now_s - self._cut_s >= CUT_PERIOD_S - 1e-9
-        if is_cut(newest, now_s) or not due or self._cuts >= MAX_CUTS:
+        if is_emergency_stopped(newest, now_s) or not due or self._cuts >= MAX_CUTS:
             return None
         self._cut_s, self._cuts = now_s, self._cuts + 1
         return EmergencyStop()
@@ -186,7 +186,7 @@ class Watchdog:
 
     def _hold(self, now_s: float, last: LastTick, newest: Telemetry | None) -> Command | None:
         """Return the last safe setpoint; None where there is none to hold."""
-        known = newest if knows_its_position(newest, now_s) else None
+        known = newest if has_fresh_position(newest, now_s) else None
         if self._held is None and known is not None:
             match last.command:
                 case RawThrust(thrust) if abs(known.velocity_mps[2]) < STILL_MPS:
@@ -274,7 +274,7 @@ def rescue(
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
-            rest = rest_of(state, obs, profile, LOOK_S)
+            rest = rest_text(state, obs, profile, LOOK_S)
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)

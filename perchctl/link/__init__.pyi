@@ -1,7 +1,7 @@
 from .cflib_link import CflibLink as CflibLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
-from .listening import MotionLink as MotionLink
+from .listening import AttitudeLink as AttitudeLink
 from .listening import ProbeLink as ProbeLink
 from .listening import find_vehicles as find_vehicles
 from .mock import MockLink as MockLink

@@ -22,8 +22,8 @@ from perchctl.link.crtp import (
     Packet,
     encode,
 )
-from perchctl.link.external_position import Standing, estimator_parameters, settle
-from perchctl.link.firmware import check_firmware, decks_found, read_parameters, set_parameters
+from perchctl.link.external_position import StandingFeed, estimator_parameters, settle
+from perchctl.link.firmware import check_firmware, detected_decks, read_parameters, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.telemetry import LogBlocks
@@ -38,8 +38,8 @@ from perchctl.vehicle import (
     Idle,
     RawThrust,
     Telemetry,
-    is_known,
-    may_fly,
+    is_fresh,
+    may_be_flying,
 )
 
 SILENCE_S = 1.5
@@ -90,7 +90,9 @@ class CflibLink:
             raise
 
     def decks(self) -> tuple[str, ...]:
-        return () if self.connection is None else decks_found(read_parameters(self.connection.cf))
+        return (
+            () if self.connection is None else detected_decks(read_parameters(self.connection.cf))
+        )
 
     def telemetry(self) -> list[Telemetry]:
         return self._blocks.take()
@@ -99,7 +101,7 @@ class CflibLink:
         if self._sender is not None and not isinstance(command, Idle):
             self._sender.put(command)
 
-    def external(self, place: ExternalPosition) -> bool:
+    def send_external(self, place: ExternalPosition) -> bool:
         try:
             return self.connection is not None and self.connection.send(*encode(place))
         except Exception:  # the library's; commands report their own
@@ -112,7 +114,7 @@ class CflibLink:
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
         cf, config, clock = self.connection.cf, self._positioning, self._clock
-        standing = Standing(self.external, ground_z_m, config.rate_hz, clock)
+        standing = StandingFeed(self.send_external, ground_z_m, config.rate_hz, clock)
         wait = standing.wait if feed is None else time.sleep
         settle(cf, self._uri, config, feed or standing, lambda: self._blocks.newest, clock, wait)
 
@@ -155,7 +157,7 @@ class CflibLink:
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
         newest = self._blocks.newest
-        if newest is not None and not newest.has(ARMED):  # a Crazyflie 2.1 arms itself
+        if newest is not None and not newest.has_bit(ARMED):  # a Crazyflie 2.1 arms itself
             send_packets(connection.cf, ARM)
         self._unlock_thrust(connection)  # from here on it is known to be on the ground
         set_parameters(connection.cf, self._uri, estimator_parameters(self._positioning))
@@ -172,9 +174,9 @@ class CflibLink:
     def _unlock_thrust(self, connection: Connection) -> None:
         """Unlock the raw thrust; on the ground only, since its zero thrust cuts the motors."""
         newest, now_s = self._blocks.newest, self._clock()
-        if not is_known(newest, now_s):
+        if not is_fresh(newest, now_s):
             raise ConnectionFailed(f"the telemetry of {self._uri} has stopped: not taken over")
-        if newest is not None and newest.has(FLYING):
+        if newest is not None and newest.has_bit(FLYING):
             raise ConnectionFailed(
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
             )
@@ -217,7 +219,7 @@ class CflibLink:
 
     def _may_say_farewell(self) -> bool:
         """True where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""
-        return not may_fly(self._blocks.newest, self._clock())
+        return not may_be_flying(self._blocks.newest, self._clock())
 
     def _leave(self, *, farewell: bool) -> None:
         """Release the link. `farewell`: let cflib send its zero setpoint, which drops a flying

@@ -68,7 +68,7 @@ class Connection:
     def open(self, uri: str, timeout_s: float) -> bool:
         """Return True once the vehicle is connected, or refused (`lost`), within `timeout_s`."""
         # Opening a radio may block in its driver: it gets a thread and a bound.
-        begin_thread("perchctl-open", lambda: self.cf.open_link(uri))
+        start_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
             return False
         self._has_safelink = not getattr(self.cf.link, "needs_resending", True)
@@ -134,7 +134,7 @@ class Connection:
                 if cause is None:
                     return
                 self._give_up(cause)
-            self._opener = begin_thread("perchctl-reconnect", self._open_again)
+            self._opener = start_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
         """Release the driver and clean up. `farewell`: let cflib send its zero setpoint, which
@@ -153,11 +153,11 @@ class Connection:
         """Note a driver's end; called in any thread, and in the middle of anything."""
         with self._change:
             if number == self._number and not self._left:
-                self._give_up(plain_cause(message))
+                self._give_up(readable_cause(message))
         self._settled.set()
 
     def _on_failed(self, _uri: str, message: str) -> None:
-        self.lost = plain_cause(message)
+        self.lost = readable_cause(message)
         self._settled.set()
 
     def _give_up(self, cause: str) -> None:
@@ -166,7 +166,7 @@ class Connection:
         self.lost = cause
         driver, self.cf.link = self.cf.link, _Nowhere()
         if driver is not None:
-            self._closer = begin_thread("perchctl-close", driver.close)
+            self._closer = start_thread("perchctl-close", driver.close)
 
     def _open_again(self) -> None:
         if self._closer is not None:
@@ -241,8 +241,8 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     program has the vehicle.
     """
     share_s = timeout_s / CONNECT_TRIES
-    with claim_vehicle(uri) as claim:
-        ready_cflib()
+    with lock_vehicle(uri) as claim:
+        init_cflib()
         for _ in range(CONNECT_TRIES):
             connection = Connection()
             answered = False
@@ -262,7 +262,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     )
 
 
-def ready_cflib() -> None:
+def init_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
     silence it: its log has tracebacks of what is reported by callback as well, and its radio prints
     on stdout, which is for results."""
@@ -305,7 +305,7 @@ _CAUSES = {
 """What to say of a message of cflib's, by words in it: the first that fits."""
 
 
-def plain_cause(message: str) -> str:
+def readable_cause(message: str) -> str:
     """Return cflib's message without its traceback, or the cause and its remedy where they are
     known."""
     for words, cause in _CAUSES.items():
@@ -320,10 +320,10 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
         for call in calls:
             call()
 
-    begin_thread("perchctl-close", run).join(CLOSE_TIMEOUT_S)
+    start_thread("perchctl-close", run).join(CLOSE_TIMEOUT_S)
 
 
-def begin_thread(name: str, call: Callable[[], object]) -> threading.Thread:
+def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
     """Start a thread for what may block in a driver."""
     thread = threading.Thread(target=call, name=name, daemon=True)
     thread.start()
@@ -345,7 +345,7 @@ def _forget_dead_dongle(uri: str) -> None:
 # two streams of setpoints would pull it two ways.
 
 
-def claim_vehicle(uri: str) -> contextlib.ExitStack:
+def lock_vehicle(uri: str) -> contextlib.ExitStack:
     """Lock the vehicle at `uri` for this process until the result is closed.
 
     Nothing is locked where no lock can be kept (no folder to write to, Windows), which is no reason

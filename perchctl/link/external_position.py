@@ -19,14 +19,14 @@ import numpy as np
 from perchctl.errors import ConnectionFailed, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.link.firmware import set_parameters
-from perchctl.positioning import FeedStatus, Placed, PositionFeed
+from perchctl.positioning import FeedStatus, PositionFeed, VehiclePose
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import (
     ExternalPosition,
     SendPosition,
     Telemetry,
-    knows_its_position,
-    may_fly,
+    has_fresh_position,
+    may_be_flying,
 )
 
 ESTIMATOR = "stabilizer.estimator"
@@ -55,8 +55,8 @@ def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
     }
 
 
-def start_parameters(start: Placed) -> dict[str, float]:
-    """Return the parameters by which a reset starts the firmware's estimator at a place."""
+def estimator_start_parameters(start: VehiclePose) -> dict[str, float]:
+    """Return the `kalman.initial*` parameters that make a reset start the estimator at `start`."""
     x, y, z = (float(part) for part in start.position_m)
     values = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(start.R)}
     return {f"kalman.initial{name}": value for name, value in values.items()}
@@ -66,7 +66,7 @@ def settle(
     cf: Any,
     uri: str,
     config: PositioningConfig,
-    feed: PositionFeed | Standing,
+    feed: PositionFeed | StandingFeed,
     newest: Callable[[], Telemetry | None],
     clock: Callable[[], float],
     wait: Callable[[float], None] = time.sleep,
@@ -85,14 +85,14 @@ def settle(
             )
         wait(POLL_S)
     for _ in range(RESETS):
-        if may_fly(newest(), clock()):
+        if may_be_flying(newest(), clock()):
             raise ConnectionFailed(
                 f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
             )
         start = feed.place()
         assert start is not None  # one was sent
         x, y, z = start.position_m
-        set_parameters(cf, uri, start_parameters(start))
+        set_parameters(cf, uri, estimator_start_parameters(start))
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
         for value in (1, 0):
             set_parameters(cf, uri, {RESET_PARAMETER: value}, read_back=False)
@@ -109,8 +109,8 @@ def settle(
 
 
 def _agree(
-    feed: PositionFeed | Standing,
-    start: Placed,
+    feed: PositionFeed | StandingFeed,
+    start: VehiclePose,
     newest: Callable[[], Telemetry | None],
     clock: Callable[[], float],
     wait: Callable[[float], None],
@@ -125,7 +125,7 @@ def _agree(
             status.problem is None
             and placed is not None
             and sample is not None
-            and knows_its_position(sample, now_s)
+            and has_fresh_position(sample, now_s)
             and math.dist(placed.position_m, start.position_m) <= STILL_M
             and math.dist(placed.position_m, sample.position_m) <= AGREE_M
             and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= AGREE_RAD
@@ -137,7 +137,7 @@ def _agree(
     return False
 
 
-class Standing:
+class StandingFeed:
     """Feed of a vehicle that stands at the world's origin, level, with its front along x: so the
     world is defined. `wait` sends that place, `rate_hz` times a second."""
 
@@ -160,5 +160,5 @@ class Standing:
     def status(self, now_s: float) -> FeedStatus:
         return FeedStatus(0.0, None, self._count, self._place)
 
-    def place(self) -> Placed:
-        return Placed(self._clock(), np.array(self._place.position_m), np.eye(3))
+    def place(self) -> VehiclePose:
+        return VehiclePose(self._clock(), np.array(self._place.position_m), np.eye(3))

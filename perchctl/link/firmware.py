@@ -89,7 +89,7 @@ def read_parameters(cf: Any) -> dict[str, float]:
     }
 
 
-def decks_found(parameters: Mapping[str, float]) -> tuple[str, ...]:
+def detected_decks(parameters: Mapping[str, float]) -> tuple[str, ...]:
     """Return the decks that were found at boot, by the firmware's names, sorted."""
     names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
     return tuple(sorted(names))

@@ -1,7 +1,7 @@
 """Links that read a vehicle and command nothing, and the search for vehicles that answer.
 
-`MotionLink` reads how a vehicle is moved by hand, `ProbeLink` what it holds and how good the radio
-is. Nothing that is sent here flies, arms or turns a motor.
+`AttitudeLink` reads how a vehicle is moved by hand, `ProbeLink` what it holds and how good the
+radio is. Nothing that is sent here flies, arms or turns a motor.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from perchctl.errors import NotFound, TimedOut
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.connection import (
     Connection,
-    begin_thread,
-    plain_cause,
-    ready_cflib,
+    init_cflib,
+    readable_cause,
     send_packets,
+    start_thread,
 )
 from perchctl.link.crtp import Packet, Port
 from perchctl.link.external_position import estimator_parameters
@@ -41,7 +41,7 @@ from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
 
 
-class ListeningLink(CflibLink):
+class ReadOnlyLink(CflibLink):
     """A `CflibLink` that sets no parameter, arms nothing, and commands nothing, not even at its
     end: the vehicle may fly for another program."""
 
@@ -75,8 +75,8 @@ MOTION_BLOCK = dict.fromkeys(
 MOST_SAMPLES = 20_000
 
 
-class MotionLink(ListeningLink):
-    """A `ListeningLink` that collects attitude samples, 100 a second. Errors as `CflibLink`."""
+class AttitudeLink(ReadOnlyLink):
+    """A `ReadOnlyLink` that collects attitude samples, 100 a second. Errors as `CflibLink`."""
 
     def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
         super().__init__(uri, config, clock)
@@ -129,8 +129,8 @@ _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of th
 _ECHO_MARK = 1  # cflib's own pings begin with 0
 
 
-class ProbeLink(ListeningLink):
-    """A `ListeningLink` that refuses no firmware: what is wrong with it is what is asked for.
+class ProbeLink(ReadOnlyLink):
+    """A `ReadOnlyLink` that refuses no firmware: what is wrong with it is what is asked for.
 
     `quality` is the radio's, %: how few of its packets had to be sent again; None without one.
     `missing` names the log variables that perchctl needs and the firmware lacks.
@@ -227,7 +227,7 @@ def find_vehicles(uri: str = "") -> tuple[list[str], str]:
     def run() -> None:
         from cflib import crtp
 
-        ready_cflib()
+        init_cflib()
         with contextlib.suppress(Exception):  # whatever the driver raises
             why[0] = _radio_problem()
         for driver in crtp.CLASSES:
@@ -235,7 +235,7 @@ def find_vehicles(uri: str = "") -> tuple[list[str], str]:
                 with contextlib.suppress(Exception):
                     found.extend(uri for uri, _ in driver().scan_interface(address))
 
-    begin_thread("perchctl-scan", run).join(SCAN_TIMEOUT_S)
+    start_thread("perchctl-scan", run).join(SCAN_TIMEOUT_S)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
     return list(uris), why[0]
 
@@ -246,5 +246,5 @@ def _radio_problem() -> str:
     try:
         Crazyradio().close()
     except Exception as error:
-        return plain_cause(str(error) or "Cannot find a Crazyradio Dongle")
+        return readable_cause(str(error) or "Cannot find a Crazyradio Dongle")
     return ""

@@ -18,9 +18,9 @@ from perchctl.link.crtp import (
 from perchctl.link.external_position import (
     RESET_PARAMETER,
     estimator_parameters,
-    start_parameters,
+    estimator_start_parameters,
 )
-from perchctl.link.firmware import decks_found
+from perchctl.link.firmware import detected_decks
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.telemetry import (
     BLOCKS,
@@ -28,10 +28,10 @@ from perchctl.link.telemetry import (
     FAST_BLOCKS,
     RESUME_PERIOD_S,
     SLOW_PERIOD_S,
-    Assembler,
+    SampleAssembler,
 )
 from perchctl.mission import SentCommand
-from perchctl.positioning import Placed
+from perchctl.positioning import VehiclePose
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import FLYING, Command, ExternalPosition, Telemetry
 
@@ -78,7 +78,7 @@ class MockLink:
     ) -> None:
         self.vehicle = vehicle
         self.radio = radio or Radio()
-        self._assembler = Assembler()
+        self._assembler = SampleAssembler()
         self._periods_s = {
             name: telemetry_period_s if name in FAST_BLOCKS else SLOW_PERIOD_S for name in BLOCKS
         }
@@ -113,7 +113,7 @@ class MockLink:
                 self._call(self.now_s)
         self.vehicle.advance_to(t_s)
 
-    def each(self, period_s: float, call: Callable[[float], object]) -> None:
+    def call_every(self, period_s: float, call: Callable[[float], object]) -> None:
         """Call `call` with the time every `period_s` from now on: a thread's stand-in."""
         self._call, self._call_period_s, self._call_due_s = call, period_s, self.now_s
 
@@ -126,7 +126,7 @@ class MockLink:
     def decks(self) -> tuple[str, ...]:
         firmware = self.vehicle.firmware
         names = (n for n in firmware.PARAMETERS if n.startswith("deck."))
-        return decks_found({name: firmware.get_parameter(name) for name in names})
+        return detected_decks({name: firmware.get_parameter(name) for name in names})
 
     def telemetry(self) -> list[Telemetry]:
         self._collect()
@@ -157,14 +157,14 @@ class MockLink:
     def send(self, command: Command) -> None:
         self._hand_over(encode(command))
 
-    def external(self, place: ExternalPosition) -> bool:
+    def send_external(self, place: ExternalPosition) -> bool:
         self._hand_over(encode(place))
         return True
 
-    def settle(self, config: PositioningConfig, start: Placed) -> None:
+    def settle(self, config: PositioningConfig, start: VehiclePose) -> None:
         """Set the estimator to positions from outside, and start it at `start`."""
         firmware = self.vehicle.firmware
-        parameters = estimator_parameters(config) | start_parameters(start)
+        parameters = estimator_parameters(config) | estimator_start_parameters(start)
         for name, value in (parameters | {RESET_PARAMETER: 1}).items():
             firmware.set_parameter(name, value)
         firmware.set_parameter(RESET_PARAMETER, 0)

@@ -45,7 +45,7 @@ class Link(Protocol):
     def send(self, command: Command) -> None:
         """Hand one command to the vehicle. Never blocks for long."""
 
-    def external(self, place: ExternalPosition) -> bool:
+    def send_external(self, place: ExternalPosition) -> bool:
         """Hand a position from outside to the vehicle's estimator, at once or not at all: it is
         never queued behind anything, and raises nothing. Returns True if it went out. Called from
         a thread of its own."""

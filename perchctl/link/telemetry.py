@@ -133,7 +133,7 @@ SLOW_PERIOD_S = 0.1
 MOST_CARRIED_S = 0.05
 
 
-class Assembler:
+class SampleAssembler:
     """Puts the newest values of all blocks together.
 
     A block that stops coming leaves its values behind. The attitude's block makes the sample,
@@ -200,7 +200,7 @@ class LogBlocks:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._timebase = Timebase()
-        self._assembler = Assembler()
+        self._assembler = SampleAssembler()
         self._samples: deque[Telemetry] = deque(maxlen=MOST_SAMPLES)
         self._first_sample = threading.Event()
         self._awaited: set[str] = set()  # slow blocks without data so far

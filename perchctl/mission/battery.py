@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 
-from perchctl.mission.conditions import press_thrust
+from perchctl.mission.conditions import max_press_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.state import BatteryOutlook, EnergyState, Phase
 from perchctl.profile import Profile
@@ -67,7 +67,7 @@ def update_energy(
         if state.rest_v is None:
             return state
         spent = fit_battery(state)[1] * state.load * _per_s(battery_mah) * dt_s
-        return replace(state, rest_v=resting_v(charge_at(state.rest_v) - spent))
+        return replace(state, rest_v=rest_v_from_charge(charge_from_rest_v(state.rest_v) - spent))
     state = replace(state, unknown_s=0.0)
     if load == 0.0 and not state.loaded_s:
         return replace(state, ground_v=battery_v, rest_v=battery_v)
@@ -84,8 +84,8 @@ def update_energy(
 
 
 def fit_battery(state: EnergyState) -> tuple[float, float]:
-    """The sag under full thrust, in V, and the hunger: the least-squares fit to the readings,
-    around the usual values and within bounds."""
+    """The voltage sag under full thrust, V, and the factor by which the charge falls faster than
+    counted: a least-squares fit to the readings, regularised and bounded."""
     a, b, c, p, q = state.fit
     a += SAG_WITHIN_V**-2
     c += HUNGER_WITHIN**-2
@@ -95,12 +95,12 @@ def fit_battery(state: EnergyState) -> tuple[float, float]:
     return max(LEAST_SAG_V, sag_v), min(MOST_HUNGER, max(LEAST_HUNGER, hunger))
 
 
-def charge_at(rest_v: float) -> float:
+def charge_from_rest_v(rest_v: float) -> float:
     """The share of its charge, 0..1, that a cell with that resting voltage has."""
     return min(1.0, max(0.0, _along(VOLTS, SHARES, rest_v)))
 
 
-def resting_v(share: float) -> float:
+def rest_v_from_charge(share: float) -> float:
     """The resting voltage at a share of the charge."""
     return _along(SHARES, VOLTS, share)
 
@@ -115,9 +115,9 @@ def _summed(
 ) -> tuple[float, float, float, float, float]:
     """`EnergyState.fit` with one more reading, as deviations from the usual values."""
     assert state.ground_v is not None
-    begun = charge_at(state.ground_v)
+    begun = charge_from_rest_v(state.ground_v)
     counted = max(min(begun, COUNTED_SHARE), begun - state.used)
-    spent_v = resting_v(begun) - resting_v(counted)
+    spent_v = rest_v_from_charge(begun) - rest_v_from_charge(counted)
     off_v = state.ground_v - battery_v - USUAL_SAG_V * state.load - USUAL_HUNGER * spent_v
     weight, keep = dt_s / READING_V**2, math.exp(-dt_s / FADES_S)
     a, b, c, p, q = (keep * each for each in state.fit)
@@ -142,7 +142,7 @@ def _towards(value: float, goal: float, part: float) -> float:
 # --- What that is enough for ------------------------------------------
 
 
-def outlook(c: Context) -> BatteryOutlook:
+def battery_outlook(c: Context) -> BatteryOutlook:
     """What the battery has left, and for how many attempts that is enough. An unknown charge counts
     at most as the grace of a vehicle without a reading (fault 7)."""
     energy = c.state.energy
@@ -152,7 +152,7 @@ def outlook(c: Context) -> BatteryOutlook:
     seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
     if c.target_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    enough_s, (attempt_s, again_s, landing_s) = seconds, needs_s(c)
+    enough_s, (attempt_s, again_s, landing_s) = seconds, required_times_s(c)
     if enough_s is None:
         enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
     spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
@@ -174,14 +174,14 @@ def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
     )
     lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
-    press_load = max(load, press_thrust(profile) / FULL_THRUST)
+    press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
     sag_v, hunger = fit_battery(state)
     end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
-    share = charge_at(state.rest_v) - charge_at(end_v)
+    share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
     return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah))
 
 
-def needs_s(c: Context) -> tuple[float, float, float]:
+def required_times_s(c: Context) -> tuple[float, float, float]:
     """The seconds that the attempt at hand, each further one and the landing take, by the height of
     a target that was seen."""
     planner = c.planner
@@ -203,9 +203,9 @@ def is_short_of_charge(c: Context) -> bool:
     return gated and not c.state.battery.attempts
 
 
-def why_short(c: Context) -> str:
+def battery_shortfall(c: Context) -> str:
     """The shortfall with its figures, as a sentence."""
-    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, needs_s(c)
+    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, required_times_s(c)
     has = "what the battery has left is not known"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"

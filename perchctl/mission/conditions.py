@@ -67,7 +67,7 @@ def _contact(c: Context) -> bool:
         and c.reads_one_g
         and c.state.hover_thrust > 0
         and c.thrust_is_known
-        and tel.thrust >= min(wanted, PROVABLE * press_thrust(c.profile))
+        and tel.thrust >= min(wanted, PROVABLE * max_press_thrust(c.profile))
     )
 
 
@@ -86,7 +86,7 @@ def contact_error(c: Context) -> ContactError:
     return ContactError(math.hypot(*reckoning.aside_m), sigma_m)
 
 
-def touched_error(c: Context) -> ContactError | None:
+def last_touch_error(c: Context) -> ContactError | None:
     """In RECOVER the `contact_error` that was kept from the touch, if any; None with a fresh sight,
     or once motion capture shows the vehicle away from there."""
     state = c.state
@@ -100,7 +100,7 @@ def touched_error(c: Context) -> ContactError | None:
     return state.contact
 
 
-def contact_within_m(c: Context) -> float:
+def contact_tolerance_m(c: Context) -> float:
     """Tolerance of the target's height for a gear in contact."""
     planner = c.planner
     drift_mps = CARRIED_ON_MPS if c.by_sight else planner.landing.drift_mps
@@ -110,16 +110,16 @@ def contact_within_m(c: Context) -> float:
 def is_at_target(c: Context) -> bool:
     """True if the gear is surely in the magnet's reach."""
     near = contact_error(c).is_within(c.planner.perch.contact_xy_m)
-    return near and abs(c.error_z_m) <= contact_within_m(c)
+    return near and abs(c.error_z_m) <= contact_tolerance_m(c)
 
 
-def press_thrust(profile: Profile) -> float:
+def max_press_thrust(profile: Profile) -> float:
     """The largest thrust that a press can have."""
     perch = profile.planner.perch
     return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
 
 
-def hovers(c: Context) -> bool:
+def is_hover_thrust(c: Context) -> bool:
     """True if the thrust is what hovering takes: neither carried nor pressed nor accelerated."""
     tel, setpoint = c.telemetry, c.state.setpoint
     vz = tel.velocity_mps[2]
@@ -144,7 +144,7 @@ def _is_carried(c: Context) -> bool:
 def _magnet_slips(c: Context) -> bool:
     """True if it falls away from the proven contact, by position or by acceleration."""
     complete, tel = c.planner.complete, c.telemetry
-    if c.state.contact_z_m is None or not c.sinks(complete.slip_mps):
+    if c.state.contact_z_m is None or not c.is_sinking(complete.slip_mps):
         return False
     above_m = tel.position_m[2] - c.state.contact_z_m
     return not c.placed or above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g
@@ -187,7 +187,7 @@ def _down(c: Context) -> bool:
     """True if the motors are off, and the supervisor agrees, or has not changed its word long."""
     stopped_s = c.state.stopped_s
     long_off = stopped_s is not None and c.t_s - stopped_s > SUPERVISOR_S
-    return c.telemetry.thrust < 1 and (not c.telemetry.has(FLYING) or long_off)
+    return c.telemetry.thrust < 1 and (not c.telemetry.has_bit(FLYING) or long_off)
 
 
 def _on_floor(c: Context) -> bool:
@@ -291,7 +291,7 @@ PROOFS = BY_PLACE | {C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.CARRIED, C.SATURA
 """What may stop the motors or end a flight: these count over fresh telemetry only."""
 
 
-def conditions_since(c: Context) -> dict[Condition, float]:
+def update_conditions(c: Context) -> dict[Condition, float]:
     """`PlannerState.since` of this tick, without what is void in it."""
     old, now_s, void = c.state.since, c.t_s, _void(c)
     return {

@@ -129,7 +129,7 @@ class Context:
         since = self.state.since.get(condition)
         return -1.0 if since is None else self.t_s - since
 
-    def sinks(self, mps: float) -> bool:
+    def is_sinking(self, mps: float) -> bool:
         """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts
         only while the accelerometer reads less than the weight, too."""
         tel = self.telemetry

@@ -64,7 +64,7 @@ def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
     return float(target[0] - gear[0]), float(target[1] - gear[1])
 
 
-def walk(
+def step_towards(
     c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> PositionSetpoint:
     """The setpoint one tick later: towards the goal, at limited speeds; wary of a mounting that
@@ -74,7 +74,7 @@ def walk(
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if c.state.phase is Phase.LANDING:
         yaw_radps = 0.0
-    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
+    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.is_unconfirmed:
         xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
@@ -87,7 +87,7 @@ def walk(
     )
 
 
-def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
+def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
     """Integral of the gear's position error, m, world axes, limited; it rests while the error is
     large, and takes away what a steady draught leaves."""
     planner = c.planner
@@ -133,7 +133,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     return part * dx, part * dy
 
 
-def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """The held setpoint one tick later. Without a sight of the target it sinks: from lower down it
     is soonest seen again."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
@@ -165,7 +165,7 @@ def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 # --- The press, its release, and the catch of a slip ------------------
 
 
-def presses(c: Context) -> bool:
+def is_pressing(c: Context) -> bool:
     """True if it is at its thrust's limit, or above what hovering takes, and does not move."""
     return (
         _is_strong(c)
@@ -248,7 +248,7 @@ def hold_by_position(c: Context) -> Acted:
     return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)
 
 
-def is_still(c: Context) -> bool:
+def motors_are_still(c: Context) -> bool:
     """True if the motors stand still by raw thrust."""
     released_s = c.state.released_s
     return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
@@ -297,7 +297,7 @@ def _braked_place_m(c: Context) -> tuple[float, float]:
     return x_m - x_mps / POSITION_GAIN_PER_S, y_m - y_mps / POSITION_GAIN_PER_S
 
 
-def left_contact(c: Context, below_m: float) -> Context:
+def clear_contact_below(c: Context, below_m: float) -> Context:
     """The context without its contact once the vehicle is so far below it."""
     contact_z_m = c.state.contact_z_m
     if contact_z_m is None or c.telemetry.position_m[2] >= contact_z_m - below_m:

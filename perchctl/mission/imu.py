@@ -1,8 +1,8 @@
 """The vehicle's motion by accelerometer and attitude, where no position tells it.
 
 `ImuMotion` integrates the specific force over each sample of the telemetry, and notes when the
-vehicle fell, sank or was silent. `Reckoning` is the planner's: the speed and the place under the
-target, carried on from the last good position.
+vehicle fell, sank or was silent. `DeadReckoning` is the planner's: the speed and the place under
+the target, carried on from the last good position.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Corrections:
         certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
         return now_s - self.none_since_s if certain else 0.0
 
-    def updated(self, sample: Telemetry) -> Corrections:
+    def add_sample(self, sample: Telemetry) -> Corrections:
         """The corrections with one more sample."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
@@ -81,7 +81,7 @@ class Corrections:
 
 
 @dataclass(frozen=True)
-class Blow:
+class Impact:
     """A blow from below, as the floor gives one."""
 
     t_s: float = -math.inf  # -inf: there was none
@@ -122,8 +122,8 @@ class ImuMotion:
     misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
     turning_radps: tuple[float, float] = (0.0, 0.0)
     corrections: Corrections = Corrections()  # of the estimate beside this motion
-    last_moment: tuple[Blow, ...] = ()  # what a blow that begins now has ended
-    blow: Blow = Blow()  # the newest from below
+    last_moment: tuple[Impact, ...] = ()  # what a blow that begins now has ended
+    blow: Impact = Impact()  # the newest from below
     off_s: float = math.inf  # since when the motors have been off; inf while they turn
 
     @property
@@ -148,13 +148,13 @@ class ImuMotion:
             frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
             attitude_frozen_s=_frozen_s(self.attitude_frozen_s, last, new, _ATTITUDE),
             place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _PLACE),
-            corrections=self.corrections.updated(new),
+            corrections=self.corrections.add_sample(new),
             off_s=min(self.off_s, new.t_s) if new.thrust < 1 else math.inf,
         )
         if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
             return _after_silence(motion, last, new)
         offset_g = motion.offset_g
-        if new.thrust < 1 and not new.has(FLYING):
+        if new.thrust < 1 and not new.has_bit(FLYING):
             offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
         misled_rad, turning_radps = _misled(motion, last, new, dt_s)
         before = ImuMotion.acceleration_mps2(last, offset_g, motion.misled_rad)
@@ -180,7 +180,7 @@ class ImuMotion:
         steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
         if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
             steady_aside_s = new.t_s
-        now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
+        now = Impact(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
         keeps = math.exp(-dt_s / PUSH_MEMORY_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
         mean_x_g, mean_y_g = motion.aside_g
@@ -269,13 +269,15 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     return abs(gained_mps) <= NO_FALL_MPS and abs(way_m) <= NO_FALL_M
 
 
-def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mps: float) -> Blow:
+def _struck(
+    motion: ImuMotion, new: Telemetry, last_moment: tuple[Impact, ...], mps: float
+) -> Impact:
     """The newest blow, which has gained `mps` by now; of its bounces the hardest counts. The
     onboard estimate has the whole of a blow before its second sample arrives."""
     old = motion.blow
     follows = new.t_s - old.t_s <= BOUNCES_S
     if mps > BLOW_MPS:
-        begun = Blow(
+        begun = Impact(
             new.t_s,
             min(moment.estimated_mps for moment in last_moment),
             min(moment.felt_mps for moment in last_moment),
@@ -325,7 +327,7 @@ def _frozen_s(
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
     """The hover thrust with one more sample of free flight."""
-    flies = sample.has(FLYING) and sample.thrust < SATURATED * FULL_THRUST
+    flies = sample.has_bit(FLYING) and sample.thrust < SATURATED * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
     felt = sample.thrust / sample.acc_z_g
@@ -341,7 +343,7 @@ def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:
 
 
 @dataclass(frozen=True)
-class Reckoning:
+class DeadReckoning:
     """Speed and place under the target in world axes, carried on by the accelerometer."""
 
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
@@ -361,8 +363,8 @@ class Reckoning:
 
 
 def advance_reckoning(
-    old: Reckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
-) -> Reckoning:
+    old: DeadReckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
+) -> DeadReckoning:
     """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
     it may be of another axis, and even after a silence the reckoned one is better."""
     estimated, blow = sample.velocity_mps, imu.blow
@@ -444,13 +446,13 @@ def advance_reckoning(
     )
 
 
-def discount_wrong_positions(old: Reckoning) -> Reckoning:
+def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     """The reckoning once wrong positions have turned the attitude."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
 
-def add_step(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
+def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) -> DeadReckoning:
     """The reckoning with the step of the position between two samples that its speed does not
     explain. Steps add up; where samples are missing none is seen."""
     dt_s = _position_s(sample) - _position_s(last)
@@ -473,9 +475,9 @@ def _position_s(sample: Telemetry) -> float:
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
-def add_sight(
-    old: Reckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
-) -> Reckoning:
+def add_sighting(
+    old: DeadReckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
+) -> DeadReckoning:
     """The reckoning with a sight: from the gear to the target's axis, world axes, and up to it."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m

@@ -17,10 +17,10 @@ from enum import Enum
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.conditions import (
-    conditions_since,
-    contact_within_m,
+    contact_tolerance_m,
     has_slipped,
     lasting_conditions,
+    update_conditions,
 )
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
 from perchctl.mission.guidance import (
@@ -30,16 +30,23 @@ from perchctl.mission.guidance import (
     Acted,
     catch,
     catch_above_m,
+    clear_contact_below,
     hold_here,
+    is_pressing,
     leave_press,
-    left_contact,
     limited,
-    presses,
     release_by_thrust,
+    step_towards,
     stop_motors,
-    walk,
 )
-from perchctl.mission.imu import REACH_M, UNSEEN_S, Vector, add_sight, add_step, advance_reckoning
+from perchctl.mission.imu import (
+    REACH_M,
+    UNSEEN_S,
+    Vector,
+    add_position_step,
+    add_sighting,
+    advance_reckoning,
+)
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
 from perchctl.profile import PlannerConfig, Profile
 from perchctl.values import replace
@@ -111,9 +118,9 @@ def step_landing(
     down begins with the first. `state` is None if the planner has none yet. Returns the new state,
     and the command to send."""
     c = Context(state or PlannerState.on_ground(obs), obs, profile)
-    c = observe(begin_landing(c))
-    state, command = act(c.evolve(since=conditions_since(c)))
-    return replace(note_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
+    c = remember_observation(begin_landing(c))
+    state, command = act(c.evolve(since=update_conditions(c)))
+    return replace(record_thrust_order(state, command), t_s=obs.t_s, last=obs.telemetry), command
 
 
 def begin_landing(c: Context) -> Context:
@@ -127,7 +134,7 @@ def begin_landing(c: Context) -> Context:
         since=lasting_conditions(c.state.since),
         entry_m=c.telemetry.position_m,
         entry_yaw_rad=c.telemetry.yaw_rad,
-        pressed=c.state.caught and presses(c),
+        pressed=c.state.caught and is_pressing(c),
         ordered_s=None,
         orders=0,
     )
@@ -138,7 +145,7 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
     """The tick with what a way down from `old` starts with; it has its entry already."""
     tel, stopped_s = c.telemetry, old.stopped_s
     heard = c.t_s - tel.t_s <= c.safety.proof_age_s
-    ordered = heard and tel.has(HL_ACTIVE) and not c.by_sight
+    ordered = heard and tel.has_bit(HL_ACTIVE) and not c.by_sight
     if ordered and not c.state.astray:
         c = c.evolve(orders=LEAST_ORDERS, ordered_s=c.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
@@ -159,7 +166,7 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
         hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )
-    return lose_position(c) if blind else c
+    return give_up_position(c) if blind else c
 
 
 # --- What is known ----------------------------------------------------
@@ -195,12 +202,12 @@ def _has_lost_its_position(c: Context) -> bool:
     return not (_is_sighted(c) if c.by_sight else c.located or c.state.astray)
 
 
-def is_in_reach(c: Context) -> bool:
+def is_in_magnet_reach(c: Context) -> bool:
     """True if the magnet may hold the vehicle: since a contact, or since it was reckoned near."""
     return c.state.contact_z_m is not None or c.state.reach_s is not None
 
 
-def is_driven(c: Context) -> bool:
+def is_motor_borne(c: Context) -> bool:
     """True if neither the weight was put on the magnet nor the motors stopped."""
     return c.state.released_s is None and c.state.stopped_s is None
 
@@ -231,7 +238,7 @@ def _is_held_elsewhere(c: Context) -> bool:
         return False
     if state.row == HELD:
         return c.obs.imu.fell_s <= state.entered_s
-    below = contact_within_m(c) < c.error_z_m <= FAR_BELOW_M and state.contact is None
+    below = contact_tolerance_m(c) < c.error_z_m <= FAR_BELOW_M and state.contact is None
     by_position = c.placed and not c.by_sight and state.jump_s is None and c.height_m > HIGH_M
     return below and (c.fresh or by_position)
 
@@ -248,7 +255,7 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
     return Finding.UNKNOWN if came_unheard or imu.gap_s > since_s else Finding.HANGS
 
 
-def hangs_where_it_did(c: Context) -> bool:
+def is_still_hanging(c: Context) -> bool:
     """True if it is at its contact by a position, or has hung all the time by the accelerometer."""
     contact_z_m, tel = c.state.contact_z_m, c.telemetry
     if not c.by_sight and c.placed and contact_z_m is not None:
@@ -258,19 +265,19 @@ def hangs_where_it_did(c: Context) -> bool:
     return _by_fall(c, c.state.reach_s) is Finding.HANGS
 
 
-def hangs_stopped(c: Context) -> bool:
+def hangs_with_motors_off(c: Context) -> bool:
     """True if the motors were stopped where it hung, and it is still there."""
     stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
     if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
         return False
-    return hangs_where_it_did(c)
+    return is_still_hanging(c)
 
 
 # --- What is remembered -----------------------------------------------
 
 
-def observe(c: Context) -> Context:
-    """The tick with what is remembered of its observation, for all who fly a way down."""
+def remember_observation(c: Context) -> Context:
+    """The tick with the state updated from its observation, for every kind of landing."""
     state, obs = c.state, c.obs
     if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
         kept = lasting_conditions(state.since)
@@ -290,14 +297,14 @@ def observe(c: Context) -> Context:
     if obs.turned_rad > math.radians(c.safety.heading_lost_deg):
         c = c.evolve(heading_lost=True, hover_thrust=_hover_thrust(c.state, obs))
     c = c.with_state(_reckon(_answered(c)))
-    comes_down = c.state.phase is Phase.LANDING and is_driven(c)
+    comes_down = c.state.phase is Phase.LANDING and is_motor_borne(c)
     if comes_down and c.state.blind_s is None and _has_lost_its_position(c):
-        return lose_position(c)
+        return give_up_position(c)
     return c
 
 
-def note_order(state: PlannerState, command: Command) -> PlannerState:
-    """The state with the commanded raw thrust."""
+def record_thrust_order(state: PlannerState, command: Command) -> PlannerState:
+    """The state after recording the raw thrust that was just commanded."""
     if isinstance(command, RawThrust):
         return replace(state, raw_order=command.thrust)
     if isinstance(command, Idle):
@@ -317,7 +324,7 @@ def _answered(c: Context) -> Context:
     return c if c.thrust_is_known else c.evolve(unread_s=c.t_s)
 
 
-def lose_position(c: Context) -> Context:
+def give_up_position(c: Context) -> Context:
     """The tick once accelerometer and attitude are all that is left, for good."""
     hover = _hover_thrust(c.state, c.obs)
     return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
@@ -332,7 +339,7 @@ def _reckon(c: Context) -> PlannerState:
         state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray
     )
     if c.located and not c.by_sight and state.last is not None:
-        new = add_step(new, state.last, obs.telemetry)
+        new = add_position_step(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
         blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
@@ -358,7 +365,7 @@ def _reckon(c: Context) -> PlannerState:
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
             if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
-            new = add_sight(new, target.measured_s, aside_m, float(ez), sigma_m)
+            new = add_sighting(new, target.measured_s, aside_m, float(ez), sigma_m)
             if seen and target.measured_s > new.stepped_s:
                 new = replace(new, stepped_m=(0.0, 0.0))
     held_s = c.held(Condition.CARRIED)
@@ -373,7 +380,7 @@ def _reckon(c: Context) -> PlannerState:
             velocity_mps=(*new.velocity_mps[:2], 0.0),
         )
     reach_s = state.reach_s
-    if is_driven(c):  # what is released or stopped moves no more
+    if is_motor_borne(c):  # what is released or stopped moves no more
         # After the floor was touched nothing climbs, whatever was reckoned since.
         near = new.below_m < REACH_M and state.touch_s is None
         within = state.contact_z_m is not None or near
@@ -472,7 +479,7 @@ def _descend(c: Context) -> Acted:
     to an unmeasured floor: then it is level from there."""
     if not _knows_its_place(c):
         return _level(c)
-    landing, in_reach, doubtful = c.planner.landing, is_in_reach(c), _is_doubtful(c)
+    landing, in_reach, doubtful = c.planner.landing, is_in_magnet_reach(c), _is_doubtful(c)
     if c.by_sight or not (in_reach or doubtful):
         state, away = leave_press(c)
         if away is not None:
@@ -484,7 +491,7 @@ def _descend(c: Context) -> Acted:
         return release_by_thrust(c) if gives_up else _by_setpoints(c)
     if c.by_sight:
         return _level(c) if c.state.level_thrust or low else _by_setpoints(c)
-    overdue = c.in_phase_s > landing.overdue_s
+    overdue = c.in_phase_s > landing.setpoint_time_s
     return _own_landing(c) if doubtful or overdue or low else _by_setpoints(c)
 
 
@@ -492,11 +499,11 @@ def _falls_free(c: Context) -> bool:
     """True if it has come off the magnet, and falls."""
     if not c.imu_proves:
         return False
-    if not is_driven(c):
-        return is_in_reach(c) and has_slipped(c)
+    if not is_motor_borne(c):
+        return is_in_magnet_reach(c) and has_slipped(c)
     if c.state.orders:
         return False
-    return c.state.contact_z_m is not None and c.state.caught and c.sinks(-DROPPING_MPS)
+    return c.state.contact_z_m is not None and c.state.caught and c.is_sinking(-DROPPING_MPS)
 
 
 def _stands(c: Context) -> bool:
@@ -504,7 +511,7 @@ def _stands(c: Context) -> bool:
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return True
     level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
-    low = c.height_m < STOP_BELOW_M and not is_in_reach(c)
+    low = c.height_m < STOP_BELOW_M and not is_in_magnet_reach(c)
     return level and low and c.climb_mps > -RESTS_MPS
 
 
@@ -546,10 +553,10 @@ def _by_setpoints(c: Context) -> Acted:
     start = replace(start, z_m=min(start.z_m, here.z_m))
     x, y, _ = state.entry_m
     goal = replace(start, x_m=x, y_m=y, z_m=state.ground_z_m + 0.5 * landing.handover_m)
-    setpoint = walk(c.evolve(setpoint=start), goal, down_mps=landing.speed_mps)
+    setpoint = step_towards(c.evolve(setpoint=start), goal, down_mps=landing.speed_mps)
     if c.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
-    state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
+    state = replace(clear_contact_below(c, PEELED_M).state, setpoint=setpoint, caught=True)
     return state, limited(c, setpoint)
 
 
@@ -572,10 +579,10 @@ def _own_landing(c: Context) -> Acted:
         return state, away
     ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
-    if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has(FLYING)):
+    if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has_bit(FLYING)):
         return state, Idle()  # on the floor: another order would spin the motors up again
     waited = math.inf if state.ordered_s is None else c.t_s - state.ordered_s
-    seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has(HL_ACTIVE)
+    seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has_bit(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.t_s - state.started_s
         order = own_landing(c.planner, state.ground_z_m, flown_s, tel.position_m[2])
@@ -626,7 +633,7 @@ def _level(c: Context) -> Acted:
     gained_mps = GRAVITY_MPS2 * (thrust / hover - 1.0) * dt_s
     under_way_mps = state.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
     state = replace(
-        left_level(c).state,
+        clear_contact_after_fall(c).state,
         hover_thrust=hover,
         level_thrust=thrust,
         touch_s=touch_s,
@@ -641,7 +648,7 @@ def _level(c: Context) -> Acted:
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
 
-def is_spent(c: Context) -> bool:
+def is_landing_over(c: Context) -> bool:
     """True if a way down is over: a level one has come to its least thrust, or the setpoint to the
     floor. Without a stop the firmware would lock the vehicle."""
     setpoint, ground_m = c.state.setpoint, c.state.ground_m
@@ -652,10 +659,10 @@ def is_spent(c: Context) -> bool:
     return 0.0 < c.state.level_thrust <= LEAST_PART * c.state.hover_thrust + 1.0
 
 
-def left_level(c: Context) -> Context:
+def clear_contact_after_fall(c: Context) -> Context:
     """The context without its contact, once a position shows it below, or it fell."""
     if c.placed and c.state.blind_s is None:
-        return left_contact(c, PEELED_M)
+        return clear_contact_below(c, PEELED_M)
     reach_s = c.state.reach_s
     if reach_s is not None and c.obs.imu.fell_s > max(reach_s, c.state.entered_s):
         reckoning = replace(c.state.reckoning, below_m=math.inf)
@@ -674,7 +681,7 @@ def _learned_hover(c: Context, dt_s: float) -> float:
     within = state.level_within
     if c.attitude_age_s > LATEST_S or not 0.7 <= tel.acc_z_g <= 1.3 or tel.thrust < 0.5 * first:
         return state.hover_thrust
-    if is_in_reach(c) or state.touch_s is not None:
+    if is_in_magnet_reach(c) or state.touch_s is not None:
         return state.hover_thrust
     felt = tel.thrust / tel.acc_z_g
     memory_s = HOVER_MEMORY_S if within == HOVER_WITHIN else 0.5 * HOVER_MEMORY_S
@@ -698,7 +705,7 @@ def _is_overdue(c: Context) -> bool:
 def _braking(c: Context) -> tuple[float, float]:
     """Roll and pitch against the sideways speed, and against the attitude's error as pictures
     measured it; level without a heading."""
-    if c.state.heading_lost or is_in_reach(c):
+    if c.state.heading_lost or is_in_magnet_reach(c):
         return 0.0, 0.0
     yaw_rad = c.telemetry.yaw_rad
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)

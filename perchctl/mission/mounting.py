@@ -33,7 +33,7 @@ _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 
 @dataclass(frozen=True)
-class Sight:
+class MountSample:
     """Vehicle and target in the plane of the estimate's world, x + iy, in metres. `lean`: from
     the vehicle to where its upward axis meets the target's plane."""
 
@@ -48,20 +48,20 @@ class Sight:
         return self.vehicle + self.lean
 
 
-def sight_of(t_s: float, telemetry: Telemetry, target_m: Array) -> Sight:
+def mount_sample(t_s: float, telemetry: Telemetry, target_m: Array) -> MountSample:
     """The sight of a target at `target_m` (3,), by the vehicle's newest sample."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
     lean_m = (float(target_m[2]) - z) * up
     place = complex(float(target_m[0]), float(target_m[1]))
-    return Sight(t_s, complex(x, y), place, complex(float(lean_m[0]), float(lean_m[1])))
+    return MountSample(t_s, complex(x, y), place, complex(float(lean_m[0]), float(lean_m[1])))
 
 
 @dataclass(frozen=True)
-class MountWatch:
+class MountingMonitor:
     """The sights since the target came into view, and what they show of the mounting."""
 
-    sights: tuple[Sight, ...] = ()
+    sights: tuple[MountSample, ...] = ()
     deaf_until_s: float = -math.inf
     fits: bool = False  # the target has stood still over `PROVEN_M`: the watch is over
     still: bool = False  # it has stood still so far
@@ -69,30 +69,30 @@ class MountWatch:
     turn_rad: float = 0.0  # the turn that would make the target stand still
 
     @property
-    def wrong(self) -> bool:
+    def is_wrong(self) -> bool:
         """True once enough sights in a row speak against the mounting."""
         return self.against >= SIGHTS_IN_A_ROW
 
     @property
-    def open(self) -> bool:
+    def is_unconfirmed(self) -> bool:
         """True while nothing confirms the mounting."""
         return not (self.fits or self.still)
 
 
-def update_watch(old: MountWatch, sight: Sight) -> MountWatch:
+def update_monitor(old: MountingMonitor, sight: MountSample) -> MountingMonitor:
     """The watch with one more sight of a measured target."""
-    if old.fits or old.wrong:
+    if old.fits or old.is_wrong:
         return old
     kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= WINDOW_S)
     if kept and _jumped(kept, sight):
-        return MountWatch(deaf_until_s=sight.t_s + SETTLES_S)
+        return MountingMonitor(deaf_until_s=sight.t_s + SETTLES_S)
     if sight.t_s < old.deaf_until_s:
         return old
     new = replace(old, sights=(*kept, sight), still=False, against=0)
     return new if len(new.sights) < LEAST_SIGHTS else _judged(new, old.against)
 
 
-def _jumped(before: tuple[Sight, ...], sight: Sight) -> bool:
+def _jumped(before: tuple[MountSample, ...], sight: MountSample) -> bool:
     last = before[-1]
     far = ESTIMATE_JUMP_M + FASTEST_MPS * (sight.t_s - last.t_s)
     if abs(sight.vehicle - last.vehicle) > far:
@@ -108,7 +108,7 @@ def _jumped(before: tuple[Sight, ...], sight: Sight) -> bool:
     return False
 
 
-def _judged(watch: MountWatch, against: int) -> MountWatch:
+def _judged(watch: MountingMonitor, against: int) -> MountingMonitor:
     aims, targets = [s.aim for s in watch.sights], [s.target for s in watch.sights]
     n, first = len(aims), aims[0]
     moved_m = max(abs(aim - first) for aim in aims)

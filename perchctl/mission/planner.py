@@ -16,12 +16,12 @@ import numpy as np
 
 from perchctl.mission import battery, lander
 from perchctl.mission.conditions import (
-    conditions_since,
     contact_error,
-    contact_within_m,
-    hovers,
+    contact_tolerance_m,
+    is_hover_thrust,
+    last_touch_error,
     lasting_conditions,
-    touched_error,
+    update_conditions,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
@@ -30,23 +30,23 @@ from perchctl.mission.guidance import (
     Acted,
     catch,
     catch_above_m,
+    clear_contact_below,
     corrected,
     hold_here,
-    integrated,
-    is_still,
+    is_pressing,
     leave_press,
-    left_contact,
     limited,
     lower_thrust,
-    presses,
+    motors_are_still,
     release_by_thrust,
-    sinking,
+    sink_setpoint,
+    step_towards,
     stop_motors,
     under_target_xy,
-    walk,
+    update_integral,
 )
 from perchctl.mission.imu import discount_wrong_positions
-from perchctl.mission.mounting import MountWatch, sight_of, update_watch
+from perchctl.mission.mounting import MountingMonitor, mount_sample, update_monitor
 from perchctl.mission.state import (
     Condition,
     ContactError,
@@ -60,7 +60,7 @@ from perchctl.mission.table import (
     IN_THE_OPEN,
     TABLE,
     Transition,
-    first_match,
+    first_transition,
     hold_reason,
 )
 from perchctl.profile import Profile
@@ -84,25 +84,25 @@ def step_mission(
     """Fly one tick of the mission; `state` is None in the first, on the ground. Returns the new
     state, and the command to send."""
     c = _remember(Context(state or PlannerState.on_ground(obs), obs, profile))
-    row = first_match(c, table)
+    row = first_transition(c, table)
     if row is not None:
         c = _enter(c, row)
         c = c.evolve(hold=hold_reason(c))
     new, command = act(c)
-    return replace(lander.note_order(new, command), t_s=obs.t_s), command
+    return replace(lander.record_thrust_order(new, command), t_s=obs.t_s), command
 
 
 def _remember(c: Context) -> Context:
-    c = lander.observe(c.with_state(_with_target(c.state, c.obs)))
-    hold, since, hover = hold_reason(c), conditions_since(c), c.state.hover_thrust
+    c = lander.remember_observation(c.with_state(_with_target(c.state, c.obs)))
+    hold, since, hover = hold_reason(c), update_conditions(c), c.state.hover_thrust
     if hold:
         since = lasting_conditions(since)  # a held vehicle proves nothing
     away = c.state.phase is not Phase.ASCEND or c.error_z_m > c.planner.ascend.near_m
-    if away and c.state.phase in _LEARNING and hovers(c):
+    if away and c.state.phase in _LEARNING and is_hover_thrust(c):
         hover = _learned_hover_thrust(c.state, c.obs)
     energy = battery.read_battery(c)
     c = c.evolve(hold=hold, hover_thrust=hover, last=c.telemetry, energy=energy)
-    return c.evolve(battery=battery.outlook(c), since=since, mount=_mount_watched(c))
+    return c.evolve(battery=battery.battery_outlook(c), since=since, mount=_mount_watched(c))
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -124,14 +124,14 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
     )
 
 
-def _mount_watched(c: Context) -> MountWatch:
+def _mount_watched(c: Context) -> MountingMonitor:
     """The mounting's watch with this tick's frame, if that measured the target over fresh
     telemetry."""
     state = c.state
     measured = c.obs.new_frame and state.confirmed > 0 and c.proves and not state.hold
     if state.target_m is None or not measured or state.phase not in IN_THE_OPEN:
         return state.mount
-    return update_watch(state.mount, sight_of(c.t_s, c.telemetry, state.target_m))
+    return update_monitor(state.mount, mount_sample(c.t_s, c.telemetry, state.target_m))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -150,13 +150,13 @@ def _enter(c: Context, row: Transition) -> Context:
     # An ordered press has wound the integrators up, whatever thrust is read; a fall that is just
     # being caught turns at full thrust in the air.
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
-    pressed = ends and state.caught and (state.phase is Phase.PERCH or presses(c))
+    pressed = ends and state.caught and (state.phase is Phase.PERCH or is_pressing(c))
     new = c.evolve(
         phase=row.to,
         entered_s=c.t_s,
         reason=row.reason if isinstance(row.reason, str) else row.reason(c),
         row=row.name,
-        severity=state.severity.then(row.severity),
+        severity=state.severity.escalate(row.severity),
         stop=row.stop,
         outcome=_outcome(state, row),
         since=lasting_conditions(state.since),
@@ -186,7 +186,7 @@ def _started_phase(new: Context, c: Context) -> Context:
     old, row, z_m = c.state, new.state.row, c.telemetry.position_m[2]
     match new.state.phase:
         case Phase.COMPLETE:
-            contact = touched_error(c) or contact_error(c)
+            contact = last_touch_error(c) or contact_error(c)
             return new.evolve(contact_z_m=z_m, contact=contact, released_s=None)
         case Phase.RECOVER:
             touched = old.phase is Phase.PERCH or row == "blocked"
@@ -204,7 +204,7 @@ def _started_phase(new: Context, c: Context) -> Context:
         case Phase.LANDING:
             # The mounting may be right and the motion capture's axes wrong, by which the landing
             # would speed up until it tilts over.
-            capture = c.profile.positioning.by == "mocap" and old.mount.wrong
+            capture = c.profile.positioning.by == "mocap" and old.mount.is_wrong
             if row == "position-astray" or (row == "mounting" and capture):
                 reckoning = old.reckoning if old.astray else discount_wrong_positions(old.reckoning)
                 new = new.evolve(astray=True, reckoning=reckoning)
@@ -230,7 +230,7 @@ def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
         return old.contact if old.contact_z_m is not None else None
     proven = c.held(Condition.CONTACT) >= c.planner.perch.contact_dwell_s
     carried = proven or c.held(Condition.CARRIED) >= 0.0  # which has that dwell in itself
-    if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_within_m(c):
+    if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_tolerance_m(c):
         return contact_error(c)
     return None
 
@@ -244,7 +244,7 @@ def act(c: Context) -> Acted:
     leaves = c.state.phase is Phase.RECOVER and (c.state.pressed or not c.state.caught)
     if c.state.hold and c.state.setpoint is not None and not leaves:
         lift = c.state.phase is not Phase.APPROACH or c.height_m > LIFTED_M
-        return _fly_to(c, sinking(c, c.state.setpoint), lift=lift)
+        return _fly_to(c, sink_setpoint(c, c.state.setpoint), lift=lift)
     return ACTIONS[c.state.phase](c)
 
 
@@ -256,9 +256,9 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
 def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
     """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
-    trim = integrated(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
+    trim = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = c.evolve(integral_m=trim)
-    return _fly_to(c, walk(c, goal, up_mps=up_mps))
+    return _fly_to(c, step_towards(c, goal, up_mps=up_mps))
 
 
 def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
@@ -277,7 +277,7 @@ def _approach(c: Context) -> Acted:
     if planner.approach_xy_m is not None and c.height_m > 0.7 * planner.takeoff_height_m:
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
-    setpoint = walk(c.evolve(setpoint=start), goal, up_mps=planner.takeoff_speed_mps)
+    setpoint = step_towards(c.evolve(setpoint=start), goal, up_mps=planner.takeoff_speed_mps)
     return _fly_to(c, setpoint, lift=c.height_m > LIFTED_M)
 
 
@@ -292,7 +292,7 @@ def _search(c: Context) -> Acted:
     x, y, z = state.entry_m
     if c.target_m is not None:
         there = under_target_xy(c, state.entry_yaw_rad)
-        x, y = _not_far(state.mount, (x, y), there) if state.mount.open else there
+        x, y = _not_far(state.mount, (x, y), there) if state.mount.is_unconfirmed else there
         height = min(z, c.contact_goal_z_m - c.planner.ascend.near_m)
     else:
         top = max(z, ground_m[2] + search.max_height_m)
@@ -301,11 +301,11 @@ def _search(c: Context) -> Acted:
         height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
     goal = PositionSetpoint(x, y, height, yaw)
-    return _fly_to(c, walk(c, goal, up_mps=c.planner.ascend.speed_mps))
+    return _fly_to(c, step_towards(c, goal, up_mps=c.planner.ascend.speed_mps))
 
 
 def _not_far(
-    mount: MountWatch, start: tuple[float, float], goal: tuple[float, float]
+    mount: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
 ) -> tuple[float, float]:
     """The goal, world x and y (m), cut to `WARY_M` from the last sight, else from `start`."""
     if mount.sights:
@@ -335,7 +335,7 @@ def _perch(c: Context) -> Acted:
     if c.target_m is None:
         return _fly_to(c, c.state.setpoint or hold_here(c), lift=False)
     goal = _target_goal(c, c.contact_goal_z_m + perch.press_m)
-    return _fly_to(c, walk(c, goal, up_mps=perch.climb_mps, down_mps=0.0), lift=False)
+    return _fly_to(c, step_towards(c, goal, up_mps=perch.climb_mps, down_mps=0.0), lift=False)
 
 
 def _complete(c: Context) -> Acted:
@@ -351,7 +351,7 @@ def _recover(c: Context) -> Acted:
     if (caught := catch(c)) is not None:
         return caught
     recover = c.planner.recover
-    c = left_contact(c, min(AWAY_M, 0.5 * recover.descend_m))
+    c = clear_contact_below(c, min(AWAY_M, 0.5 * recover.descend_m))
     state, away = leave_press(c)
     if away is not None:
         return state, away
@@ -368,14 +368,14 @@ def _recover(c: Context) -> Acted:
     else:
         goal = replace(setpoint, z_m=z)
     c = c.with_state(replace(state, setpoint=setpoint))
-    return _fly_to(c, walk(c, goal, down_mps=FREE_SPEED_MPS))
+    return _fly_to(c, step_towards(c, goal, down_mps=FREE_SPEED_MPS))
 
 
 def _aborted(c: Context) -> Acted:
     """The motor stop, once; what hangs with its motors still would be locked without one."""
     if c.state.orders:
         return c.state, Idle()
-    ends = StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
+    ends = StopMotors() if motors_are_still(c) or lander.is_landing_over(c) else Idle()
     return replace(c.state, orders=1, ordered_s=c.t_s), c.state.stop or ends
 
 

@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 from perchctl.geometry import Array
 from perchctl.mission.context import Context
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
-from perchctl.mission.table import unplaced_text
+from perchctl.mission.table import position_loss_text
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
 from perchctl.vision import Consistency, PictureKind, PipelineOutput, TargetEstimate
@@ -43,7 +43,7 @@ class Event:
 
     @classmethod
     def of_rescue(cls, t_s: float, error: BaseException, rest: str) -> Event:
-        """The note on what became of a vehicle after an error in flight; `rest` as in `rest_of`."""
+        """The note on what became of a vehicle after an error in flight; `rest`: see `rest_text`."""
         return cls(t_s, EventKind.NOTE, f"{type(error).__name__}{RESCUE}{rest}")
 
     @property
@@ -71,7 +71,7 @@ class Event:
             held = EventKind.HOLD, state.hold, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
-            text = unplaced_text(Context(state, obs, profile))
+            text = position_loss_text(Context(state, obs, profile))
             events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))
         return events
 
@@ -103,7 +103,7 @@ class ExternalPositions:
 
 
 @dataclass(frozen=True)
-class FrameSeen:
+class FrameRecord:
     """A `perchctl.vision.Frame` as its source gave it, without its picture."""
 
     index: int
@@ -120,7 +120,7 @@ class TurnInputs:
 
     samples: tuple[Telemetry, ...] = ()  # in the order in which they came
     late: tuple[Telemetry, ...] = ()  # those that came while camera or vision hung
-    frame: FrameSeen | None = None
+    frame: FrameRecord | None = None
     problem: str | None = None  # problem, ended, live: the source's own
     ended: bool = False
     live: bool = True
@@ -128,7 +128,7 @@ class TurnInputs:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseSeen:
+class UnfilteredPose:
     """An unfiltered pose of the target, as of a `perchctl.vision.MarkerPose`."""
 
     t_s: float
@@ -150,7 +150,7 @@ class Turn:
     began_s: float
     t_s: float  # for which it was decided; later than `began_s` where it hung
     taken: TurnInputs
-    poses: dict[str, PoseSeen] = field(default_factory=dict)  # by large, small, joint
+    poses: dict[str, UnfilteredPose] = field(default_factory=dict)  # by large, small, joint
     observation: Observation | None = None  # None while waiting
     command: Command | None = None  # None while waiting, and of one that failed
     phase: Phase | None = None

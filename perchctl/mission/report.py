@@ -136,28 +136,28 @@ class FlightReport:
             attempts=state.attempts + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP),
             duration_s=obs.t_s - state.started_s,
             # The telemetry at hand is older than an emergency stop, which always locks.
-            locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
+            locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
             history=history,
             findings=None if consistency is None else Findings.of(consistency, profile.camera),
             contact=contact if placed else None,
-            touchdown=touchdown_of(Context(state, obs, profile)),
+            touchdown=find_touchdown(Context(state, obs, profile)),
         )
 
 
-def rest_of(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
+def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
     """Where the vehicle is, as a sentence without its end, once its motors have been seen off for
     `off_s`; None before that. A hard touchdown is told with it."""
     c = Context(state, obs, profile)
     if c.held(Condition.DOWN) < off_s:
         return None
-    finding, touchdown = rest_finding(c), touchdown_of(c)
+    finding, touchdown = rest_finding(c), find_touchdown(c)
     hangs = finding in (Finding.HANGS, Finding.HELD)
     if hangs or touchdown is None or not touchdown.is_hard:
         return finding.value
     return f"{finding.value}; it {touchdown.text}"
 
 
-def touchdown_of(c: Context) -> Touchdown | None:
+def find_touchdown(c: Context) -> Touchdown | None:
     """The newest blow from below, where it may have been the floor's; None if there was none.
 
     Its speed is the estimate's where that is believed, else as reckoned by the accelerometer."""

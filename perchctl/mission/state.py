@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
-from perchctl.mission.imu import ImuMotion, Reckoning
-from perchctl.mission.mounting import MountWatch
+from perchctl.mission.imu import DeadReckoning, ImuMotion
+from perchctl.mission.mounting import MountingMonitor
 from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors, Telemetry
 from perchctl.vision import TargetEstimate
 
@@ -62,7 +62,7 @@ class Severity(IntEnum):
     LAND = 3
     STOP = 4
 
-    def then(self, row: Severity) -> Severity:
+    def escalate(self, row: Severity) -> Severity:
         """The flight's severity after a transition: from `LAND` on it only rises."""
         return max(self, row) if self >= Severity.LAND else row
 
@@ -228,7 +228,7 @@ class PlannerState:
     confirmed: int = 0
     target_m: Array | None = None  # in the world, at the last frame that measured it
     target_spread_m: float = 0.0  # by which successive frames' targets differ
-    mount: MountWatch = field(default_factory=MountWatch)  # does the target stand still
+    mount: MountingMonitor = field(default_factory=MountingMonitor)  # does the target stand still
     ground_m: tuple[float, float, float] | None = None
     entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_yaw_rad: float = 0.0
@@ -250,7 +250,9 @@ class PlannerState:
     last: Telemetry | None = None  # the newest sample that was decided on
     energy: EnergyState = field(default_factory=EnergyState)  # fitted to the battery
     battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
-    reckoning: Reckoning = field(default_factory=Reckoning)  # speed and place by the accelerometer
+    reckoning: DeadReckoning = field(
+        default_factory=DeadReckoning
+    )  # speed and place by the accelerometer
     reach_s: float | None = None  # within the magnet's reach since
     contact: ContactError | None = None  # as it made contact
     heading_lost: bool = False  # position control would lead away from its setpoint

@@ -9,15 +9,15 @@ import math
 from collections.abc import Callable, Set
 from dataclasses import dataclass
 
-from perchctl.mission.battery import is_short_of_charge, why_short
+from perchctl.mission.battery import battery_shortfall, is_short_of_charge
 from perchctl.mission.conditions import (
     SATURATED,
     contact_error,
-    contact_within_m,
+    contact_tolerance_m,
     has_slipped,
     is_at_target,
-    press_thrust,
-    touched_error,
+    last_touch_error,
+    max_press_thrust,
 )
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.imu import PUSHED_S
@@ -25,8 +25,8 @@ from perchctl.mission.lander import (
     HELD,
     LOOKED_S,
     Finding,
-    hangs_stopped,
-    hangs_where_it_did,
+    hangs_with_motors_off,
+    is_still_hanging,
     rest_finding,
 )
 from perchctl.mission.state import (
@@ -120,7 +120,7 @@ def _away_m(c: Context) -> float:
     return 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
 
 
-def why_astray(c: Context) -> str:
+def astray_reason(c: Context) -> str:
     if _swings(c):
         return (
             f"it swings up and down, now at {-c.climb_mps:.1f} m/s: are the positions of the "
@@ -138,14 +138,14 @@ def why_astray(c: Context) -> str:
     )
 
 
-def is_lost(c: Context) -> bool:
+def is_position_lost(c: Context) -> bool:
     """True if no position has come for so long that none is waited for any more."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
 
 
-def unplaced_text(c: Context) -> str:
+def position_loss_text(c: Context) -> str:
     """The words for how long no external position was sent, and why."""
     if c.is_blown:
         return "pushed aside while the target was not seen"
@@ -156,7 +156,7 @@ def unplaced_text(c: Context) -> str:
     return f"{text}: {why}" if why else text
 
 
-def fence_broken(c: Context) -> bool:
+def is_outside_fence(c: Context) -> bool:
     """True if the vehicle is farther from its take-off than the fence allows."""
     if c.state.ground_m is None:
         return False
@@ -165,7 +165,7 @@ def fence_broken(c: Context) -> bool:
     return math.hypot(dx, dy) > c.safety.fence_radius_m
 
 
-def why_latency(c: Context) -> str:
+def latency_reason(c: Context) -> str:
     assumed_s = c.profile.camera.start_latency_s + c.obs.delay_s
     return (
         f"the pictures are {1e3 * (assumed_s + c.mismatch.later_s):.0f} ms old, not "
@@ -173,15 +173,15 @@ def why_latency(c: Context) -> str:
     )
 
 
-def mounted_wrong(c: Context) -> bool:
+def is_mounting_wrong(c: Context) -> bool:
     """True if the target moves with the vehicle, or seems to lie below it."""
     below = c.held(C.TARGET_BELOW) >= BELOW_S
-    return c.state.mount.wrong or c.mismatch.turn_rad != 0.0 or below
+    return c.state.mount.is_wrong or c.mismatch.turn_rad != 0.0 or below
 
 
-def why_mounted_wrong(c: Context) -> str:
+def mounting_reason(c: Context) -> str:
     turn_rad = c.mismatch.turn_rad
-    if turn_rad or c.state.mount.wrong:
+    if turn_rad or c.state.mount.is_wrong:
         turn_deg = 10 * round(math.degrees(turn_rad or c.state.mount.turn_rad) / 10.0)
         turn_deg = 180 if turn_deg == -180 else turn_deg
         text = (
@@ -197,7 +197,7 @@ def why_mounted_wrong(c: Context) -> str:
     )
 
 
-def why_not_found(c: Context) -> str:
+def not_found_reason(c: Context) -> str:
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refused
     return f"{text}: {why}" if why else text
@@ -210,16 +210,16 @@ def is_caught(c: Context) -> bool:
     """True if the target's magnet holds it already."""
     if c.held(C.HANGING) < HANGING_S:
         return False
-    touched, radius_m = touched_error(c), c.planner.perch.contact_xy_m
+    touched, radius_m = last_touch_error(c), c.planner.perch.contact_xy_m
     near = touched is not None and max(touched.aside_m, touched.sigma_m) <= radius_m
     return near or is_at_target(c)
 
 
 def is_held_elsewhere(c: Context) -> bool:
     """True if something else than the target's magnet holds it: at another height, or beside."""
-    touched = touched_error(c)
+    touched = last_touch_error(c)
     error = touched or contact_error(c)
-    at_its_height = touched is not None or abs(c.error_z_m) <= contact_within_m(c)
+    at_its_height = touched is not None or abs(c.error_z_m) <= contact_tolerance_m(c)
     beside = error.aside_m - 2.0 * error.sigma_m > c.planner.perch.contact_xy_m
     return c.held(C.HANGING) >= HELD_S and (beside or not at_its_height)
 
@@ -232,17 +232,17 @@ def is_blocked(c: Context) -> bool:
 def is_blocked_off_target(c: Context) -> bool:
     """True if it is blocked, and in the press too far from the target to prove a contact."""
     pressing = c.state.phase is P.PERCH
-    return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_within_m(c))
+    return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_tolerance_m(c))
 
 
-def too_weak(c: Context) -> bool:
+def lacks_press_thrust(c: Context) -> bool:
     """True if no thrust is left to press with: seen at full thrust, or known before the press."""
     if c.state.pressed:
         return False
     if c.held(C.SATURATED) >= WEAK_S:
         return True
     near = c.state.phase is P.ASCEND and c.held(C.NEAR_STANDOFF) >= 0.0
-    return near and c.state.hover_thrust > SATURATED * press_thrust(c.profile)
+    return near and c.state.hover_thrust > SATURATED * max_press_thrust(c.profile)
 
 
 # --- Attempts, the press and the release ------------------------------
@@ -259,7 +259,7 @@ def has_recovered(c: Context) -> bool:
     return steady and c.state.contact_z_m is None
 
 
-def too_little_left(c: Context) -> bool:
+def lacks_charge_to_begin(c: Context) -> bool:
     """True if an attempt would begin, or begin anew, and the battery has not enough for it."""
     begins = is_aligned(c) if c.state.phase is P.ALIGN else has_recovered(c)
     return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
@@ -269,10 +269,10 @@ def is_in_contact(c: Context) -> bool:
     return c.held(C.CONTACT) >= c.planner.perch.contact_dwell_s
 
 
-def why_contact(c: Context) -> str:
+def contact_reason(c: Context) -> str:
     by = "position, acceleration and thrust"
     if not c.placed:
-        by = f"acceleration and thrust, {unplaced_text(c)}"
+        by = f"acceleration and thrust, {position_loss_text(c)}"
     return f"contact proven by {by}; {contact_error(c).text}"
 
 
@@ -286,7 +286,7 @@ def release_monitored(c: Context) -> bool:
     return stopped_for_s(c) >= c.planner.complete.watch_s and c.held(C.DOWN) >= 0.1
 
 
-def is_off_as(finding: Finding) -> Predicate:
+def motors_off_as(finding: Finding) -> Predicate:
     """The predicate that the motors are off, and that the vehicle is found to hang or stand so."""
     return lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is finding
 
@@ -298,7 +298,7 @@ def hold_reason(c: Context) -> str:
     """Why the vehicle must stay where it is in this tick, or the empty string."""
     phase = c.state.phase
     if phase in IN_THE_OPEN and c.position_is_stale:
-        return unplaced_text(c)
+        return position_loss_text(c)
     if phase not in BY_CAMERA:
         return ""
     if c.telemetry_age_s > c.safety.telemetry_hold_s:
@@ -310,11 +310,11 @@ def hold_reason(c: Context) -> str:
     if c.obs.loop_late_s > c.safety.loop_late_hold_s:
         return f"the control loop is {c.obs.loop_late_s:.1f} s late"
     if phase is not P.RECOVER and c.obs.camera_age_s > c.safety.camera_hold_s:
-        return why_no_picture(c)
+        return no_picture_reason(c)
     return ""
 
 
-def why_no_picture(c: Context) -> str:
+def no_picture_reason(c: Context) -> str:
     return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
 
 
@@ -328,40 +328,40 @@ def why_unconfirmed(c: Context) -> str:
 # --- The ways out of the mission --------------------------------
 
 
-def cuts(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
-    """The motors are cut and locked, wherever in the air it is."""
+def cut_row(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
+    """Return a row of the table: cut and lock the motors at once, in any airborne phase."""
     return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, stop=EmergencyStop())
 
 
-def ends(name: str, bit: int, reason: str) -> Transition:
-    """The supervisor has ended the flight: the motors are stopped."""
+def end_row(name: str, bit: int, reason: str) -> Transition:
+    """Return a row of the table: the supervisor set `bit`, so stop the motors and abort."""
 
     def when(c: Context) -> bool:
-        return c.telemetry.has(bit)
+        return c.telemetry.has_bit(bit)
 
     return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, O.SAFETY, stop=StopMotors())
 
 
-def lands(
+def land_row(
     name: str, phases: Set[Phase], when: Predicate, reason: Reason, outcome: Outcome = O.SAFETY
 ) -> Transition:
-    """The flight is over: the way down begins."""
+    """Return a row of the table: finish the mission and begin the way down."""
     return Transition(name, phases, when, P.LANDING, reason, S.LAND, outcome)
 
 
-def backs_off(name: str, phases: Set[Phase], when: Predicate, reason: Reason) -> Transition:
-    """The attempt has failed: down a little, and another one."""
+def back_off_row(name: str, phases: Set[Phase], when: Predicate, reason: Reason) -> Transition:
+    """Return a row of the table: the attempt failed, so descend a little and try again."""
     return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF)
 
 
-def gives_up(name: str, when: Predicate, reason: Reason) -> Transition:
-    """The landing has ended, and not as it should."""
+def give_up_row(name: str, when: Predicate, reason: Reason) -> Transition:
+    """Return a row of the table: the landing was not completed normally."""
     return Transition(name, {P.LANDING}, when, P.ABORTED, reason, S.LAND, O.SAFETY)
 
 
 TABLE: tuple[Transition, ...] = (
     # --- the safety rows, gravest first ------------------------------------------
-    cuts(
+    cut_row(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
         "second Ctrl-C: emergency stop",
@@ -370,58 +370,58 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "hung-but-locked",
         {P.COMPLETE, P.LANDING},
-        lambda c: c.telemetry.has(LOCKED) and hangs_stopped(c),
+        lambda c: c.telemetry.has_bit(LOCKED) and hangs_with_motors_off(c),
         P.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=O.PERCHED,
     ),
-    ends("locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"),
-    ends("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
-    ends("crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"),
-    cuts(
+    end_row("locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"),
+    end_row("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
+    end_row("crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"),
+    cut_row(
         "tilted",
         lambda c: c.held(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
         "tilted beyond the limit: motors cut",
     ),
-    lands(
+    land_row(
         "operator-land",
         FLYING_PHASES,
         lambda c: c.obs.operator >= Operator.LAND,
         "the operator asked to land",
         O.OPERATOR,
     ),
-    lands(
+    land_row(
         "link-lost",
         FLYING_PHASES,
         lambda c: c.obs.link_problem is not None,
         lambda c: f"link lost: {c.obs.link_problem}",
     ),
-    lands(
+    land_row(
         "telemetry-stale",
         FLYING_PHASES,
         lambda c: c.telemetry_age_s > c.safety.telemetry_land_s,
         lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s",
     ),
-    lands(
+    land_row(
         "heading-lost",
         BEFORE_CONTACT,
         lambda c: c.state.heading_lost,
         "the estimated heading jumped: down level, by thrust alone",
     ),
-    lands("position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, why_astray),
-    lands(
+    land_row("position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, astray_reason),
+    land_row(
         "position-lost",
         IN_THE_OPEN | {P.PERCH},
-        is_lost,
-        lambda c: f"{unplaced_text(c)}; down level, by thrust alone",
+        is_position_lost,
+        lambda c: f"{position_loss_text(c)}; down level, by thrust alone",
     ),
-    lands(
+    land_row(
         "estimator-jump",
         BEFORE_CONTACT,
         lambda c: c.state.jump_s is not None and c.t_s - c.state.jump_s >= c.safety.jump_hold_s,
         "the state estimate jumped: landing where it is",
     ),
-    lands(
+    land_row(
         "estimate-unsure",
         IN_THE_OPEN,
         lambda c: c.held(C.UNSURE) >= c.safety.variance_land_s,
@@ -430,53 +430,53 @@ TABLE: tuple[Transition, ...] = (
             f"{c.safety.flight_variance_m2:g} allowed: is the positioning system gone?"
         ),
     ),
-    lands(
+    land_row(
         "battery-low",
         BEFORE_CONTACT,
         lambda c: c.held(C.BATTERY_LOW) >= c.safety.battery_debounce_s,
         lambda c: f"battery at {c.telemetry.battery_v:.2f} V under load",
     ),
-    lands(
+    land_row(
         "battery-unknown",
         BEFORE_CONTACT,
         lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
         "the battery's reading stands still",
     ),
-    lands("latency", IN_THE_OPEN, lambda c: c.mismatch.later_s != 0.0, why_latency),
-    lands("mounting", IN_THE_OPEN, mounted_wrong, why_mounted_wrong),
-    lands(
+    land_row("latency", IN_THE_OPEN, lambda c: c.mismatch.later_s != 0.0, latency_reason),
+    land_row("mounting", IN_THE_OPEN, is_mounting_wrong, mounting_reason),
+    land_row(
         "height-limit",
         BEFORE_CONTACT,
         lambda c: c.height_m > c.safety.max_height_m,
         lambda c: f"height {c.height_m:.2f} m is above the limit",
     ),
-    lands("fence", BEFORE_CONTACT, fence_broken, "outside the fence"),
-    lands(
+    land_row("fence", BEFORE_CONTACT, is_outside_fence, "outside the fence"),
+    land_row(
         "camera-gone",
         BY_CAMERA,
         lambda c: c.obs.camera_age_s > c.safety.camera_land_s,
-        why_no_picture,
+        no_picture_reason,
     ),
-    lands(
+    land_row(
         "loop-late",
         FLYING_PHASES,
         lambda c: c.obs.loop_late_s > c.safety.loop_late_land_s,
         lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late",
     ),
-    lands(
+    land_row(
         "markers-disagree",
         BY_CAMERA,
         lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
         "large and small marker contradict each other: check the printed sizes in the "
         "profile and the camera's calibration",
     ),
-    lands(
+    land_row(
         "log-lost",
         BEFORE_CONTACT,
         lambda c: c.safety.land_on_log_error and c.obs.log_problem is not None,
         lambda c: f"flight log: {c.obs.log_problem}",
     ),
-    lands(
+    land_row(
         "time-over",
         BEFORE_CONTACT,
         lambda c: c.t_s - c.state.started_s > c.planner.perching_time_s,
@@ -485,24 +485,26 @@ TABLE: tuple[Transition, ...] = (
     ),
     # --- the magnet may catch early ---------------------------------------------
     Transition("caught", BEFORE_COMPLETION, is_caught, P.COMPLETE, "hanging on the magnet already"),
-    lands(HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"),
-    lands(
+    land_row(
+        HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"
+    ),
+    land_row(
         "hangs-at-contact",
         BEFORE_COMPLETION,
         lambda c: c.held(C.HANGING) >= HELD_S,
         lambda c: (
-            f"it hangs at the target's height, {(touched_error(c) or contact_error(c)).text}: "
+            f"it hangs at the target's height, {(last_touch_error(c) or contact_error(c)).text}: "
             f"that may be its magnet"
         ),
     ),
     # --- something is in the way -----------------------------------------------
-    lands(
+    land_row(
         "cannot-rise",
         {P.APPROACH},
-        lambda c: is_blocked(c) or too_weak(c),
+        lambda c: is_blocked(c) or lacks_press_thrust(c),
         lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
     ),
-    backs_off(
+    back_off_row(
         "blocked",
         BEFORE_COMPLETION,
         is_blocked_off_target,
@@ -511,10 +513,10 @@ TABLE: tuple[Transition, ...] = (
             + ("" if c.state.hover_thrust else ", or the thrust is weak")
         ),
     ),
-    lands(
+    land_row(
         "too-weak",
         BY_CAMERA,
-        too_weak,
+        lacks_press_thrust,
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
         "something is above",
     ),
@@ -526,7 +528,7 @@ TABLE: tuple[Transition, ...] = (
         P.SEARCH,
         "hovering in the perching area",
     ),
-    lands(
+    land_row(
         "approach-timeout",
         {P.APPROACH},
         lambda c: c.in_phase_s > c.planner.approach_timeout_s,
@@ -540,11 +542,11 @@ TABLE: tuple[Transition, ...] = (
         P.ESTIMATE,
         "target seen",
     ),
-    lands(
+    land_row(
         "searched-out",
         {P.SEARCH},
         lambda c: c.state.searches >= c.planner.search.attempts,
-        why_not_found,
+        not_found_reason,
         O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
@@ -572,16 +574,16 @@ TABLE: tuple[Transition, ...] = (
         "target lost in alignment",
         S.HOLD,
     ),
-    backs_off(
+    back_off_row(
         "align-timeout",
         {P.ALIGN},
         lambda c: c.in_phase_s > c.planner.align.timeout_s,
         "alignment took too long",
     ),
-    lands("too-little-left", {P.ALIGN, P.RECOVER}, too_little_left, why_short),
+    land_row("too-little-left", {P.ALIGN, P.RECOVER}, lacks_charge_to_begin, battery_shortfall),
     Transition("aligned", {P.ALIGN}, is_aligned, P.ASCEND, "aligned in position and heading"),
     # --- phase 5: ascend -----------------------------------------------------
-    backs_off("ascend-lost", {P.ASCEND}, lambda c: not c.tracked, "target lost in ascent"),
+    back_off_row("ascend-lost", {P.ASCEND}, lambda c: not c.tracked, "target lost in ascent"),
     Transition(
         "outside-cone",
         {P.ASCEND},
@@ -590,7 +592,7 @@ TABLE: tuple[Transition, ...] = (
         "drifted out of the cone",
         S.HOLD,
     ),
-    backs_off(
+    back_off_row(
         "ascend-timeout",
         {P.ASCEND},
         lambda c: (
@@ -607,27 +609,27 @@ TABLE: tuple[Transition, ...] = (
         "settled at the stand-off",
     ),
     # --- phase 6: perch ------------------------------------------------------
-    backs_off(
+    back_off_row(
         "beside-the-magnet",
         {P.PERCH},
         lambda c: is_in_contact(c) and not contact_error(c).is_within(c.planner.perch.contact_xy_m),
         lambda c: f"contact {contact_error(c).text}",
     ),
-    Transition("contact", {P.PERCH}, is_in_contact, P.COMPLETE, why_contact),
-    backs_off(
+    Transition("contact", {P.PERCH}, is_in_contact, P.COMPLETE, contact_reason),
+    back_off_row(
         # The last centimetres are flown unseen: by the target alone, by dead reckoning.
         "pressed-blindly",
         {P.PERCH},
         lambda c: c.by_sight and c.position_age_s > BLIND_PRESS_S,
         lambda c: f"no contact {c.position_age_s:.1f} s after the last sight of the target",
     ),
-    backs_off(
+    back_off_row(
         "knocked-aside",
         {P.PERCH},
         lambda c: c.held(C.KNOCKED) >= KNOCKED_S,
         "pushed aside under the target",
     ),
-    backs_off(
+    back_off_row(
         # Not in time, or not before the next turn of a loop as late as this one.
         "no-contact",
         {P.PERCH},
@@ -635,13 +637,13 @@ TABLE: tuple[Transition, ...] = (
         "no proof of contact",
     ),
     # --- phase 7: completion -------------------------------------------------
-    backs_off(
+    back_off_row(
         "slipped",
         {P.COMPLETE},
         has_slipped,
         lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
     ),
-    backs_off(
+    back_off_row(
         "not-released",
         {P.COMPLETE},
         lambda c: c.state.stopped_s is None and c.in_phase_s > c.planner.complete.release_timeout_s,
@@ -650,20 +652,22 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "perched",
         {P.COMPLETE},
-        lambda c: release_monitored(c) and hangs_where_it_did(c),
+        lambda c: release_monitored(c) and is_still_hanging(c),
         P.PERCHED,
         "hanging still with the motors off",
         outcome=O.PERCHED,
     ),
-    lands("fell-unseen", {P.COMPLETE}, release_monitored, "it is not known to hang where it did"),
-    lands(
+    land_row(
+        "fell-unseen", {P.COMPLETE}, release_monitored, "it is not known to hang where it did"
+    ),
+    land_row(
         "not-stopped",
         {P.COMPLETE},
         lambda c: stopped_for_s(c) > c.planner.complete.watch_s + UNSTOPPED_S,
         lambda c: f"motors stopped, but their thrust still reads {c.telemetry.thrust:.0f}",
     ),
     # --- the failed attempt --------------------------------------------------
-    lands(
+    land_row(
         "attempts-used",
         {P.RECOVER},
         lambda c: c.state.attempts >= c.planner.attempts and c.in_phase_s > 0.5,
@@ -677,7 +681,7 @@ TABLE: tuple[Transition, ...] = (
         P.ESTIMATE,
         "steady again, trying once more",
     ),
-    lands(
+    land_row(
         "recover-timeout",
         {P.RECOVER},
         lambda c: c.in_phase_s > c.planner.recover.timeout_s,
@@ -687,32 +691,32 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "hung",
         {P.LANDING},
-        is_off_as(Finding.HANGS),
+        motors_off_as(Finding.HANGS),
         P.PERCHED,
         "hanging with the motors off",
     ),
     Transition(
         "landed",
         {P.LANDING},
-        is_off_as(Finding.STANDS),
+        motors_off_as(Finding.STANDS),
         P.LANDED,
         lambda c: (
             "motors off"
             + ("" if c.state.blind_s is None else "; it was felt to come down to the floor")
         ),
     ),
-    gives_up(
+    give_up_row(
         "held-elsewhere",
-        is_off_as(Finding.HELD),
+        motors_off_as(Finding.HELD),
         "motors off; something holds it where its estimate has no target: look before you touch it",
     ),
-    gives_up(
+    give_up_row(
         "hangs-or-stands",
         lambda c: c.held(C.DOWN) >= LOOKED_S,
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it",
     ),
-    gives_up(
+    give_up_row(
         "landing-timeout",
         lambda c: c.in_phase_s > c.planner.landing.timeout_s,
         why_unconfirmed,
@@ -720,7 +724,7 @@ TABLE: tuple[Transition, ...] = (
 )
 
 
-def first_match(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
+def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
     """The first transition that applies, or None to stay. Whatever the table says, one that would
     lead from a landing to a flying phase is passed over."""
     landing = c.state.severity >= Severity.LAND

@@ -64,8 +64,8 @@ def update_calibration(
     is_measured = pose.cov is not None and finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
     if is_measured and before is not None and after is not None:
         velocity_mps = velocity_at(history, t_s - delay_s)
-        moment = consistency_moment(pose, before, after, velocity_mps, delay_s, setup)
-        new = replace(old, sums=add_moment(old.sums, t_s, *moment))
+        moment = consistency_rows(pose, before, after, velocity_mps, delay_s, setup)
+        new = replace(old, sums=add_rows(old.sums, t_s, *moment))
         if t_s - old.solved_s >= SOLVE_EVERY_S:
             newest = solve_consistency(new.sums, attitude_sigma_rad)
             new = replace(new, newest=newest, solved_s=t_s)
@@ -132,7 +132,7 @@ class ConsistencySums:
     rows: int = 0
 
 
-def consistency_moment(
+def consistency_rows(
     pose: MarkerPose,
     before: Attitude,
     after: Attitude,
@@ -196,10 +196,10 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def add_moment(
+def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """Return the sums with one frame more, by its `consistency_moment`. After a gap, or a jump,
+    """Return the sums with one frame more, by its `consistency_rows`. After a gap, or a jump,
     changes are counted anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)

@@ -20,7 +20,7 @@ from perchctl.perception.online_calibration import (
 )
 from perchctl.perception.visual_inertial import (
     VisualInertialWindow,
-    drop_sights,
+    drop_sightings,
     estimate_motion,
 )
 from perchctl.profile import Profile
@@ -101,9 +101,9 @@ class Perception:
         """Latency and mounting by all pictures so far; None if there were too few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
-    def drop_sights(self) -> None:
+    def drop_sightings(self) -> None:
         """Forget the sights by which the vehicle's motion is judged."""
-        self.motion = drop_sights(self.motion)
+        self.motion = drop_sightings(self.motion)
 
     def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
         """Update what is estimated of motion, latency and mounting."""

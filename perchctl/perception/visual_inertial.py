@@ -52,7 +52,7 @@ class VisualInertialWindow:
         return self.found if self.agreed >= AGREED else None
 
 
-def drop_sights(old: VisualInertialWindow) -> VisualInertialWindow:
+def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
     """The window without the sights from before, and content with a rougher speed."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
@@ -71,7 +71,7 @@ def estimate_motion(
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
     if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
         return new
-    wanders_m, velocity_mps, bias_mps2 = motion_by_hypothesis(new.sights, samples, offset_g)
+    wanders_m, velocity_mps, bias_mps2 = fit_hypotheses(new.sights, samples, offset_g)
     if old.mismatch is None:  # else it stays
         found, before = _found(wanders_m), old.found
         agreed = 0 if found is None else 1
@@ -105,7 +105,7 @@ def _found(wanders_m: Array) -> Mismatch | None:
     return found if found.turn_rad or abs(found.later_s) >= LEAST_LATER_S else None
 
 
-def motion_by_hypothesis(
+def fit_hypotheses(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
     """The motion under each hypothesis, a pair of `LATER_S` and `TURNS_RAD`: the target's sideways

@@ -5,6 +5,6 @@ from .feed import BodyPose as BodyPose
 from .feed import CaptureFrame as CaptureFrame
 from .feed import CaptureSource as CaptureSource
 from .feed import FeedStatus as FeedStatus
-from .feed import Placed as Placed
 from .feed import PositionFeed as PositionFeed
-from .sight import SightFeed as SightFeed
+from .feed import VehiclePose as VehiclePose
+from .sight import TargetFeed as TargetFeed

@@ -48,14 +48,14 @@ class CaptureSetup:
 
 
 @dataclass(frozen=True)
-class Failed:
+class CaptureFailure:
     """The library has given up, with its words; with `is_loaded` False Python cannot import it."""
 
     text: str
     is_loaded: bool = True
 
 
-def setup_of(config: PositioningConfig) -> CaptureSetup:
+def capture_setup(config: PositioningConfig) -> CaptureSetup:
     """Return what the child connects to: Vicon and VRPN take a port with the name, the others want
     it apart."""
     options = {"hostname": config.host.strip()}
@@ -74,7 +74,7 @@ def open_capture(
     without an answer in `config.connect_timeout_s`.
     """
     PositionFeed.check_reachable(config)
-    return MotionCapture(setup_of(config), config.label, config.body, clock)
+    return MotionCapture(capture_setup(config), config.label, config.body, clock)
 
 
 class MotionCapture:
@@ -94,7 +94,7 @@ class MotionCapture:
         self._settled = threading.Event()  # by a first frame, or an end before it
         self._closed = False
         self._ended: str | None = None
-        self._failed: Failed | None = None
+        self._failed: CaptureFailure | None = None
         self._last_line = ""
         self._child, self._channel = spawn(_CHILD, subprocess.PIPE)
         self._threads = [threading.Thread(target=self._read_output, daemon=True)]
@@ -164,8 +164,8 @@ class MotionCapture:
     def _read_frames(self, channel: Channel) -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
-                message: tuple[float, Bodies] | Failed = channel.receive()
-                if isinstance(message, Failed):
+                message: tuple[float, Bodies] | CaptureFailure = channel.receive()
+                if isinstance(message, CaptureFailure):
                     self._failed = message
                     failed = "" if self._framed_s is None else " failed"
                     self._ended = f"{self._gone()}{failed}: {message.text}"
@@ -232,7 +232,7 @@ def serve_parent() -> None:
         _pass_on(client, channel, setup.partial)
     except Exception as error:  # whatever the library, or the loading of its own modules, raises
         with contextlib.suppress(OSError):  # the parent may be gone, and have caused it
-            channel.send(Failed(str(error) or type(error).__name__, is_loaded))
+            channel.send(CaptureFailure(str(error) or type(error).__name__, is_loaded))
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:

@@ -28,11 +28,11 @@ AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 _TRUE_OF = {"system", "host", "body", "body_rpy_deg", "body_position_m"}
 
 
-class Comparison(BaseModel):
-    """What is known of one vehicle's comparison with its motion capture, and what its file holds.
+class CaptureComparison(BaseModel):
+    """The result of comparing one vehicle with its motion capture by hand, as its file stores it.
 
-    `set_up` is what it is true of; another vehicle, capture, body or turn of its axes is another
-    one. `at` is None where there was none.
+    `set_up` identifies vehicle, capture, body and mounting of the body; the result holds for that
+    set-up only. `at` is None if no comparison was made.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -42,7 +42,7 @@ class Comparison(BaseModel):
     passed: bool = False
     found: str = ""
 
-    def objection(self, now: datetime) -> tuple[str, str] | None:
+    def flight_objection(self, now: datetime) -> tuple[str, str] | None:
         """Say why no flight may rely on it: what was found, and what to do. None where it passed,
         at most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
@@ -66,19 +66,19 @@ def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:
     return {"vehicle": vehicle, **config.model_dump(mode="json", include=_TRUE_OF)}
 
 
-def path_of(config: PositioningConfig, vehicle: str) -> Path:
+def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
     """Return the file of a vehicle's comparison. `vehicle`: as `perchctl.link.vehicle_uri` has
     it."""
     of = repr(_set_up(config, vehicle)).encode()
     return user_folder("state") / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
-def load_comparison(config: PositioningConfig, vehicle: str) -> Comparison:
+def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
     """Return what is known of this vehicle in this set-up. A file that cannot be read counts as
     none."""
-    none = Comparison(set_up=_set_up(config, vehicle))
+    none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
-        kept = Comparison.model_validate_json(path_of(config, vehicle).read_bytes())
+        kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())
     except (OSError, ValidationError):
         return none
     return kept if kept.set_up == none.set_up else none
@@ -90,8 +90,8 @@ def save_comparison(
     """Write a comparison down; what was there of this vehicle in this set-up is gone. `at` has a
     time zone. Returns None, or why it could not be written: one that passed must not stand, then,
     where the newest did not, and is taken away if it can be."""
-    path = path_of(config, vehicle)
-    record = Comparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)
+    path = comparison_path(config, vehicle)
+    record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)
     try:
         write_files({path: record.model_dump_json(indent=1).encode()})
     except (InvalidValue, OSError) as error:

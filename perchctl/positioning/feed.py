@@ -32,8 +32,8 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
 @dataclass(frozen=True)
 class BodyPose:
-    """A rigid body in the capture's world: its origin, and the turn from its axes to the
-    world's. SI; as the system says it, before the profile's turn and offset."""
+    """A rigid body's pose in the capture's world: the position of its origin, m, and the rotation
+    from its axes to the world's. As the system reports it, before the profile's offsets."""
 
     position_m: tuple[float, float, float]
     quaternion: Quaternion
@@ -129,14 +129,14 @@ class PositionFeed:
         self, source: CaptureSource, send: SendPosition, config: PositioningConfig
     ) -> None:
         self._source, self._send, self._config = source, send, config
-        self._judge = Judge(config)
+        self._judge = PoseValidator(config)
         self._rate = SendingRate(config.rate_hz)
         self._quiet_s = max(QUIET_S, 2.0 * self._rate.period_s)
         self._lock = threading.Lock()
         self._turned_s: float | None = None
         self._framed_s = -math.inf
         self._exposed_s = -math.inf
-        self._placed: Placed | None = None
+        self._placed: VehiclePose | None = None
         self._pose: ExternalPosition | None = None
         self._problem: str | None = None
         self._stopped = False
@@ -190,7 +190,7 @@ class PositionFeed:
         with self._lock:
             self._turned_s, self._problem = now_s, problem
 
-    def place(self) -> Placed | None:
+    def place(self) -> VehiclePose | None:
         """Return the newest that was handed to the link, with its attitude also where only the
         position was sent."""
         return self._placed
@@ -204,7 +204,7 @@ class PositionFeed:
                 sent=self._rate.count,
                 pose=self._pose,
                 rate_hz=self._rate.hz(now_s),
-                measured=None if self._placed is None else self._placed.external(pose=True),
+                measured=None if self._placed is None else self._placed.to_external(pose=True),
             )
 
     def _one(self, now_s: float) -> str | None:
@@ -214,10 +214,10 @@ class PositionFeed:
             silent = now_s - self._framed_s > QUIET_S
             return trouble or (None if silent else self._judge.problem)
         self._framed_s = now_s
-        placed = self._judge.judge(frame, now_s)
+        placed = self._judge.validate(frame, now_s)
         if placed is None or not self._rate.is_due(now_s):
             return trouble or self._judge.problem
-        place = placed.external(pose=self._config.send == "pose")
+        place = placed.to_external(pose=self._config.send == "pose")
         if self._send(place) is False:
             return BUSY
         with self._lock:
@@ -257,7 +257,7 @@ HELD_MPS, HELD_RADPS = 0.5, 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class VehiclePose:
     """A body of the vehicle's axes in the capture's world: (3,) and (3, 3), at `t_s`."""
 
     t_s: float
@@ -265,7 +265,7 @@ class Placed:
     R: Array
 
     @classmethod
-    def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> Placed:
+    def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> VehiclePose:
         """Return the vehicle's body, from the rigid body's axes as the capture system has defined
         them: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
         roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
@@ -274,26 +274,26 @@ class Placed:
         R = rotation_from_quaternion((w, x, y, z)) @ rotation_from_rpy(roll, pitch, yaw).T
         return cls(t_s, np.asarray(pose.position_m) - R @ np.asarray(config.body_position_m), R)
 
-    def external(self, *, pose: bool) -> ExternalPosition:
+    def to_external(self, *, pose: bool) -> ExternalPosition:
         x, y, z = (float(part) for part in self.position_m)
         return ExternalPosition((x, y, z), quaternion_from_rotation(self.R) if pose else None)
 
 
-class Judge:
-    """Asked about each frame in turn; keeps the last pose that was believed, and the one that
-    was not."""
+class PoseValidator:
+    """Checks each frame's pose for plausibility; keeps the last accepted and the last rejected
+    pose."""
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
         self._who = f"the rigid body {config.body!r} of the {config.label}"
         self._arrived_s = -math.inf
         self._newest: BodyPose | None = None
-        self._believed: Placed | None = None
-        self._stranger: Placed | None = None
+        self._believed: VehiclePose | None = None
+        self._stranger: VehiclePose | None = None
         self.problem: str | None = None
         """Why the newest frame with news was not believed; None if it was."""
 
-    def judge(self, frame: CaptureFrame, now_s: float) -> Placed | None:
+    def validate(self, frame: CaptureFrame, now_s: float) -> VehiclePose | None:
         """Return the vehicle's place if the frame has one that may be sent, its time that of the
         exposure; otherwise `problem` says why, or there was no news in it."""
         arrived_s = min(frame.t_s, now_s)  # nothing arrives later than now
@@ -320,10 +320,10 @@ class Judge:
             return None
         self._newest = pose
         return self._followed(
-            Placed.of(pose, self._config, arrived_s - self._config.latency_s), now_s
+            VehiclePose.of(pose, self._config, arrived_s - self._config.latency_s), now_s
         )
 
-    def _followed(self, placed: Placed, now_s: float) -> Placed | None:
+    def _followed(self, placed: VehiclePose, now_s: float) -> VehiclePose | None:
         """Return the pose, or None and a `problem` if no vehicle gets there so soon.
 
         Time does not make a jump true: poses near a refused one are refused too, until the body is
@@ -353,7 +353,7 @@ def _is_pose(pose: BodyPose) -> bool:
     return abs(math.sqrt(sum(part * part for part in pose.quaternion)) - 1.0) <= UNIT_WITHIN
 
 
-def _jumps(a: Placed, b: Placed) -> bool:
+def _jumps(a: VehiclePose, b: VehiclePose) -> bool:
     """True if no vehicle can have gone from `a` to `b` in their time."""
     dt_s = b.t_s - a.t_s
     first_s = min(dt_s, AT_FASTEST_S)
@@ -362,9 +362,9 @@ def _jumps(a: Placed, b: Placed) -> bool:
     return _way_m(a, b) > far_m or _turn_rad(a, b) > far_rad
 
 
-def _way_m(a: Placed, b: Placed) -> float:
+def _way_m(a: VehiclePose, b: VehiclePose) -> float:
     return float(np.linalg.norm(b.position_m - a.position_m))
 
 
-def _turn_rad(a: Placed, b: Placed) -> float:
+def _turn_rad(a: VehiclePose, b: VehiclePose) -> float:
     return math.acos(max(-1.0, min(1.0, (float(np.trace(a.R.T @ b.R)) - 1.0) / 2.0)))

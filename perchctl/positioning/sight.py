@@ -58,7 +58,7 @@ def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseS
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 
-class SightFeed:
+class TargetFeed:
     """Sends places by sights; it has no thread and no clock, and the flight loop calls it.
 
     `target` is None until it was seen from the ground. `off`: by how much the body is beside its
@@ -78,16 +78,16 @@ class SightFeed:
         self._pose: ExternalPosition | None = None
         self._refusal = ""
 
-    def stand(self, now_s: float) -> None:
-        """Send the origin, at rest on the ground, until the target's place is known."""
+    def send_origin(self, now_s: float) -> None:
+        """Send the world's origin while the vehicle stands and no target is known yet."""
         if self.target is None:
-            self.known(self._origin_m, now_s)
+            self.send_known(self._origin_m, now_s)
 
-    def known(self, position_m: tuple[float, float, float], now_s: float) -> None:
-        """Send a place that is known without a picture: standing, pressed or hanging."""
+    def send_known(self, position_m: tuple[float, float, float], now_s: float) -> None:
+        """Send a position known without a picture: standing, in contact or hanging."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
-    def touching(self, yaw_rad: float) -> tuple[float, float, float] | None:
+    def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
         """Return the body's position, m, with the gear in the target's centre, level, where its
         estimate has that heading; None before the target's place is known."""
         if self.target is None:
@@ -96,7 +96,7 @@ class SightFeed:
         x, y, z = self.target.position_m - way_m
         return float(x), float(y), float(z)
 
-    def steered(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
+    def with_fixed_target(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
         """Return what is seen, with the place where the target stands: it stands still, and the
         body is beside its estimate now as it was of late (`off`). Until its place is known, as
         seen."""
@@ -109,7 +109,7 @@ class SightFeed:
             seen, e_m=e_m, e_yaw_rad=e_yaw_rad, world_m=world_m, world_yaw_rad=world_yaw_rad
         )
 
-    def see(
+    def add_pose(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
         """Take a pose that this turn's picture gave; `then`: the vehicle's attitude and estimated

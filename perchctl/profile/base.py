@@ -102,7 +102,7 @@ def key_unit(path: str) -> str:
 # --- Keys that have become constants of their section ------------------
 
 
-def without_constants(
+def drop_constant_keys(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
     """Return the values of a profile without keys that are constants by now: class variables of
@@ -121,6 +121,6 @@ def without_constants(
             else:
                 lost.append(f"{now}, and {value} here; remove it")
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
-            result[key], more, gone = without_constants(value, kind, f"{path}{key}.")
+            result[key], more, gone = drop_constant_keys(value, kind, f"{path}{key}.")
             notes, lost = notes + more, lost + gone
     return result, notes, lost

@@ -19,10 +19,10 @@ from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import YAMLError
 
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_place, mode_of, write_files
+from perchctl.files import check_writable, file_mode, write_files
 from perchctl.places import data_folder
 from perchctl.plain_yaml import clip_text, parse_yaml
-from perchctl.profile.base import without_constants
+from perchctl.profile.base import drop_constant_keys
 from perchctl.profile.load import check_profile, find_profile, first_invalid_key
 from perchctl.profile.schema import Profile
 
@@ -45,7 +45,7 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
-        _, notes, lost = without_constants(values, Profile)
+        _, notes, lost = drop_constant_keys(values, Profile)
         if notes or lost:
             raise InvalidValue(f"{option}: {(notes + lost)[0]}")
         return Profile.model_validate(values)
@@ -106,7 +106,7 @@ def writable_profile(name: str) -> Path:
             f"{path} is shipped with perchctl and is not written to: copy it (cp {path} "
             f"my_{path.name}), and name the copy (-p my_{path.name})"
         )
-    check_place(path, force=True)
+    check_writable(path, force=True)
     if not os.access(path, os.W_OK):
         raise InvalidValue(
             f"{path} is read-only and is not written to: allow it (chmod u+w {path}), or name a "
@@ -126,8 +126,8 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
     listed = ", ".join(f"{dotted}: {_flow(value)}" for dotted, value in values.items())
     by_hand = f"write them yourself: {listed}"
     try:
-        old, mode = path.read_bytes().decode(), mode_of(path)
-        new = with_values(old, values)
+        old, mode = path.read_bytes().decode(), file_mode(path)
+        new = replace_values(old, values)
     except (OSError, ValueError, YAMLError) as error:
         why = " ".join(str(error).split())
         raise InvalidValue(f"{path}: {why}: {by_hand}") from None
@@ -145,7 +145,7 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
     return aside
 
 
-def with_values(text: str, values: Mapping[str, Value]) -> str:
+def replace_values(text: str, values: Mapping[str, Value]) -> str:
     """Return a profile's text with the values under their dotted keys, as in ``camera.latency_s``.
 
     Comments, order and quotes stay. A list of as many numbers keeps its layout; a key that is

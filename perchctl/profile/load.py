@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_figures
+from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_texts
 from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
-from perchctl.profile.base import without_constants
+from perchctl.profile.base import drop_constant_keys
 from perchctl.profile.schema import Profile
 from perchctl.profile.vision import MergeConfig, WeightsConfig
 
@@ -163,7 +163,7 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     covered = np.asarray(image > _WHITE)
     share = float(covered.mean())
     if share > MOST_COVERED:
-        covers, allowed = distinct_figures(100.0 * share, 100.0 * MOST_COVERED, 0)
+        covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_COVERED, 0)
         raise InvalidValue(
             f"camera.mask: {path} covers {covers} % of the picture, at most {allowed} % are "
             f"allowed: white is what the vehicle covers, black is free"
@@ -210,7 +210,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
 
 
 def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
-    values, notes, lost = without_constants(values, Profile)
+    values, notes, lost = drop_constant_keys(values, Profile)
     if lost:
         raise InvalidValue(f"{path}: {lost[0]}")
     for note in notes:

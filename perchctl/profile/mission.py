@@ -164,7 +164,7 @@ class LandingConfig(Section):
     timeout_s: float = key(30.0, "longest time of a landing", gt=0, le=120)
 
     @property
-    def overdue_s(self) -> float:
+    def setpoint_time_s(self) -> float:
         """The time for which the landing goes by setpoints; then the vehicle lands by itself."""
         return OVERDUE_SHARE * self.timeout_s
 

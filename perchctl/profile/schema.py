@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from perchctl.profile.base import Section, key, without_constants
+from perchctl.profile.base import Section, drop_constant_keys, key
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.positioning import PositioningConfig
@@ -76,7 +76,7 @@ class Profile(Section):
     def lost_values(cls, values: dict[str, Any]) -> list[str]:
         """Return a sentence for each key of the values that is a constant now, and had another
         value."""
-        return without_constants(values, cls)[2]
+        return drop_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")
     def _neighbours_can_be_printed(self) -> Profile:

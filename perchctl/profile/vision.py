@@ -38,7 +38,7 @@ def dictionary_size(name: str) -> int:
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 
-def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
+def is_same_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
     """Return whether both are the same black and white cells, at any turn: ``DICT_4X4_50`` holds
     the first ids of ``DICT_4X4_1000``."""
     one, two = aruco_dictionary(name), aruco_dictionary(other)
@@ -225,7 +225,7 @@ class TargetConfig(Section):
     @model_validator(mode="after")
     def _markers_differ(self) -> TargetConfig:
         large, small = self.large, self.small
-        if is_one_pattern(large.dictionary, large.id, small.dictionary, small.id):
+        if is_same_pattern(large.dictionary, large.id, small.dictionary, small.id):
             both = dict.fromkeys(f"{m.dictionary}/{m.id}" for m in (large, small))
             raise ValueError(
                 f"large and small are the same marker, {' and '.join(both)}, which cannot be told "

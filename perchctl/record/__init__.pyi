@@ -1,6 +1,6 @@
-from .exact import from_exact as from_exact
+from .exact import from_exact_json as from_exact_json
 from .exact import json_line as json_line
-from .exact import to_exact as to_exact
+from .exact import to_exact_json as to_exact_json
 from .header import camera_record as camera_record
 from .read import FlightLog as FlightLog
 from .read import PhaseSpan as PhaseSpan

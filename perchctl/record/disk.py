@@ -60,7 +60,7 @@ class DiskFile:
             os.close(fd)
 
 
-def begin_file(path: Path, sync: bool, begun: Callable[[DiskFile], T]) -> T:
+def create_file(path: Path, sync: bool, begun: Callable[[DiskFile], T]) -> T:
     """Create a file and return what `begun` makes of it; an error of that leaves no file. Raises
     OSError as `DiskFile` does."""
     file = DiskFile(path, sync)

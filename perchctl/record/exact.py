@@ -26,8 +26,8 @@ _GONE = {"timing"}  # fields of a flight in real time by 0.2.0
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
-def to_exact(value: Any) -> Any:
-    """Return JSON's own types, from which `from_exact` makes the same value.
+def to_exact_json(value: Any) -> Any:
+    """Convert a value to JSON types from which `from_exact_json` restores it exactly.
 
     Raises TypeError for what has no exact form.
     """
@@ -36,19 +36,19 @@ def to_exact(value: Any) -> Any:
     if value is None or type(value) in (bool, int, str):
         return value
     if isinstance(value, (list, tuple)):
-        return [to_exact(v) for v in value]
+        return [to_exact_json(v) for v in value]
     if dataclasses.is_dataclass(value):
         return _exact_fields(value)
     if isinstance(value, Enum):
-        return to_exact(value.value)
+        return to_exact_json(value.value)
     if isinstance(value, dict):
         if all(type(key) is str for key in value):
-            return {key: to_exact(v) for key, v in value.items()}
-        return [[to_exact(key), to_exact(v)] for key, v in value.items()]
+            return {key: to_exact_json(v) for key, v in value.items()}
+        return [[to_exact_json(key), to_exact_json(v)] for key, v in value.items()]
     if isinstance(value, PurePath):
         return str(value)
     if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "fiub":
-        flat = [to_exact(v) for v in value.ravel().tolist()]
+        flat = [to_exact_json(v) for v in value.ravel().tolist()]
         if value.dtype == np.float64 and value.ndim == 1:
             return flat
         return {"dtype": value.dtype.str, "shape": list(value.shape), "data": flat}
@@ -62,7 +62,7 @@ def _exact_fields(value: Any) -> dict[str, Any]:
         part = getattr(value, name)
         if part is None and default is None:
             continue
-        exact = to_exact(part)
+        exact = to_exact_json(part)
         is_named = part is not None and len(members) > 1
         found[name] = [type(part).__name__, exact] if is_named else exact
     return found
@@ -82,8 +82,8 @@ def _members(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
-def from_exact(kind: type[T], data: Any) -> T:
-    """Return the value of `kind` that `to_exact` wrote. A field that is missing has its default.
+def from_exact_json(kind: type[T], data: Any) -> T:
+    """Return the value of `kind` that `to_exact_json` wrote. A missing field has its default.
 
     Raises ValueError, with the way to it, for data that is none.
     """
@@ -159,7 +159,7 @@ def _array_from(data: Any) -> Any:
 DECIMALS = 6
 
 
-def to_plain(value: Any) -> Any:
+def to_rounded_json(value: Any) -> Any:
     """Return JSON's own types: numbers rounded to `DECIMALS`, NaN and infinities as None.
 
     Raises TypeError for a value that has no place in a log.
@@ -169,10 +169,10 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, float):  # nearly all of a record
         return round(value, DECIMALS) + 0.0 if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(k): to_plain(v) for k, v in value.items()}
+        return {str(k): to_rounded_json(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [to_plain(v) for v in value]
-    return to_exact(value)
+        return [to_rounded_json(v) for v in value]
+    return to_exact_json(value)
 
 
 def encode(record: Mapping[str, Any]) -> bytes:
@@ -180,7 +180,7 @@ def encode(record: Mapping[str, Any]) -> bytes:
 
     Top-level keys whose value is None are left out.
     """
-    return json_line({k: v for k, v in to_plain(record).items() if v is not None})
+    return json_line({k: v for k, v in to_rounded_json(record).items() if v is not None})
 
 
 def json_line(plain: Mapping[str, Any]) -> bytes:

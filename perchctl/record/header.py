@@ -24,7 +24,7 @@ from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
 from perchctl.errors import PerchError
 from perchctl.profile import Profile, read_mask
-from perchctl.record.exact import to_exact
+from perchctl.record.exact import to_exact_json
 from perchctl.record.fields import FIELDS, FORMAT, SCHEMA_VERSION
 
 
@@ -64,7 +64,7 @@ def camera_record(profile: Profile) -> dict[str, Any]:
     cannot be read is left out: the flight says so."""
     with contextlib.suppress(PerchError):
         camera = profile_camera(profile.camera)
-        record = {"camera": to_exact(camera)}
+        record = {"camera": to_exact_json(camera)}
         if profile.camera.mask is not None:
             record["mask"] = _packed(read_mask(profile.camera.mask, camera.size_px))
         return record

@@ -102,7 +102,7 @@ def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
     )
 
 
-def mounts_of(profile: Profile) -> list[FrameTransform]:
+def fixed_transforms(profile: Profile) -> list[FrameTransform]:
     """Return the transforms of what does not move against the body: camera and gear."""
     T_body_cam, gear_m = profile.camera.mount.T_body_cam, profile.vehicle.gear_body_m
     q = quaternion_from_rotation(T_body_cam[:3, :3])
@@ -113,7 +113,9 @@ def mounts_of(profile: Profile) -> list[FrameTransform]:
     ]
 
 
-def moving(ns: int, sampled_ns: int, record: Mapping[str, Any]) -> Iterator[FrameTransform]:
+def moving_transforms(
+    ns: int, sampled_ns: int, record: Mapping[str, Any]
+) -> Iterator[FrameTransform]:
     """Yield the transforms from the world of what a tick's record places: the body, at the time of
     its sample, the target and the setpoint. One that is missing or not finite is left out."""
     for child, at_ns, keys in (

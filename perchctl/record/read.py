@@ -26,7 +26,7 @@ from perchctl.files import file_kind
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand, Turn
 from perchctl.profile import Profile, first_invalid_key
-from perchctl.record.exact import decode_line, from_exact
+from perchctl.record.exact import decode_line, from_exact_json
 from perchctl.record.fields import FIELDS, FORMAT, READABLE_VERSIONS, SCHEMA_VERSION
 from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
@@ -87,12 +87,12 @@ class FlightLog:
     @cached_property
     def turns(self) -> list[Turn]:
         """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
-        return [turn_of(record) for record in self.turn_records]
+        return [parse_turn(record) for record in self.turn_records]
 
     @cached_property
     def sent(self) -> list[SentCommand]:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
-        return [exact_of(SentCommand, record) for record in self.sent_records]
+        return [parse_exact(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
         """Return a field over the ticks, shape (n,); NaN where it is missing.
@@ -115,13 +115,13 @@ class FlightLog:
         the log has its events; also an end that no tick followed."""
         spans: list[PhaseSpan] = []
         for record in self.records:
-            t_s, phase = self.since(float(record["t_s"])), str(record.get("phase") or "")
+            t_s, phase = self.to_flight_s(float(record["t_s"])), str(record.get("phase") or "")
             if spans:
                 spans[-1] = replace(spans[-1], end_s=t_s)
             if not spans or spans[-1].phase != phase:
                 spans.append(PhaseSpan(phase, t_s, t_s, str(record.get("reason") or "")))
         for event in (e for e in self.events if e.get("event") == "phase"):
-            at_s, phase = self.since(float(event["t_s"])), str(event.get("phase") or "")
+            at_s, phase = self.to_flight_s(float(event["t_s"])), str(event.get("phase") or "")
             words = [str(event.get(k) or "") for k in ("reason", "row", "severity", "simulated")]
             begun = [k for k, span in enumerate(spans) if abs(span.start_s - at_s) < SAME_S]
             for k in begun:
@@ -144,7 +144,7 @@ class FlightLog:
         table.writeheader()
         for record in self.records:
             times_s = {key: record[key] for key in TIMES if record[key] is not None}
-            since_s = {key: round(self.since(t_s), 6) for key, t_s in times_s.items()}
+            since_s = {key: round(self.to_flight_s(t_s), 6) for key, t_s in times_s.items()}
             table.writerow(record | since_s)
         return text.getvalue()
 
@@ -157,25 +157,25 @@ class FlightLog:
         first = self.records[0] if self.records else next(flown, None)
         return 0.0 if first is None else float(first["t_s"])
 
-    def since(self, t_s: Times) -> Times:
+    def to_flight_s(self, t_s: Times) -> Times:
         """Count times on the loop's clock from the first flown turn, as all outputs do."""
         return t_s - self.start_s
 
     @cached_property
     def t_s(self) -> Array:
         """Times of the ticks since the flight's first turn, shape (n,)."""
-        return self.since(self.column("t_s"))
+        return self.to_flight_s(self.column("t_s"))
 
     @property
     def end_s(self) -> float:
         """Time of the last tick since the flight's first turn; 0 without any."""
-        return self.since(float(self.records[-1]["t_s"])) if self.records else 0.0
+        return self.to_flight_s(float(self.records[-1]["t_s"])) if self.records else 0.0
 
     def index_at(self, t_s: float) -> int:
         """Return the index of the newest tick at that time since the first turn."""
         return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
 
-    def within(self, start_s: float, end_s: float) -> slice:
+    def tick_slice(self, start_s: float, end_s: float) -> slice:
         """Return the ticks from one time since the first turn up to another, without that."""
         first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
         return slice(int(first), int(last))
@@ -218,7 +218,7 @@ class FlightLog:
         if self.header.get("camera") is None:
             return None
         try:
-            return from_exact(CameraModel, self.header["camera"])
+            return from_exact_json(CameraModel, self.header["camera"])
         except ValueError as error:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
@@ -368,7 +368,7 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
 # --- turns, and what was sent in the loop's place ---------------------
 
 
-def turn_of(record: dict[str, Any]) -> Turn:
+def parse_turn(record: dict[str, Any]) -> Turn:
     """Return the turn of a record, to the same bits. Errors: InvalidValue."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
@@ -376,14 +376,14 @@ def turn_of(record: dict[str, Any]) -> Turn:
         samples = taken.get("late") or taken.get("samples")
         if isinstance(samples, list) and samples:
             record = record | {"observation": obs | {"telemetry": samples[-1]}}
-    return exact_of(Turn, record)
+    return parse_exact(Turn, record)
 
 
-def exact_of(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
+def parse_exact(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
     """Return the turn, or the command that was sent in the loop's place, of a record, to the same
     bits. Errors: InvalidValue."""
     try:
-        return from_exact(kind, _without_kind(record))
+        return from_exact_json(kind, _without_kind(record))
     except ValueError as error:
         raise InvalidValue(
             f"the log's {record.get('kind')} at {record.get('t_s')} s cannot be read ({error}): "

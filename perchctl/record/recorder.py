@@ -24,7 +24,7 @@ from mcap_protobuf.schema import register_schema
 import perchctl
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile
-from perchctl.record.disk import BackgroundWriter, DiskFile, Job, begin_file
+from perchctl.record.disk import BackgroundWriter, DiskFile, Job, create_file
 from perchctl.record.exact import encode
 from perchctl.record.messages import (
     CORNERS,
@@ -35,9 +35,9 @@ from perchctl.record.messages import (
     TICK,
     TICK_SCHEMA,
     corners_message,
+    fixed_transforms,
     image_message,
-    mounts_of,
-    moving,
+    moving_transforms,
     stamp,
 )
 from perchctl.record.summary import RecordingEnd
@@ -83,7 +83,7 @@ class Recorder:
         self._mcap = Writer(sink, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
         self._mcap.start(library=f"perchctl {perchctl.__version__}")
         self._channels: dict[str, int] = {}
-        self._mounts = mounts_of(profile)
+        self._mounts = fixed_transforms(profile)
         self._newest_s = self._t0_s = float(header["t0_s"])
         started = header.get("started_utc")
         self._started_ns = NS * round(datetime.fromisoformat(started).timestamp()) if started else 0
@@ -100,7 +100,7 @@ class Recorder:
     ) -> Recorder:
         """Begin a new file beside the log. Errors: InvalidValue, before the flight."""
         try:
-            return begin_file(path, live, lambda stream: cls(path, stream, header, profile, live))
+            return create_file(path, live, lambda stream: cls(path, stream, header, profile, live))
         except OSError as error:
             raise InvalidValue(
                 f"{path}: the recording cannot be begun ({error.strerror or error}): free the "
@@ -178,7 +178,7 @@ class Recorder:
         for mount in self._mounts:
             mount.timestamp.CopyFrom(stamp(ns))
         sampled_ns = self._ns(t_s - (record.get("tel_age_s") or 0.0))
-        transforms = [*self._mounts, *moving(ns, sampled_ns, record)]
+        transforms = [*self._mounts, *moving_transforms(ns, sampled_ns, record)]
         self._add(TF, ns, FrameTransforms(transforms=transforms))
         shown = {**record, "t_s": t_s - first_s}
         if exposed_s is not None:

@@ -23,8 +23,8 @@ from perchctl.camera import FrameSource, WrappedSource
 from perchctl.errors import InvalidValue
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
-from perchctl.record.disk import BackgroundWriter, DiskFile, begin_file
-from perchctl.record.exact import encode, json_line, to_exact
+from perchctl.record.disk import BackgroundWriter, DiskFile, create_file
+from perchctl.record.exact import encode, json_line, to_exact_json
 from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
 from perchctl.record.summary import FlightSummary, RecordingEnd
@@ -82,7 +82,7 @@ class LogWatcher:
         return self._writer.refused + self._failed + self._unfinished
 
     @property
-    def lacks(self) -> str | None:
+    def loss_reason(self) -> str | None:
         """One sentence why the log is not whole, the disk first; None for a whole one."""
         return self.problem or self.formless
 
@@ -94,12 +94,12 @@ class LogWatcher:
         otherwise each record is in the file at once. Raises InvalidValue, before the flight.
         """
         # A replay flies by the profile in the header, so no number of it is rounded.
-        line = json_line(to_exact({k: v for k, v in header.items() if v is not None}))
+        line = json_line(to_exact_json({k: v for k, v in header.items() if v is not None}))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             for free in _free_names(path):
                 with suppress(FileExistsError):
-                    return begin_file(free, live, partial(cls, free, line, live))
+                    return create_file(free, live, partial(cls, free, line, live))
             raise AssertionError("unreachable")
         except OSError as error:
             raise InvalidValue(
@@ -159,7 +159,7 @@ class LogWatcher:
         return [problem]
 
     @property
-    def begun(self) -> bool:
+    def has_begun(self) -> bool:
         """True if the flight has begun; `abandon` leaves no file of one that has not."""
         return self._ticks > 0
 
@@ -222,7 +222,7 @@ class LogWatcher:
         return replace(
             summary,
             lost_records=self.lost_records,
-            log_problem=self.lacks,
+            log_problem=self.loss_reason,
             recording=self._ended_recording(),
         )
 
@@ -230,7 +230,7 @@ class LogWatcher:
         """Close the log of a flight that failed. One that never began leaves no file."""
         self.end({"outcome": "failed", "reason": reason})
         self._ended_recording()
-        if not self.begun:
+        if not self.has_begun:
             self.path.unlink(missing_ok=True)
             if self.recorder is not None:
                 self.recorder.path.unlink(missing_ok=True)
@@ -298,13 +298,13 @@ class LogWatcher:
 
 def sent_line(sent: SentCommand) -> bytes:
     """Return what was sent in the loop's place as one line of the log, exact."""
-    return json_line({"kind": "sent", **to_exact(sent)})
+    return json_line({"kind": "sent", **to_exact_json(sent)})
 
 
 def turn_line(turn: Turn) -> bytes:
     """Return a turn as one line of the log, whole and exact, by the fields of
     `perchctl.mission.Turn`."""
-    record = {"kind": "turn", **to_exact(turn)}
+    record = {"kind": "turn", **to_exact_json(turn)}
     obs, samples = turn.observation, turn.taken.late or turn.taken.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
         del record["observation"]["telemetry"]  # it stands in the same line already

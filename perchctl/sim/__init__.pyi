@@ -2,7 +2,7 @@ from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
 from .capture import draw_capture as draw_capture
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
-from .powertrain import most_thrust_n as most_thrust_n
+from .powertrain import max_thrust_n as max_thrust_n
 from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S

@@ -135,11 +135,11 @@ class SimCapture:
         self._before: dict[str, BodyPose] = {}
         self._under_way: deque[CaptureFrame] = deque()
 
-    def lay(self, fault: CaptureFault, for_s: float = math.inf) -> None:
+    def begin_fault(self, fault: CaptureFault, for_s: float = math.inf) -> None:
         """Begin a fault now, for so long."""
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
-    def heal(self) -> None:
+    def end_faults(self) -> None:
         """End all faults."""
         self._faults.clear()
 

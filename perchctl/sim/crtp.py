@@ -24,7 +24,7 @@ from perchctl.sim.firmware.controller import (
     MODE_Z_DISTANCE,
     Setpoint,
 )
-from perchctl.sim.firmware.planner import Planner
+from perchctl.sim.firmware.planner import HighLevelPlanner
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
@@ -73,10 +73,10 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
         case Port.HIGH_LEVEL, 0, _:
             return data[:3].ljust(3, b"\0") + bytes((_plan(firmware, data),))
         case Port.LOCALIZATION, 0, _:
-            firmware.external(struct.unpack_from("<fff", data))
+            firmware.take_external(struct.unpack_from("<fff", data))
         case Port.LOCALIZATION, 1, 8:
             x, y, z, qx, qy, qz, qw = struct.unpack_from("<fffffff", data, 1)
-            firmware.external((x, y, z), (qw, qx, qy, qz))
+            firmware.take_external((x, y, z), (qw, qx, qy, qz))
         case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 3):
             firmware.emergency_stop()
         case ((Port.LOCALIZATION | Port.SUPERVISOR), 1, 4):
@@ -106,7 +106,7 @@ def _fly(firmware: Firmware, setpoint: Setpoint) -> None:
     """Pass on finite numbers. Others would poison the controller for good."""
     values = (getattr(setpoint, name) for name in Setpoint.__slots__)
     if all(math.isfinite(value) for value in values if isinstance(value, float)):
-        firmware.low_level(setpoint)
+        firmware.fly_setpoint(setpoint)
 
 
 def _plan(firmware: Firmware, data: bytes) -> int:
@@ -115,19 +115,19 @@ def _plan(firmware: Firmware, data: bytes) -> int:
     values: tuple[Any, ...]
     match data[0]:
         case 3:
-            order, values = Planner.stop, ()
+            order, values = HighLevelPlanner.stop, ()
         case 7 | 8 as kind:
             height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
-            order = Planner.take_off if kind == 7 else Planner.land
+            order = HighLevelPlanner.take_off if kind == 7 else HighLevelPlanner.land
             values = (height, duration, None if keep_yaw else yaw)
         case 12:  # data[3] is a flag for straight lines
             values = *struct.unpack_from("<fffff", data, 4), bool(data[2])
-            order = Planner.go_to
+            order = HighLevelPlanner.go_to
         case _:
             return ENOEXEC
     is_finite = all(math.isfinite(value) for value in values if value is not None)
     if is_finite and data[1:2] == b"\0":  # for all groups; this vehicle is in none
-        firmware.high_level(order, *values)
+        firmware.give_order(order, *values)
     return OK
 
 
@@ -135,7 +135,7 @@ def _plan(firmware: Firmware, data: bytes) -> int:
 
 
 @dataclass(frozen=True)
-class Number:
+class CNumber:
     """A C number type: its `struct` letter, and its codes in the two tables."""
 
     letter: str
@@ -163,12 +163,12 @@ class Number:
 
 
 BY_CTYPE = {
-    "uint8_t": Number("B", 0x01, 0x08),
-    "uint16_t": Number("H", 0x02, 0x09),
-    "uint32_t": Number("I", 0x03, 0x0A),
-    "int8_t": Number("b", 0x04, 0x00),
-    "float": Number("f", 0x07, 0x06),
-    "FP16": Number("e", 0x08, 0x05),
+    "uint8_t": CNumber("B", 0x01, 0x08),
+    "uint16_t": CNumber("H", 0x02, 0x09),
+    "uint32_t": CNumber("I", 0x03, 0x0A),
+    "int8_t": CNumber("b", 0x04, 0x00),
+    "float": CNumber("f", 0x07, 0x06),
+    "FP16": CNumber("e", 0x08, 0x05),
 }
 BY_LOG_CODE = {number.log_code: number for number in BY_CTYPE.values()}
 
@@ -230,7 +230,7 @@ _RESTARTS = (b"\xfe\xf0\x01", b"\xfe\x03")  # the radio chip's: reset to the fir
 
 @dataclass
 class _Block:
-    variables: list[tuple[str, Number]] = field(default_factory=list)
+    variables: list[tuple[str, CNumber]] = field(default_factory=list)
     period_s: float = 0.0
     due_s: float | None = None  # None: stopped
 
@@ -276,7 +276,7 @@ class CrtpServer:
             return []
         return [] if answer is None else [Packet(packet.port, packet.channel, answer)]
 
-    def due(self) -> list[Packet]:
+    def due_packets(self) -> list[Packet]:
         """Return the log data that the vehicle sends by itself by now."""
         now_s = self._firmware.t_s
         packets = []

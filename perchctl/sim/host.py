@@ -113,7 +113,7 @@ class VehicleHost:
                 self.positions.publish(frame)
         self._steps += 1
         if self._peer is not None:
-            self._send(self.server.due(), self._peer)
+            self._send(self.server.due_packets(), self._peer)
         if self._truth is not None and self._steps % TRUTH_EVERY == 0:
             self._truth.write(json.dumps(self.truth()) + "\n")
             self._truth.flush()
@@ -131,7 +131,7 @@ class VehicleHost:
         of = next((part for part in parts if hasattr(part, name)), self)
         return getattr(of, name)(*arguments, **named)
 
-    def silence(self, duration_s: float) -> None:
+    def silence_link(self, duration_s: float) -> None:
         """Let the link receive and send nothing for `duration_s` of simulated time."""
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
@@ -139,7 +139,7 @@ class VehicleHost:
         """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
         it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
-        ceiling_n, floor = world.contacts()
+        ceiling_n, floor = world.contact_state()
         return {
             "t_s": self.elapsed_s,
             "position_m": (world.x_m, world.y_m, world.z_m),
@@ -198,7 +198,7 @@ def serve_parent(
     try:
         with contextlib.closing(VehicleHost(scenario, **settings)) as host:
             channel.send(host.addresses)
-            Runner(host, channel, realtime=pace == "realtime", shared=shared).run()
+            HostRunner(host, channel, realtime=pace == "realtime", shared=shared).run()
     except Exception as error:
         with contextlib.suppress(OSError):
             channel.send(f"{type(error).__name__}: {error}")
@@ -217,7 +217,7 @@ _IDLE_S = 0.25
 _BATCH = 50  # steps between two polls of the control connection while catching up
 
 
-class Runner:
+class HostRunner:
     """Runs one host until its parent is gone."""
 
     def __init__(
@@ -313,7 +313,7 @@ class MjpegServer(ThreadingHTTPServer):
             self._newest = self._newest[0] + 1, image
             self._changed.notify_all()
 
-    def after(self, number: int) -> tuple[int, Picture]:
+    def wait_for_newer(self, number: int) -> tuple[int, Picture]:
         """Return the newest picture and its number as soon as that is above `number`."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest[0] > number)
@@ -336,7 +336,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
             self.end_headers()
             while True:
-                number, image = self.server.after(number)
+                number, image = self.server.wait_for_newer(number)
                 _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
                 head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}"
                 self.wfile.write(f"{head}\r\n\r\n".encode() + jpeg.tobytes() + b"\r\n")

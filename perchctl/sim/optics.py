@@ -58,7 +58,7 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     return RayGrid(rays, down, np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]]))
 
 
-def plane_map(T_target_cam: Array) -> Array:
+def ray_to_plane_map(T_target_cam: Array) -> Array:
     """Return what maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (...,
     3, 3) of poses (..., 4, 4).
 
@@ -72,7 +72,7 @@ def plane_map(T_target_cam: Array) -> Array:
     return H
 
 
-def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return where the grid's rays meet the plane, (rows, cols, 2) m, and which do not.
 
     `to_plane` is the map (3, 3), or with a rolling shutter those of rows at equal distances
@@ -130,7 +130,7 @@ class Lens:
     focal_px: float
 
 
-def lens_of(camera: CameraModel) -> Lens:
+def shared_lens(camera: CameraModel) -> Lens:
     """Return the camera's lens, which flights share."""
     return _lens(*camera.contents)
 

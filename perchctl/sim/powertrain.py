@@ -53,14 +53,14 @@ _Q_PER_N = 1.0 / (2.0 * C3)
 _D = (C1 / (3.0 * C3) - _P * _P) ** 3
 
 
-def motor_v(thrust_n: float) -> float:
+def motor_voltage(thrust_n: float) -> float:
     """Return the motor voltage at which one motor gives `thrust_n`."""
     q = _Q + _Q_PER_N * thrust_n
     s = sqrt(q * q + _D)
     return cbrt(q + s) + cbrt(q - s) + _P
 
 
-STANDSTILL_V = motor_v(0.0)
+STANDSTILL_V = motor_voltage(0.0)
 """0.45 V: the dead band."""
 
 
@@ -169,7 +169,7 @@ STANDING_LAG_S = 0.18
 MOTOR_COAST_S = 0.12
 MOTOR_CURRENT_A = 1.1
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
-_HOVER_V = motor_v(0.042 * GRAVITY_MPS2 / 4.0)
+_HOVER_V = motor_voltage(0.042 * GRAVITY_MPS2 / 4.0)
 # The share of the way in one control period is sqrt(_STANDING + _PER_V * v).
 _STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
 _PER_V = ((CONTROL_PERIOD_S / MOTOR_LAG_S) ** 2 - _STANDING) / _HOVER_V
@@ -209,7 +209,7 @@ class Powertrain:
         return self.forces_n
 
 
-def most_thrust_n(rest_v: float) -> float:
+def max_thrust_n(rest_v: float) -> float:
     """Return four motors' steady thrust at the full duty cycle, from a cell of that resting
     voltage."""
     battery_v = rest_v

@@ -24,10 +24,10 @@ from perchctl.sim.optics import (
     LEAST_RISE,
     Picture,
     RayGrid,
-    lens_of,
     local_px_per_m,
-    plane_map,
-    trace,
+    ray_to_plane_map,
+    shared_lens,
+    trace_rays,
 )
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.sheets import (
@@ -36,12 +36,12 @@ from perchctl.sim.sheets import (
     TILE_M,
     Box,
     Ceiling,
-    Placed,
-    View,
-    beside,
-    box_around,
-    pixels_of,
+    PlacedSheet,
+    SheetView,
+    neighbour_sheet,
+    pixel_slices,
     printed_sheet,
+    union_box,
 )
 from perchctl.vision import CameraModel
 
@@ -99,11 +99,11 @@ class Renderer:
             large=target.large.model_copy(update={"side_m": scenario.large_side_m}),
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
-        own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
-        self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
+        own = () if scenario.no_target else (PlacedSheet(printed_sheet(printed.model_dump_json())),)
+        self._sheets = (*own, *(neighbour_sheet(n, printed) for n in scenario.neighbours))
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
-        lens = lens_of(camera)
+        lens = shared_lens(camera)
         self._coarse, self._pixels, self._shade = lens.coarse, lens.pixels, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
         self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
@@ -156,7 +156,7 @@ class Renderer:
             picture = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), np.uint8)
         if self._analogue > 0.0:
             rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
-            picture = spoil(picture, self._analogue, rng)
+            picture = add_analogue_faults(picture, self._analogue, rng)
         return picture
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
@@ -181,13 +181,13 @@ class Renderer:
         self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
     ) -> Picture:
         """Return the picture at poses T_target_cam, of each row (n, 4, 4)."""
-        count = sample_count(length_px)
-        by_row = [plane_map(spread(poses, count)) for poses in rows]
+        count = blur_sample_count(length_px)
+        by_row = [ray_to_plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         middle = maps[count // 2]
         if count % 2 == 0:
             middle = (maps[count // 2 - 1] + middle) / 2.0
-        nodes, misses = trace(self._coarse, middle)
+        nodes, misses = trace_rays(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
         # At the ray grids' padded size.
         picture = self._background(nodes, misses, motion_px, length_px)
@@ -197,7 +197,7 @@ class Renderer:
         if lens > _PLAIN_PX:
             picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
         elif lens > 0.05 and views:
-            defocused(picture, lens, box_around([view.box for view in views]))
+            defocus_blocks(picture, lens, union_box([view.box for view in views]))
         width, height = self.camera.size_px
         seen = picture[:height, :width]
         return np.asarray(cv2.multiply(seen, self._shade, seen, scale=1.0 / 255.0), np.uint8)
@@ -221,7 +221,7 @@ class Renderer:
         texels += (_CENTER_TEXEL - tile * texels_per_m).astype(np.float32)
         crop = COARSE_PX // step
         wider = cv2.resize(texels, None, fx=crop, fy=crop)
-        picture = sample(texture, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
+        picture = sample_texture(texture, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(
                 misses[1:-1, 1:-1].astype(np.uint8),
@@ -229,19 +229,19 @@ class Renderer:
                 interpolation=cv2.INTER_NEAREST,
             )
             picture[mask > 0] = FLOOR_GREY
-        kernel = line_kernel(motion_px / step)
+        kernel = motion_blur_kernel(motion_px / step)
         if length_px >= SHARP_MOTION_PX and kernel is not None:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=step, fy=step), np.uint8)
 
-    def _add_sheet(self, picture: Picture, view: View, maps: Array) -> None:
-        rows, cols = pixels_of(view.box)
+    def _add_sheet(self, picture: Picture, view: SheetView, maps: Array) -> None:
+        rows, cols = pixel_slices(view.box)
         pixels = self._pixels
         here = np.ascontiguousarray(pixels.xy[rows, cols])
         rays = RayGrid(here, pixels.down[rows], pixels.outline)
-        texels = [trace(rays, view.to_texels @ each)[0] for each in maps]
-        seen = mean_of([sample(view.texture.value, each) for each in texels])
-        alpha = mean_of([sample(view.texture.alpha, each) for each in texels])
+        texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
+        seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
+        alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
         rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
         picture[rows, cols] = cv2.add(rest, seen)
 
@@ -252,7 +252,7 @@ class Renderer:
         of poses (n, 4, 4)."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
-        points = plane_map(poses[len(poses) // 2]).dot(self._places)
+        points = ray_to_plane_map(poses[len(poses) // 2]).dot(self._places)
         points /= np.maximum(points[2], LEAST_RISE)
         points[2] = 0.0
         R, t = poses[:, :3, :3], poses[:, :3, 3:]
@@ -273,7 +273,7 @@ class Renderer:
 # --- Sums, look-ups and shading of whole pictures ---------------------
 
 
-def mean_of(pictures: Sequence[Picture]) -> Picture:
+def mean_picture(pictures: Sequence[Picture]) -> Picture:
     """Return the mean of the pictures, rounded once."""
     total: Any = pictures[0].astype(np.uint16)
     for picture in pictures[1:]:
@@ -281,16 +281,16 @@ def mean_of(pictures: Sequence[Picture]) -> Picture:
     return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / len(pictures)), np.uint8)
 
 
-def sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
+def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
     """Return a bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
     remap: Any = cv2.remap  # its stub denies that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
 
-def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
+def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
     """Blur the blocks of `box`, and what is so near to them that it shows a part of their blur."""
     reach = math.ceil(3.0 * sigma_px) + 1
-    near, far = pixels_of(box, reach), pixels_of(box, 2 * reach)
+    near, far = pixel_slices(box, reach), pixel_slices(box, 2 * reach)
     blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)
     top, left = (a.start - b.start for a, b in zip(near, far, strict=True))
     into = picture[near]
@@ -334,7 +334,7 @@ def path_length_px(motion_px: Array) -> float:
     return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
 
 
-def sample_count(length_px: float) -> int:
+def blur_sample_count(length_px: float) -> int:
     """Return how many poses the blur of a path of that length needs; 1 for a sharp frame."""
     if length_px < SHARP_MOTION_PX:
         return 1
@@ -356,7 +356,7 @@ def spread(poses: Array, count: int) -> Array:
     return np.asarray((1.0 - part) * poses[low] + part * poses[[i + 1 for i in low]])
 
 
-def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
+def motion_blur_kernel(motion_px: Array) -> NDArray[np.float32] | None:
     """Return the blur kernel of the path at the image's middle; None if it is too short to see."""
     path = motion_px[0] - motion_px[0].mean(axis=0)
     reach = float(np.abs(path).max())
@@ -389,7 +389,9 @@ SNOW_LINES_PER_FRAME = 12.0
 """Means at full strength."""
 
 
-def spoil(image: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+def add_analogue_faults(
+    image: NDArray[np.uint8], strength: float, rng: np.random.Generator
+) -> NDArray[np.uint8]:
     """Return the picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
     height, width = image.shape
     shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)

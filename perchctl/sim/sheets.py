@@ -147,7 +147,7 @@ Box = tuple[slice, slice]
 """Rows and columns of blocks of `COARSE_PX` pixels."""
 
 
-class View(NamedTuple):
+class SheetView(NamedTuple):
     """A sheet in one exposure: in the picture's `box`; `to_texels` (3, 3) maps the own target's
     plane to the texture's columns and rows."""
 
@@ -157,13 +157,13 @@ class View(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class PlacedSheet:
     """A sheet, and how (3, 3) the own target's plane maps to its."""
 
     sheet: Sheet
     plane: Array | None = None  # the own
 
-    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
+    def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
         """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
         target's axes; None where it is out of view. `length_px` is the longest way of the picture
         within the exposure."""
@@ -187,7 +187,7 @@ class Placed:
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
         if self.plane is not None:
             to_texels = to_texels @ self.plane
-        return View(texture, (rows, cols), to_texels)
+        return SheetView(texture, (rows, cols), to_texels)
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -195,7 +195,7 @@ def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.add(level, cv2.absdiff(x[2:, 1:-1], x[:-2, 1:-1])), np.float32)
 
 
-def box_around(boxes: Sequence[Box]) -> Box:
+def union_box(boxes: Sequence[Box]) -> Box:
     """Return the box that holds all of them."""
     rows, cols = (
         slice(min(each.start for each in spans), max(each.stop for each in spans))
@@ -204,7 +204,7 @@ def box_around(boxes: Sequence[Box]) -> Box:
     return rows, cols
 
 
-def pixels_of(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
+def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
     """Return the rows and columns of pixels in a box, and so many around it."""
     rows, cols = (
         slice(max(COARSE_PX * each.start - margin_px, 0), COARSE_PX * each.stop + margin_px)
@@ -213,7 +213,7 @@ def pixels_of(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
     return rows, cols
 
 
-def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
+def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
     """Return another vehicle's target; what the neighbour leaves open is as on the own."""
     large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
     small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
@@ -222,7 +222,7 @@ def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
     )
     to_own = make_T(rot_z(neighbour.yaw_rad), (*neighbour.xy_m, 0.0))
     plane = np.delete(np.delete(invert_T(to_own), 2, axis=0), 2, axis=1)
-    return Placed(printed_sheet(target.model_dump_json()), plane)
+    return PlacedSheet(printed_sheet(target.model_dump_json()), plane)
 
 
 @lru_cache(maxsize=4)

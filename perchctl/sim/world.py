@@ -73,7 +73,7 @@ class World:
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
         mujoco.mj_forward(self._model, self._data)
         self._read()
-        self.feel(0.0, 0.0, 0.0)
+        self.set_acceleration(0.0, 0.0, 0.0)
 
     @property
     def t_s(self) -> float:
@@ -139,7 +139,9 @@ class World:
         mujoco.mj_step(self._model, self._data)
         self._read()
         rate = 1.0 / CONTROL_PERIOD_S
-        self.feel((self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate)
+        self.set_acceleration(
+            (self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate
+        )
 
     def gear_tip_m(self) -> tuple[float, float, float]:
         """Return the gear's tip in world axes."""
@@ -170,7 +172,7 @@ class World:
         self.place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
     def carry(self, hand: Callable[[World], None]) -> None:
-        """Let a hand `place` the vehicle, and let it `feel`, each period until `let_go`."""
+        """Call `hand` each period until `let_go`; it sets the state of the held vehicle."""
         self._hand = hand
 
     def let_go(self) -> None:
@@ -178,7 +180,7 @@ class World:
         self._hand = None
 
     def _stay(self) -> None:
-        self.feel(0.0, 0.0, 0.0)
+        self.set_acceleration(0.0, 0.0, 0.0)
 
     def place(
         self,
@@ -209,14 +211,14 @@ class World:
             (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
         )
 
-    def feel(self, ax: float, ay: float, az: float) -> None:
-        """Let the accelerometer read what belongs to an acceleration in world axes, m/s^2."""
+    def set_acceleration(self, ax: float, ay: float, az: float) -> None:
+        """Set the accelerometer's reading from an acceleration in world axes, m/s^2."""
         az += GRAVITY_MPS2
         self.fx_mps2, self.fy_mps2, self.fz_mps2 = (
             a * ax + b * ay + c * az for a, b, c in zip(*self._R, strict=True)
         )
 
-    def contacts(self) -> tuple[float, bool]:
+    def contact_state(self) -> tuple[float, bool]:
         """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
         wrench = np.zeros(6)

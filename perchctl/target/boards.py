@@ -25,10 +25,10 @@ from perchctl.profile import MarkerConfig, dictionary_size
 from perchctl.target.drawing import (
     Rectangle,
     marker_cells,
-    measured_scale,
-    merged_rectangles,
+    merge_rectangles,
     mm_text,
     parse_length,
+    print_scale,
 )
 
 BoardKind = Literal["chessboard", "charuco"]
@@ -136,7 +136,7 @@ class Board:
         width_m, height_m = (parse_length(f"{s}mm", "the board's side") for s in sides.groups()[:2])
         given = (("width", width_m), ("height", height_m))
         (across, first), (down, second) = (
-            measured_scale(name, f"the board's {name}", is_m, meant_m, self.notation())
+            print_scale(name, f"the board's {name}", is_m, meant_m, self.notation())
             for (name, is_m), meant_m in zip(given, self.size_m, strict=True)
         )
         return replace(self, scale=(across, down)), first + second
@@ -193,7 +193,7 @@ def board_rectangles(board: Board) -> list[Rectangle]:
         at = np.linspace(-board.marker_m / 2, board.marker_m / 2, len(cells) + 1)
         x = (column + 0.5) * board.square_m - width / 2
         y = height / 2 - (row + 0.5) * board.square_m
-        found += merged_rectangles(cells, x + at, y - at)
+        found += merge_rectangles(cells, x + at, y - at)
     return found
 
 

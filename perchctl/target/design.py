@@ -19,10 +19,10 @@ from perchctl.target.sight import (
     BlindRange,
     FieldOfView,
     blind_range,
-    gear_from_camera,
-    least_side_px,
+    circle_outline,
+    gear_in_camera,
+    min_side_px,
     square_outline,
-    turned_outline,
 )
 from perchctl.vision import MARKERS, CameraModel
 
@@ -69,7 +69,7 @@ class TargetDesign:
         if far_m is None or self.z2_m is None or self.z3_m is None:
             return ("a marker is never read through this blur: a sharper picture is needed",)
         if self.start_height_m == 0.0:
-            sure_px = least_side_px(self.large_px)
+            sure_px = min_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
         if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
             found.append(
@@ -174,9 +174,9 @@ def make_design(
         small_px=small_px,
         z1_m=None if large_px is None else f * large / large_px,
         z2_m=None if small_px is None else f * small / small_px,
-        z3_m=view.nearest_m(turned_outline(large), *ahead),
+        z3_m=view.nearest_m(circle_outline(large), *ahead),
         z3_upright_m=view.nearest_m(square_outline(large), *ahead),
-        small_nearest_m=view.nearest_m(turned_outline(small), *gear_from_camera(profile)),
+        small_nearest_m=view.nearest_m(circle_outline(small), *gear_in_camera(profile)),
         blind=blind_range(target, camera, profile),
         start_range_m=start_m,
         start_height_m=height_m,

@@ -67,14 +67,14 @@ class TargetDrawing:
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
         """Return the exact share of black in the windows of size_px x size_px pixels around the
         centre, 0..1."""
-        w = overlap(self.edges_m, px_per_m, size_px, window_px)
+        w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
         """Return the share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
         half = self.sheet_side_m / 2.0
-        w = overlap(np.array([-half, half]), px_per_m, size_px, window_px)
+        w = pixel_overlap(np.array([-half, half]), px_per_m, size_px, window_px)
         return np.asarray(w @ w.T)
 
     def bitmap(self, px_per_m: float) -> NDArray[np.uint8]:
@@ -85,7 +85,7 @@ class TargetDrawing:
 
     def rectangles(self) -> list[Rectangle]:
         """Return the black area as few, large, non-overlapping rectangles (for a PDF)."""
-        return merged_rectangles(self.black, self.edges_m, -self.edges_m)
+        return merge_rectangles(self.black, self.edges_m, -self.edges_m)
 
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
@@ -147,7 +147,7 @@ def _white_in_black_cells(
 ) -> float:
     """Return the largest share of white in the sampled part of a black cell, 0..1."""
     n = len(large)
-    w = overlap(edges_m, n / large_side_m, n, 1.0 - 2.0 * SAMPLED_MARGIN)
+    w = pixel_overlap(edges_m, n / large_side_m, n, 1.0 - 2.0 * SAMPLED_MARGIN)
     ink = w @ black.astype(np.float64) @ w.T
     return float((1.0 - ink)[large].max())
 
@@ -168,7 +168,7 @@ def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> ND
     return np.asarray(inside & cells[np.clip(row, 0, n - 1), np.clip(col, 0, n - 1)])
 
 
-def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
+def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
     """Return the share of each pixel's window that lies in each interval of `edges_m`, (size_px,
     n).
 
@@ -181,7 +181,7 @@ def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.
     return np.diff(below, axis=1) / window_px
 
 
-def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
+def merge_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
     """Return the black cells of a grid as few, large, non-overlapping rectangles.
 
     `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. Few and
@@ -245,7 +245,7 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
     return float(f"{value:.12g}")
 
 
-def measured_scale(
+def print_scale(
     name: str, option: str, measured_m: float, meant_m: float, source: str
 ) -> tuple[float, list[str]]:
     """Return a print's measured length over the length that it was meant to have by `source`, and

@@ -15,7 +15,7 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.drawing import marker_corners_m, measured_scale
+from perchctl.target.drawing import marker_corners_m, print_scale
 from perchctl.vision import CameraModel, PipelineOutput, undistort
 
 MEASURED_SIGMA = 0.001
@@ -34,7 +34,7 @@ def measured_target(
     target = nominal
     for name, side_m in sides_m.items():
         marker: MarkerConfig = getattr(nominal, name)
-        scales[name], said = measured_scale(
+        scales[name], said = print_scale(
             name, f"--measured-{name}", side_m, marker.side_m, "the profile"
         )
         notes += said

@@ -21,7 +21,7 @@ from perchctl.target.drawing import TargetDrawing, draw_target, marker_cells, mm
 from perchctl.vision import MARKERS
 
 
-class PlainReader:
+class ArucoReader:
     """cv2.aruco with its default parameters, and for each marker a dictionary of just
     its id (the other ids of a nested dictionary are not searched)."""
 
@@ -75,7 +75,7 @@ def smallest_side_px(
         picture_px: the larger side of the camera's picture.
     """
     drawing = draw_target(target)
-    reader = PlainReader(target)
+    reader = ArucoReader(target)
     side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
     count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
 
@@ -167,7 +167,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
             f"nearly the same pattern, so one marker would be taken for the other: take another "
             f"id for one of them"
         )
-    seen = PlainReader(target).read(draw_target(target).bitmap(_READ_SIDE_PX / large.side_m))
+    seen = ArucoReader(target).read(draw_target(target).bitmap(_READ_SIDE_PX / large.side_m))
     for name in MARKERS:
         if name not in seen:
             raise InvalidValue(

@@ -109,7 +109,7 @@ def board_pdf(board: Board, page: str) -> bytes:
         f"calibrate, behind the board: {board.notation()}:measured=WIDTHxHEIGHTmm.",
     )
     left = max(UNPRINTABLE, pdf.cx - width / 2)
-    lines = wrapped(texts, _LABEL, held[0] - UNPRINTABLE - left)
+    lines = wrap_texts(texts, _LABEL, held[0] - UNPRINTABLE - left)
     base = pdf.cy - height / 2 - 2.5 - 3.2 * (len(lines) - 1)
     for i, line in enumerate(lines):
         pdf.write_line(left, base + 3.2 * i, line, _LABEL)
@@ -202,7 +202,7 @@ def _ruler_half(half: float) -> float:
 
 def _caption_room(texts: Sequence[str], width: float) -> tuple[list[str], float]:
     """Return the caption's lines, and the room for rulers and caption below the sheet, mm."""
-    lines = wrapped(texts, _TEXT, width - 2 * (UNPRINTABLE + _RULER_DEPTH))
+    lines = wrap_texts(texts, _TEXT, width - 2 * (UNPRINTABLE + _RULER_DEPTH))
     return lines, _RULER_DEPTH + 2.0 + _LINE * len(lines)
 
 
@@ -277,7 +277,7 @@ class _Paper(FPDF):
             self.text(x - back * self.get_string_width(text), y, text)
 
 
-def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
+def wrap_texts(texts: Sequence[str], size: float, width: float) -> list[str]:
     """Return every text in as many lines as `width` mm needs; words are never cut."""
     pdf = FPDF(unit="mm")
     pdf.add_page()
@@ -322,7 +322,7 @@ def _draw_back(pdf: _Paper, half: float, magnet_m: float) -> None:
         f"centre of both markers.",
     )
     base = cy + half + _MARK_GAP + _MARK + 2.0 + _TEXT
-    for i, line in enumerate(wrapped(texts, _TEXT, pdf.w - 2 * UNPRINTABLE)):
+    for i, line in enumerate(wrap_texts(texts, _TEXT, pdf.w - 2 * UNPRINTABLE)):
         pdf.write_line(cx, base + _LINE * i, line, back=0.5)
 
 

@@ -37,7 +37,7 @@ class FieldOfView:
         self._angle = angle[order]
         self._reach = np.hypot(*rays.T)[order]
 
-    def holds(self, points_cam_m: Array) -> bool:
+    def contains(self, points_cam_m: Array) -> bool:
         """Return true if all points (n, 3) of the camera frame are in the picture."""
         x, y, z = points_cam_m.T
         if (z <= 0.0).any():
@@ -50,7 +50,7 @@ class FieldOfView:
         all points (x, y) of `outline_m` (n, 2) and from there on; None if for no distance."""
 
         def seen(d: float) -> bool:
-            return self.holds(raised(outline_m, d) @ R.T + offset_m)
+            return self.contains(outline_at_height(outline_m, d) @ R.T + offset_m)
 
         low, high = NEAREST_M, FARTHEST_M
         if not seen(high):
@@ -70,13 +70,13 @@ def square_outline(side_m: float) -> Array:
     return np.concatenate([np.column_stack(pair) for pair in ((s, h), (s, -h), (h, s), (-h, s))])
 
 
-def turned_outline(side_m: float) -> Array:
+def circle_outline(side_m: float) -> Array:
     """Return points of the circle through a square's corners: the square at any turn, (n, 2)."""
     a = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
     return np.asarray(side_m / math.sqrt(2.0) * np.column_stack([np.cos(a), np.sin(a)]))
 
 
-def raised(outline_m: Array, height_m: float) -> Array:
+def outline_at_height(outline_m: Array, height_m: float) -> Array:
     """Return the outline's points at that height, (n, 3)."""
     return np.column_stack([outline_m, np.full(len(outline_m), height_m)])
 
@@ -94,7 +94,7 @@ LEAST_UP = 0.2
 """Of the view's upward part: a camera that looks farther aside sees no target over it."""
 
 
-def least_side_px(plain_px: float | None = None) -> float:
+def min_side_px(plain_px: float | None = None) -> float:
     """Return the side in px from which on the ground's search finds the large marker surely.
     `plain_px`: what a plain one reads through the camera's own blur, where that was measured."""
     return SURE_PX if plain_px is None else max(SURE_PX, BLURRED * plain_px)
@@ -105,7 +105,7 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
     camera at most, and how far aside of its axis at some heights."""
     side_m = target.large.side_m
     view = mount.T_body_cam[:3, 2]
-    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px()
+    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / min_side_px()
     lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
     axis = _directions(lean, STRAIGHT_DEG, ".0f", "deg")
     axis = f"leans {axis}" if axis else "points straight up"
@@ -133,8 +133,8 @@ def overhead_reach_m(
     axis = height_m / view[2] * view
 
     def seen(radius_m: float) -> bool:
-        around = turned_outline(math.sqrt(2.0) * radius_m + side_m)
-        return field.holds((raised(around, 0.0) + axis) @ R)
+        around = circle_outline(math.sqrt(2.0) * radius_m + side_m)
+        return field.contains((outline_at_height(around, 0.0) + axis) @ R)
 
     if not seen(0.0):
         return None
@@ -186,7 +186,7 @@ def view_from(
     height_m = float(centre[2])
     turn = rot_z(target_yaw_rad - body_yaw_rad)
     large, small = (
-        field.holds((square_corners(side_m) @ turn.T + centre) @ R)
+        field.contains((square_corners(side_m) @ turn.T + centre) @ R)
         for side_m in (target.large.side_m, target.small.side_m)
     )
     # The small marker by its size alone.
@@ -244,12 +244,14 @@ def _blind_words(nearest_m: float | None) -> str:
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
     """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
     little."""
-    R, offset = gear_from_camera(profile)
+    R, offset = gear_in_camera(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
     def whole(range_m: float) -> bool:
-        return any(view.holds(raised(each, range_m) @ R.T + offset) for each in outlines)
+        return any(
+            view.contains(outline_at_height(each, range_m) @ R.T + offset) for each in outlines
+        )
 
     def left(range_m: float) -> bool:
         centre = R @ np.array([0.0, 0.0, range_m]) + offset
@@ -269,12 +271,12 @@ def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
     """Return true if the whole small marker is in the picture with the gear's tip so far under
     it."""
-    R, gear = gear_from_camera(profile)
-    outline = raised(square_outline(profile.target.small.side_m), range_m)
-    return FieldOfView(camera).holds(outline @ R.T + gear)
+    R, gear = gear_in_camera(profile)
+    outline = outline_at_height(square_outline(profile.target.small.side_m), range_m)
+    return FieldOfView(camera).contains(outline @ R.T + gear)
 
 
-def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
+def gear_in_camera(profile: Profile) -> tuple[Array, Array]:
     """Return the rotation from body to camera axes, and the gear's tip in the camera's, m."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T

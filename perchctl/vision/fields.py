@@ -99,7 +99,7 @@ def classify_fields(frame: Frame) -> Frame:
     return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
-def halves(frame: Frame) -> tuple[Frame, Frame]:
+def field_frames(frame: Frame) -> tuple[Frame, Frame]:
     """Return the top and the bottom field, both at the frame's time."""
     return (
         replace(frame, image=field_picture(frame.image, 0), fields="top", encoded=None),
@@ -125,7 +125,7 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
     state = _voted(replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame)
     if frame.fields != "woven" or state.top_first is None:
         return state, (frame,)
-    top, bottom = halves(frame)
+    top, bottom = field_frames(frame)
     early, late = (top, bottom) if state.top_first else (bottom, top)
     apart_s = _period_s(state.periods_s) / 2.0
     return state, (

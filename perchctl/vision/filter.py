@@ -59,8 +59,8 @@ class ProcessNoise:
     wanders: bool = False
 
     @cached_property
-    def unturned(self) -> Array:
-        """What a second adds to the rates of (yaw, x, y, z), (4, 4)."""
+    def rate_variance(self) -> Array:
+        """Variance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
         push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
         return np.diag(push * push) * _PUSH_S
 
@@ -120,14 +120,14 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     )
 
 
-def tilted(way_m: Array) -> Array:
+def tilt_jacobian(way_m: Array) -> Array:
     """Return the change of a way (3,) with a turn about the level x and y axes, m/rad, (3, 2)."""
     x, y, z = way_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
 def transition(dt_s: float) -> Array:
-    """Return F of equation 1, (8, 8)."""
+    """Return the state transition matrix F (8, 8) of the paper's equation 1, over `dt_s`."""
     return _STILL + dt_s * _MOVES
 
 
@@ -148,10 +148,10 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
 def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
     """Return what a second adds to the rates of yaw, x, y and z, (4, 4)."""
     if noise.turn_radps2 == 0.0:
-        return noise.unturned
+        return noise.rate_variance
     turned2 = noise.turn_radps2**2 * _PUSH_S
     x, y, z = position_m.tolist()
-    density = noise.unturned.copy()
+    density = noise.rate_variance.copy()
     density[1:, 1:] += turned2 * (
         (x * x + y * y + z * z) * _AXES - np.outer(position_m, position_m)
     )

@@ -33,7 +33,7 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 
 @dataclass(frozen=True, eq=False)
-class Merged:
+class MergedTarget:
     """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) of
     place."""
 
@@ -59,7 +59,7 @@ def measure_markers(
     `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,)
     the target's normal at that last pose, in the camera's axes of then.
     """
-    seen, t_s = seen_at_once(detections, setup), detections.t_s
+    seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
     joint = None
     if config.method == "joint" and len(seen) == 2:
         joint = estimate_pose(seen, t_s, attitude, setup, normal_cam, near)
@@ -78,7 +78,7 @@ def measure_markers(
         return MeasuredMarkers(poses, {"joint": joint})
     contradicting = False
     if not clear and len(singles) == 2:
-        contradicting = disagree(singles["large"], singles["small"], config.disagreement_m)
+        contradicting = markers_disagree(singles["large"], singles["small"], config.disagreement_m)
     fed, one = dict(singles), joint
     if len(singles) == 2:
         better = better_conditioned(singles["large"], singles["small"])
@@ -99,7 +99,7 @@ def measure_markers(
 
 def merge_tracks(
     tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
-) -> Merged | None:
+) -> MergedTarget | None:
     """Return the target by the tracks that this frame `fed`, or else by those unseen for the
     shortest time, merged by W (equations 5, 8, 12); None without a track."""
     if not tracks:
@@ -109,7 +109,7 @@ def merge_tracks(
     used = {name: track for name, track in used.items() if name in fed} or used
     if len(used) == 1:
         ((name, track),) = used.items()
-        return Merged(
+        return MergedTarget(
             vector=track.x[_PLACE_YAW],
             velocity_mps=track.x[VELOCITY],
             cov_m2=track.P[POSITION, POSITION],
@@ -124,7 +124,7 @@ def merge_tracks(
     pairs = np.stack([np.diag(large.P)[order], np.diag(small.P)[order]], axis=1)
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
-    return Merged(
+    return MergedTarget(
         vector=merge_pair(large.x[order], small.x[order], weights),
         velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
         cov_m2=np.diag(variance[:3]),
@@ -146,11 +146,11 @@ FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 """Of a motion, along and across, as shares of it: it was measured a frame before."""
 
 
-def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the markers with their corners at the frame's own time. `setup.readout_s` is from a
-    picture's first row to its last; where it is None the corners stay where they are, with what a
-    likely read-out would do to them for an error (`common_px`); else with what the motion's own
-    error does."""
+def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
+    """Return the markers with the rolling shutter taken out: corners as at the frame's time.
+    `setup.readout_s` is the time from a picture's first row to its last. If it is None the corners
+    are not moved, and `common_px` holds the shift by a likely read-out; otherwise it holds the
+    error that the motion's uncertainty leaves."""
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
@@ -187,7 +187,7 @@ def seen_at_once(detections: Detections, setup: PoseSetup) -> list[Detection]:
 
 
 def stage_of(large: bool, small: bool) -> Stage:
-    """Return the stage by the markers that are there."""
+    """Return the stage that follows from which markers were detected."""
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
@@ -209,7 +209,7 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
     return np.asarray(merged)
 
 
-def disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
+def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
     """Return True if the markers are farther apart than the limit and than four standard
     deviations, in any axis. What is wrong with the print moves both alike, and excuses no gap."""
     gap = np.abs(large.e_m - small.e_m)

@@ -22,12 +22,12 @@ from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
-from perchctl.vision.merge import Merged, measure_markers, merge_tracks, stage_of
+from perchctl.vision.merge import MergedTarget, measure_markers, merge_tracks, stage_of
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
-    marker_aside_m,
-    seen_from,
+    marker_offset_m,
+    relative_bias_m,
     to_level,
     to_world,
 )
@@ -35,7 +35,7 @@ from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
     expected_corners,
-    update_sight,
+    update_sighting,
     update_tracks,
 )
 from perchctl.vision.types import (
@@ -142,14 +142,14 @@ def step(
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
-    own = partial(marker_aside_m, pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
+    own = partial(marker_offset_m, pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
     detections = detect_markers(
         frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
     )
-    return follow(state, detections, attitude, pipeline, near, frame.fields or "whole")
+    return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
 
 
-def follow(
+def step_detections(
     state: PipelineState,
     detections: Detections,
     attitude: Attitude | None,
@@ -174,7 +174,7 @@ def follow(
     surest = measured.surest
     sees = surest is not None and verdict.taken
     if surest is not None and sees:
-        sighting = update_sight(sighting, surest, attitude, pipeline.pose)
+        sighting = update_sighting(sighting, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     last = state.last
     if anything and verdict.taken:
@@ -277,7 +277,7 @@ def _at_frame(
 
 
 def _placed(
-    merged: Merged,
+    merged: MergedTarget,
     attitude: Attitude | None,
     in_world: bool,
     pipeline: Pipeline,
@@ -295,7 +295,7 @@ def _placed(
         seen["world_velocity_mps"] = merged.velocity_mps
         if spread:
             cov_m2 = turn.dot(cov_m2).dot(turn.T)
-            bias_m = seen_from(bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+            bias_m = relative_bias_m(bias_m, attitude, pipeline.tracks.world, pipeline.pose)
     else:
         seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad
         if attitude is not None:

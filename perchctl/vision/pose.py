@@ -52,9 +52,9 @@ class PoseSetup:
 
     @cached_property
     def lift(self) -> dict[_Source, Array]:
-        """How far these corners are out of the plane of a sheet that curls."""
+        """Distances, m, by which a curled sheet lifts these corners out of its plane."""
         curl = self.target.curl_per_m
-        return {source: lift_of(corners, curl) for source, corners in self.corners_m.items()}
+        return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
 
 def square_corners(side_m: float) -> Array:
@@ -88,7 +88,7 @@ def estimate_pose(
     if not finite(image_px):
         return None  # the lens cannot have imaged them
     K, lift = setup.camera.K, setup.lift[source]
-    points = make_points(detections, setup.corners_m[source], image_px, K, lift)
+    points = weigh_corners(detections, setup.corners_m[source], image_px, K, lift)
     R_level_body = level_rotation(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
@@ -114,8 +114,8 @@ def estimate_pose(
 
 
 def _continued(
-    points: Points, start: PoseCandidate | None, prior: TiltPrior, most_px: float
-) -> Scored | None:
+    points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
+) -> ScoredPose | None:
     """Return the solution next to a start, if it leaves `most_px` RMS or less."""
     solution = None if start is None else gauss_newton(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
@@ -126,8 +126,8 @@ def _continued(
 def _level_pose(
     source: _Source,
     t_s: float,
-    solution: Scored,
-    points: Points,
+    solution: ScoredPose,
+    points: WeightedCorners,
     R_level_body: Array,
     setup: PoseSetup,
 ) -> MarkerPose:
@@ -210,7 +210,7 @@ class PoseCandidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Scored(PoseCandidate):
+class ScoredPose(PoseCandidate):
     """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6)."""
 
     error_px: Array
@@ -239,7 +239,7 @@ class TiltPrior:
         )
 
 
-def solve(points: Points, prior: TiltPrior) -> Scored | None:
+def solve(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     """Return the better of both tilts, in front of the camera."""
     candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
@@ -252,7 +252,7 @@ def solve(points: Points, prior: TiltPrior) -> Scored | None:
     return gauss_newton(points, best) or best
 
 
-def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
+def gauss_newton(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
     """Refine a pose with each corner's own spread, from a start that is near; None where that
     fails."""
     candidate: PoseCandidate = start
@@ -263,7 +263,7 @@ def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
         if points.curled:
-            weight = weight_with(_curl(points, scored))
+            weight = curl_weight(_curl(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -281,7 +281,7 @@ def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
             # Errors are linear in such a step.
             error_px = scored.error_px - moved_px
             rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
-            return Scored(rvec, tvec, error_px, scored.jacobian)
+            return ScoredPose(rvec, tvec, error_px, scored.jacobian)
         if gain < 1e-4 + 1e-6 * cost:
             return scored
         candidate, before = (
@@ -293,7 +293,7 @@ def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
     return None
 
 
-def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
+def covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
     """Return the pose's covariance, its fit and its change by a curl of the sheet.
 
     These are the covariance (6, 6) of (rvec, tvec), the squared error per degree of freedom, and
@@ -305,7 +305,7 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
     curl = _curl(points, scored)
-    weight = weight_with(curl) if points.curled else None
+    weight = curl_weight(curl) if points.curled else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
@@ -322,7 +322,7 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
     return cov, chi2 / freedom, curled
 
 
-def _curl(points: Points, scored: Scored) -> Array:
+def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return what each kind of curl does to the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
@@ -336,7 +336,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: Points) -> list[PoseCandidate]:
+def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
     """Return the candidates of OpenCV's SQPNP; none of corners on one line."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
@@ -355,7 +355,7 @@ def _usable(candidate: PoseCandidate) -> bool:
     return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
 
 
-def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
+def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
     """Return the candidate refined by OpenCV, or as it was."""
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
@@ -365,15 +365,15 @@ def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
     return PoseCandidate(np.ravel(rvec), np.ravel(tvec))
 
 
-def _scored(candidate: PoseCandidate, points: Points) -> Scored:
+def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
     """Return the candidate with what it leaves over of the corners."""
     rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
-    return Scored(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
+    return ScoredPose(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
 
 
-def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
+def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
     """Return the best candidate near the other tilt, whose normal is mirrored at the line of sight;
     none where both agree."""
     R = rotation_matrix(scored.rvec)
@@ -389,13 +389,13 @@ def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
     return [_scored(turned, points)] if _usable(turned) else []
 
 
-def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored:
+def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPrior) -> ScoredPose:
     """Return the best candidate by corners and tilt."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
 
-    def cost(s: Scored) -> float:
+    def cost(s: ScoredPose) -> float:
         total = float(((s.error_px / sigma) ** 2).sum())
         if prior.normal_cam is not None:
             total += (tilt_rad(s.rvec, prior.normal_cam) / prior.spread_rad) ** 2
@@ -407,7 +407,7 @@ def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored
 # --- A sheet that is not flat: what its curl does to corners, and what they are worth then ---
 
 
-def lift_of(object_m: Array, curl_per_m: float) -> Array:
+def curl_lift(object_m: Array, curl_per_m: float) -> Array:
     """Return how far corners (n, 3) are out of the sheet's plane at one standard deviation of each
     kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners to
     either."""
@@ -416,9 +416,9 @@ def lift_of(object_m: Array, curl_per_m: float) -> Array:
     return lift.repeat(2, axis=0)
 
 
-def weight_with(curl: Array) -> Array:
-    """Return the inverse covariance (2n, 2n) of errors of unit spread with `curl` (2n, k) among
-    them."""
+def curl_weight(curl: Array) -> Array:
+    """Return the weight matrix (2n, 2n) of the corner errors: the inverse of the covariance
+    ``I + curl curl^T``, for `curl` (2n, k)."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
@@ -443,7 +443,7 @@ _SIDES = 8 * _ROWS + _COLUMNS  # in an (8, 8) matrix
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class WeightedCorners:
     """object_m (n, 3) and image_px (n, 2) of a pinhole K; sigma_px (n,); whitening
     (2n, 2n) makes errors independent and of unit spread; shift (2n, k): one standard deviation
     each of what moves corners together, whitened: the shift that all edges share, the
@@ -460,13 +460,13 @@ class Points:
     curled: bool = False
 
 
-def make_points(
+def weigh_corners(
     detections: Sequence[Detection],
     object_m: Array,
     image_px: Array,
     K: Array,
     lift: Array,
-) -> Points:
+) -> WeightedCorners:
     """Return the corners of one or both detections with what each is worth."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
@@ -499,7 +499,7 @@ def make_points(
             shift[along_x, 2 + 2 * i] = 0.5 * d.row_sigma_px
             shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_sigma_px * down
     sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
-    return Points(object_m, image_px, sigma_px, W, W.dot(shift), K, lift)
+    return WeightedCorners(object_m, image_px, sigma_px, W, W.dot(shift), K, lift)
 
 
 def _outward_normals(corners: Array) -> Array:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array, finite, wrap_rad
-from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilted
+from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilt_jacobian
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
@@ -34,7 +34,7 @@ AsideOf = Callable[[MarkerName, Array], float]
 """How far a marker with corners (4, 2) px is from the own target's place, or inf."""
 
 
-def marker_aside_m(
+def marker_offset_m(
     place: OwnTargetPlace,
     t_s: float,
     attitude: Attitude | None,
@@ -45,11 +45,11 @@ def marker_aside_m(
     """Return what `AsideOf` does, in a picture taken at `attitude`."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
-    away_m = math.inf if pose is None else aside_m(pose, attitude, place, setup)
+    away_m = math.inf if pose is None else target_offset_m(pose, attitude, place, setup)
     return away_m if attitude is None or away_m <= place.within_m else math.inf
 
 
-def aside_m(
+def target_offset_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
     """Return how far a target is from the own one's place."""
@@ -59,13 +59,13 @@ def aside_m(
     return math.hypot(seen_m[0] - place.xy_m[0], seen_m[1] - place.xy_m[1])
 
 
-def refusal(
+def refusal_text(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
     """Return one sentence where the target is another vehicle's."""
     if attitude is None or place.xy_m is None:
         return None
-    away_m = aside_m(pose, attitude, place, setup)
+    away_m = target_offset_m(pose, attitude, place, setup)
     if away_m <= place.within_m:
         return None
     return (
@@ -124,7 +124,7 @@ def measurement(
     bias = np.zeros((4, 4))
     bias[1:, PRINT] = pose.print_m
     if attitude is not None:
-        bias[1:, TILTS] = tilted(way_m) * constants.tilt_sigma_rad
+        bias[1:, TILTS] = tilt_jacobian(way_m) * constants.tilt_sigma_rad
     if in_world and attitude is not None:
         turn = _STILL.copy()
         turn[:3, :3] = attitude.R_world_level
@@ -134,10 +134,12 @@ def measurement(
     return Measurement(z, R, bias)
 
 
-def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:
-    """Return what constant errors make of the way from the gear to a target in the world, level
-    axes (3, 4): of `bias_m` (3, 4), less what roll and pitch make of the gear."""
+def relative_bias_m(
+    bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
+) -> Array:
+    """Return the effect (3, 4) of constant errors on the vector from gear to target, level axes:
+    `bias_m` (3, 4) of the target less the effect of roll and pitch errors on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(bias_m)
-    moved[:, TILTS] -= tilted(gear_level) * constants.tilt_sigma_rad
+    moved[:, TILTS] -= tilt_jacobian(gear_level) * constants.tilt_sigma_rad
     return np.asarray(moved)

@@ -21,9 +21,9 @@ from perchctl.vision.filter import (
     step_track,
 )
 from perchctl.vision.lens import project
-from perchctl.vision.markers.cut import lattice_of
+from perchctl.vision.markers.cut import make_lattice
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import OwnTargetPlace, measurement, refusal
+from perchctl.vision.target_selection import OwnTargetPlace, measurement, refusal_text
 from perchctl.vision.types import (
     Attitude,
     Lock,
@@ -60,7 +60,7 @@ class TrackedFrame:
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
-    verdict: Verdict
+    verdict: GateVerdict
     lock: Lock | None = None
     stranger: Stranger | None = None
 
@@ -80,12 +80,12 @@ def update_tracks(
         for name, pose in measured.fed.items()
     }
     old = state.tracks if state.in_world == in_world else {}
-    sight, verdict = None, Verdict(taken=True, stranger=state.stranger)
+    sight, verdict = None, GateVerdict(taken=True, stranger=state.stranger)
     pose = measured.surest
     if fed and pose is not None:
         name = next(n for n, each in measured.fed.items() if each is pose)
         whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-        sight = Sight(t_s, pose, fed[name], in_world, whole)
+        sight = FramePose(t_s, pose, fed[name], in_world, whole)
         if state.stranger is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
@@ -94,10 +94,10 @@ def update_tracks(
             verdict = judged(state.lock, state.stranger, sight, constants)
         # What was locked on goes on, however far the estimate's world has drifted meanwhile.
         goes_on = not verdict.afresh or verdict.same
-        goes_on = goes_on and remembered(state.lock, None, t_s)[0] is not None
-        another = None if goes_on else refusal(pose, attitude, setup.own, setup.pose)
+        goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
+        another = None if goes_on else refusal_text(pose, attitude, setup.own, setup.pose)
         if another is not None and verdict.taken:
-            verdict = Verdict(False, stranger=state.stranger, text=another, refused=True)
+            verdict = GateVerdict(False, stranger=state.stranger, text=another, refused=True)
     if not verdict.taken:
         measured, fed = replace(measured, fed={}), {}
     begun = {} if verdict.afresh else old
@@ -105,7 +105,7 @@ def update_tracks(
     tracks = {n: track for n, track in stepped.items() if track is not None}
     if not setup.gate:
         return TrackedFrame(measured, tracks, verdict)
-    lock, stranger = remembered(state.lock, verdict.stranger, t_s)
+    lock, stranger = drop_expired(state.lock, verdict.stranger, t_s)
     if sight is not None and verdict.taken and tracks:
         surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict)
@@ -144,7 +144,7 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FramePose:
     """A frame's pose, as a measurement; `whole` if it rests on both markers; `looks_there` if the
     lock's place is in the picture."""
 
@@ -157,9 +157,10 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """Whether the pose is the target's; if so, whether the tracks have to begin anew there, though
-    it may be the `same` target; else whose it is; and a sentence where that is not as ever."""
+class GateVerdict:
+    """The gate's decision on a pose. `taken`: it is the target's; `afresh`: the tracks restart
+    there, perhaps for the `same` target. A rejected pose goes to `stranger`; `text` explains
+    what is unusual."""
 
     taken: bool
     afresh: bool = False
@@ -170,33 +171,33 @@ class Verdict:
 
 
 def judged(
-    lock: Lock | None, stranger: Stranger | None, sight: Sight, constants: FilterSetup
-) -> Verdict:
+    lock: Lock | None, stranger: Stranger | None, sight: FramePose, constants: FilterSetup
+) -> GateVerdict:
     """Return the verdict on a frame's pose."""
-    lock, stranger = remembered(lock, stranger, sight.t_s)
+    lock, stranger = drop_expired(lock, stranger, sight.t_s)
     if stranger is not None and stranger.in_world != sight.in_world:
         stranger = None
     if lock is None or lock.in_world != sight.in_world:
-        return Verdict(taken=True)
+        return GateVerdict(taken=True)
     if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
-        return Verdict(taken=False, stranger=stranger)
+        return GateVerdict(taken=False, stranger=stranger)
     if stranger is None and _is_clear(lock.track, sight, constants):
-        return Verdict(taken=True)
+        return GateVerdict(taken=True)
     fit = _misfit(lock.track, sight, constants)
     other = None if stranger is None else _misfit(stranger.track, sight, constants)
     theirs = other is not None and other.squared <= _GATE
     if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
-        return Verdict(taken=True, stranger=stranger)
+        return GateVerdict(taken=True, stranger=stranger)
     if not theirs and _goes_on(lock, sight, fit.off):
-        return Verdict(taken=True, afresh=True, same=True, text=_JUMPED)
+        return GateVerdict(taken=True, afresh=True, same=True, text=_JUMPED)
     seen = _watched(stranger if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
         text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
-        return Verdict(taken=True, afresh=True, text=text)
-    return Verdict(taken=False, stranger=seen, text=f"not the tracked target: {seen.text}")
+        return GateVerdict(taken=True, afresh=True, text=text)
+    return GateVerdict(taken=False, stranger=seen, text=f"not the tracked target: {seen.text}")
 
 
-def remembered(
+def drop_expired(
     lock: Lock | None, stranger: Stranger | None, t_s: float
 ) -> tuple[Lock | None, Stranger | None]:
     """Return what of a lock and a stranger still counts at `t_s`."""
@@ -213,7 +214,7 @@ def remembered(
     return lock, stranger
 
 
-def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict) -> Lock:
+def locked(lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict) -> Lock:
     """Return the lock after a pose that was taken; `track` is what it fed."""
     anew = verdict.afresh and not verdict.same
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
@@ -252,7 +253,7 @@ class _Fit:
         return float(np.linalg.norm(self.off[1:]))
 
 
-def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
+def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fit:
     """Return by how much the pose is off from what a track foresees."""
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The most that it drifts counts as three standard deviations.
@@ -266,7 +267,7 @@ def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
     return _Fit(off, S + np.diag(_unclaimed(_range_m(sight)) ** 2))
 
 
-def _is_clear(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
+def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
     """Return True if what no pose claims explains all, as in most frames: a quick look."""
     wanted = predict_track(track, sight.t_s, constants, spread=False)
     off = sight.measured.z - wanted.x[MEASURED]
@@ -275,7 +276,7 @@ def _is_clear(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
     return float(off @ off) <= _GATE
 
 
-def _range_m(sight: Sight) -> float:
+def _range_m(sight: FramePose) -> float:
     """Return the target's distance from the camera."""
     return math.hypot(*sight.pose.tvec_m.tolist())
 
@@ -286,7 +287,7 @@ def _unclaimed(range_m: float) -> Array:
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _goes_on(lock: Lock, sight: Sight, off_in_world: Array) -> bool:
+def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     """Return True if the pose goes on from the last one as seen from the vehicle, much better than
     in the world."""
     dt_s = sight.t_s - lock.track.t_s
@@ -306,7 +307,9 @@ def _goes_on(lock: Lock, sight: Sight, off_in_world: Array) -> bool:
 # --- strangers --------------------------------------------------------
 
 
-def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
+def _watched(
+    before: Stranger | None, sight: FramePose, fit: _Fit, constants: FilterSetup
+) -> Stranger:
     """Return the stranger with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
@@ -332,7 +335,7 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
     )
 
 
-def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
+def _believed(lock: Lock, stranger: Stranger, sight: FramePose) -> bool:
     """Return True if the target is where the stranger is now."""
     if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
         return True
@@ -386,7 +389,7 @@ def expected_corners(
     return {"large": corners[:4], "small": corners[4:]}, moved
 
 
-def update_sight(
+def update_sighting(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
     """Return the new sighting, with what it shows of the estimate's motion."""
@@ -414,7 +417,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.
-    if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > lattice_of(setup.camera).reach * way_m[2]:
+    if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > make_lattice(setup.camera).reach * way_m[2]:
         return False
     (at_px,) = project(np.zeros((1, 3)), np.zeros(3), way_m, setup.camera)
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())

@@ -26,7 +26,7 @@ from perchctl.camera import FrameSource, check_size
 from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound
 from perchctl.files import cannot_be_written
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
-from perchctl.positioning import CaptureFrame, CaptureSource, Placed
+from perchctl.positioning import CaptureFrame, CaptureSource, VehiclePose
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import (
     MARKERS,
@@ -38,7 +38,7 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
-from perchctl.weights.data import HEADER, row_text
+from perchctl.weights.data import HEADER, csv_row
 
 SEEN_SHARE = 0.9
 """Of a position's frames both markers must be in so many."""
@@ -119,7 +119,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
     """Return the lines of a position in the session's file."""
-    return "".join(row_text(position, r.t_s, [r.large, r.small, actual]) for r in readings)
+    return "".join(csv_row(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
 class SessionFile:
@@ -260,7 +260,7 @@ def _median(
     frames: list[CaptureFrame], body: str, mounted: PositioningConfig
 ) -> tuple[Array, tuple[float, float, float]]:
     """Return the position (3,) m, and roll, pitch, yaw in rad of the body's axes in the world."""
-    placed = [Placed.of(frame.bodies[body], mounted) for frame in frames]
+    placed = [VehiclePose.of(frame.bodies[body], mounted) for frame in frames]
     rpy = np.unwrap([rpy_from_rotation(each.R) for each in placed], axis=0)
     roll, pitch, yaw = (float(angle) for angle in np.median(rpy, axis=0))
     return np.median([each.position_m for each in placed], axis=0), (roll, pitch, wrap_rad(yaw))

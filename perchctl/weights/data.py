@@ -63,12 +63,12 @@ class Measurements:
         return ~(np.isnan(self.large[:, 0]) | np.isnan(self.small[:, 0]))
 
 
-def wrap(angle_rad: Any) -> Any:
+def wrap_angles(angle_rad: Any) -> Any:
     """Return the same angles in (-pi, pi], any shape."""
     return -((-angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def row_text(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
+def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
     """Return one line of the CSV for large, small and actual, each (4,) or None."""
     cells = [str(position), f"{t_s:.6f}"]
     for pose in poses:
@@ -164,7 +164,7 @@ def _check_positions(data: Measurements) -> None:
         rows = data.both & (data.position == place)
         for source in ("large", "small"):
             apart = getattr(data, source)[rows] - data.actual[rows]
-            apart[:, YAW] = wrap(apart[:, YAW])
+            apart[:, YAW] = wrap_angles(apart[:, YAW])
             far = np.abs(np.median(apart, axis=0)) > MOST_APART
             if far.any():
                 raise InvalidValue(

@@ -27,7 +27,7 @@ from scipy.special import stdtrit
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.weights.data import AXES, YAW, Measurements, wrap
+from perchctl.weights.data import AXES, YAW, Measurements, wrap_angles
 
 OUTLIER_SIGMAS = 6.0
 """A row does not count on an axis where a marker's error is farther from the median of its
@@ -79,7 +79,7 @@ class Errors:
         return np.asarray(np.add.reduceat(parts, self.starts, axis=1))
 
 
-def errors_of(data: Measurements) -> Errors:
+def marker_errors(data: Measurements) -> Errors:
     """Return the errors of the rows with both markers."""
     rows = np.flatnonzero(data.both)
     rows = rows[np.argsort(data.position[rows], kind="stable")]
@@ -89,7 +89,7 @@ def errors_of(data: Measurements) -> Errors:
     yaw = np.concatenate([large[:, YAW], small[:, YAW]])
     reference = float(np.arctan2(np.sin(yaw).sum(), np.cos(yaw).sum()))
     for each in (large, small):
-        each[:, YAW] = reference + wrap(each[:, YAW] - reference)
+        each[:, YAW] = reference + wrap_angles(each[:, YAW] - reference)
     return Errors(
         name=data.name,
         positions=positions,

@@ -25,9 +25,9 @@ from perchctl.weights.fit import (
     Errors,
     Evidence,
     FittedWeights,
-    errors_of,
     evidence,
     fit_all,
+    marker_errors,
 )
 
 FORMAT = "perchctl-merge-weights"
@@ -78,12 +78,12 @@ def fit_weights(path: Path, chosen: str, test: Path | None = None) -> Result:
     """
     if test is not None and same_file(path, test):
         raise InvalidValue(f"{test} is the data itself, and no test of what is fitted to it")
-    errors = errors_of(read_data(path))
+    errors = marker_errors(read_data(path))
     fits = fit_all(errors)
     other = None
     if test is not None:
         weights = {name: fit.weights for name, fit in fits.items()}
-        other = evidence(errors_of(read_data(test)), weights)
+        other = evidence(marker_errors(read_data(test)), weights)
     return Result(
         errors=errors,
         fits=fits,

@@ -52,7 +52,7 @@ class SimulatedStand:
         self._renderer = Renderer(self._scenario, camera, profile.target, seed)
         self._corners = square_corners(profile.target.large.side_m)
 
-    def fill(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
+    def fill_session(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
         """Complete the session; `advance` is called with each frame. Raises InvalidValue."""
         while session.done < self._positions:
             position = session.next_position

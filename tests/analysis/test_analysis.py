@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.analysis import FlightAnalysis, newest_logs, show_record, show_text
-from perchctl.analysis.flight import last_ascent
+from perchctl.analysis.flight import contact_ascent
 from perchctl.analysis.show import COLUMNS
 from perchctl.mission import Event, EventKind, Phase
 from perchctl.record import FlightLog, read_log
@@ -32,7 +32,7 @@ def test_settled_is_the_last_second_before_the_last_contact() -> None:
         *(tick(4.0 + 0.1 * i, "ASCEND", 9.0 if i < 10 else 0.003) for i in range(20)),
         tick(6.0, "PERCH", 9.0),
     ]
-    contact = last_ascent(log_of(records).phases)
+    contact = contact_ascent(log_of(records).phases)
     assert contact is not None
     assert contact.start_s == 4.0
     found = FlightAnalysis(log_of(records)).measures

@@ -6,23 +6,23 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.analysis import Comparison, FlightAnalysis
+from perchctl.analysis import FlightAnalysis, FlightComparison
 from perchctl.record import read_log
 from tests.helpers import log as synthetic
 
 
 @pytest.fixture
-def pair(tmp_path: Path) -> Comparison:
+def pair(tmp_path: Path) -> FlightComparison:
     """The second was killed in its ascent, and flown with another profile."""
     profile = synthetic.header()["profile"]
     profile = profile | {"camera": profile["camera"] | {"latency_s": 0.1, "mask": "a.png"}}
     del profile["log"]["plot"]
     one = synthetic.write(tmp_path / "one.jsonl", summary=synthetic.SUMMARY)
     other = synthetic.write(tmp_path / "other.jsonl", {"profile": profile}, most=500)
-    return Comparison((FlightAnalysis(read_log(one)), FlightAnalysis(read_log(other))))
+    return FlightComparison((FlightAnalysis(read_log(one)), FlightAnalysis(read_log(other))))
 
 
-def test_what_differs_is_in_the_table(pair: Comparison) -> None:
+def test_what_differs_is_in_the_table(pair: FlightComparison) -> None:
     found = pair
     assert found.profile == {
         "camera.latency_s": (0.07, 0.1),

@@ -12,7 +12,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 import cv2
 
-from perchctl.analysis.report import ReportedFlight, reported_flight
+from perchctl.analysis.report import ReportedFlight, read_reported_flight
 from perchctl.faults.catalogue import BY_NAME, Case
 from perchctl.faults.effects import Effect, camera_fault, killed
 from perchctl.faults.flight import fly_with_fault
@@ -38,7 +38,7 @@ def flown(outcome: str, folder: Path) -> tuple[ReportedFlight, float | None]:
     case = Case(BY_NAME[fault], phase, 0.3, (effect,))
     path = folder / "f.jsonl"
     result = fly_with_fault(profile, case, draw_scenario(profile, SEED), path)
-    flight = reported_flight(path)
+    flight = read_reported_flight(path)
     assert flight.outcome == outcome
     begin_s = result.begin_s
     return flight, None if begin_s is None else flight.flight.log.since(begin_s)

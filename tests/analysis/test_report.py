@@ -13,7 +13,12 @@ import numpy as np
 import pytest
 
 from perchctl.analysis import FlightAnalysis
-from perchctl.analysis.report import ReportedFlight, decisions_of, page_of, reported_flight
+from perchctl.analysis.report import (
+    ReportedFlight,
+    decision_frames,
+    read_reported_flight,
+    report_html,
+)
 from perchctl.profile import Profile
 from perchctl.record import read_log
 from perchctl.record.recorder import Recorder
@@ -107,11 +112,11 @@ KINDS: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_log_has_its_page(kind: str) -> None:
     changes, words = KINDS[kind]
-    assert words in Page(page_of([told(**changes)])).words
+    assert words in Page(report_html([told(**changes)])).words
 
 
 def test_a_page_is_whole_with_its_plot_and_says_what_the_flight_was() -> None:
-    page = Page(page_of([told()]))
+    page = Page(report_html([told()]))
     (plot,) = (a for a in page.loads if a.startswith("data:image/png;base64,"))
     assert base64.b64decode(plot.partition(",")[2]).startswith(b"\x89PNG")
     for part in ("Perched, 3.1 mm off centre", "ASCEND 6.0 s", "settled, heading, RMS"):
@@ -121,7 +126,7 @@ def test_a_page_is_whole_with_its_plot_and_says_what_the_flight_was() -> None:
 def test_a_log_without_a_tick_says_so() -> None:
     log = made(summary=None)
     log.records.clear()
-    words = Page(page_of([ReportedFlight(FlightAnalysis(log))])).words
+    words = Page(report_html([ReportedFlight(FlightAnalysis(log))])).words
     assert "The log holds no turn of a flight" in words
     assert "Unfinished: the log has no end" in words
 
@@ -138,7 +143,7 @@ def test_what_is_text_stays_text() -> None:
     end = {"outcome": evil, "reason": evil, "cause": evil, "advice": [evil]}
     log = made(change, end, uri=evil, source=evil, started_utc=evil, perchctl=evil)
     log.header["profile"]["name"] = evil
-    html = page_of([ReportedFlight(FlightAnalysis(log)), ReportedFlight(FlightAnalysis(log))])
+    html = report_html([ReportedFlight(FlightAnalysis(log)), ReportedFlight(FlightAnalysis(log))])
     assert "<script" not in html
     assert "alert(1)" in Page(html).words
 
@@ -146,7 +151,7 @@ def test_what_is_text_stays_text() -> None:
 @words_only
 def test_several_flights_have_a_table_that_leads_to_each() -> None:
     flights = [told(), told(summary=None), told(summary={"outcome": "landed", "reason": "r"})]
-    page = Page(page_of(flights))
+    page = Page(report_html(flights))
     assert "3 flights: 1 perched, 1 unfinished, 1 landed" in page.words
     assert {f"#flight-{n}" for n in (1, 2, 3)} <= set(page.loads)
 
@@ -168,11 +173,11 @@ def test_a_report_shows_the_picture_of_each_decision(tmp_path: Path) -> None:
             number, t_s = int(record["frame"]), float(record["frame_t_s"])
             recorder.frame(Frame(number, t_s, grey(number), t_s + 0.05))
     recorder.close()
-    decisions = decisions_of(FlightAnalysis(read_log(path)))
+    decisions = decision_frames(FlightAnalysis(read_log(path)))
     assert [caption.partition(",")[0] for caption, _ in decisions.values()] == [
         "found", "aligned", "settled", "contact",
     ]  # fmt: skip
-    pictures = reported_flight(path).pictures
+    pictures = read_reported_flight(path).pictures
     assert pictures is not None
     assert [p.caption for p in pictures] == [caption for caption, _ in decisions.values()]
     for shown, number in zip(pictures, decisions, strict=True):
@@ -184,7 +189,7 @@ def test_a_report_shows_the_picture_of_each_decision(tmp_path: Path) -> None:
 def test_a_recording_that_is_none_costs_the_pictures_only(tmp_path: Path) -> None:
     path = synthetic.write(tmp_path / "flight.jsonl", summary=synthetic.SUMMARY)
     path.with_suffix(".mcap").write_bytes(b"no recording at all")
-    flight = reported_flight(path)
+    flight = read_reported_flight(path)
     assert flight.pictures == ()
     assert "flight.mcap" in flight.picture_problem
     assert str(tmp_path) not in flight.picture_problem

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import FlightAnalysis
-from perchctl.analysis.story import ACTIONS, ENDS, Sentence, story_of
+from perchctl.analysis.story import ACTIONS, ENDS, Sentence, tell_story
 from perchctl.mission import Phase
 from tests.helpers.log import GONE_S, PLAN
 from tests.helpers.mission import note
@@ -15,7 +15,7 @@ from tests.helpers.told import START_S, SUMMARY, Change, entered, flown_s, made
 
 
 def story(change: Change = lambda record: None, **more: Any) -> list[Sentence]:
-    return list(story_of(FlightAnalysis(made(change, **more))))
+    return list(tell_story(FlightAnalysis(made(change, **more))))
 
 
 def only(told: list[Sentence], words: str) -> Sentence:
@@ -119,4 +119,4 @@ def test_a_log_of_the_first_version_and_one_without_a_tick() -> None:
     assert "Perched" in story(lambda record: record.update(tracked=None), version=1)[-1].text
     log = made()
     log.records.clear()
-    assert story_of(FlightAnalysis(log)) == ()
+    assert tell_story(FlightAnalysis(log)) == ()

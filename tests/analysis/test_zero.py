@@ -35,7 +35,7 @@ def with_ticks() -> FlightLog:
 def test_all_outputs_of_a_log_have_one_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     log = with_ticks()
     at_s = next(span.start_s for span in log.phases if span.phase == "PERCH")
-    assert log.since(float(log.records[0]["t_s"])) == 0.0
+    assert log.to_flight_s(float(log.records[0]["t_s"])) == 0.0
     assert log.start_s == corpus("perched").start_s  # without ticks by the first flown turn
     rows = csv.DictReader(StringIO(log.csv()))
     shown = show_record(FlightAnalysis(log))["phases"]

@@ -12,7 +12,7 @@ import yaml
 from typer.testing import Result
 
 from perchctl.calibration import load_calibration
-from perchctl.calibration.board.adjust import parameters_of
+from perchctl.calibration.board.adjust import lens_parameters
 from perchctl.vision import CameraModel
 from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 from tests.helpers.calibrating import calibrate, refused
@@ -50,7 +50,7 @@ def test_pictures_become_a_file(calibrated: Result, rendered: Rendered) -> None:
     camera = load_calibration(Path(told["file"]))
     assert [told["fx"], told["fy"]] == [camera.K[0, 0], camera.K[1, 1]]
     assert (told["model"], told["size_px"]) == ("plumb_bob", [480, 360])
-    error = np.abs(parameters_of(camera) - parameters_of(truth))
+    error = np.abs(lens_parameters(camera) - lens_parameters(truth))
     assert (error < 3.5 * np.array(list(told["std"].values()))).all()
     assert error[:2].max() < 0.5
     assert told["views_used"] == 10

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from perchctl.calibration import FoundViews, calibrate_camera, calibration_text, load_calibration
-from perchctl.calibration.board.adjust import MODEL_NAMES, PARAMETERS, parameters_of
+from perchctl.calibration.board.adjust import MODEL_NAMES, PARAMETERS, lens_parameters
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 from tests.helpers.boards import corner_views, draw_camera
@@ -63,7 +63,7 @@ def test_a_calibration_s_file_holds_its_quality(tmp_path: Path) -> None:
     assert plain["views_used"] == len(result.views)
     assert plain["rms_px"] == result.fit.rms_px
     assert plain["date"] == "2026-01-02T03:04:05+00:00"
-    assert plain["parameter_std"]["data"] == result.std.tolist()
+    assert plain["parameter_std"]["data"] == result.parameter_std.tolist()
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     covariance = storage.getNode("parameter_covariance").mat()
     assert (covariance == result.covariance).all()
@@ -99,7 +99,7 @@ def test_kalibr_s_file_of_one_camera_is_read(tmp_path: Path) -> None:
     chain.write_text(CAMCHAIN)
     again = tmp_path / "again.yaml"
     again.write_text(calibration_text(load_calibration(chain), "camera", {}))
-    assert parameters_of(load_calibration(again)).tolist() == [
+    assert lens_parameters(load_calibration(again)).tolist() == [
         300.0, 300.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002, 0.0,
     ]  # fmt: skip
     chain.write_text(CAMCHAIN + CAMCHAIN.replace("cam0", "cam1"))

@@ -13,7 +13,12 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import GuidedFrame, capture_views
-from perchctl.calibration.board.capture import Capture, covered_shares, next_advice, signature
+from perchctl.calibration.board.capture import (
+    GuidedCapture,
+    covered_shares,
+    next_advice,
+    view_signature,
+)
 from perchctl.camera import Grey
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
@@ -126,7 +131,7 @@ def test_a_board_s_farther_side_is_known() -> None:
             corners = CHARUCO.corners_m() @ cv2.Rodrigues(rvec)[0].T
             assert (corners[:, 2] @ corners[:, 1 - about] > 0) == (sign > 0)
             view = corner_view(rng, camera, CHARUCO, pose, 0.0, "v")
-            assert sign * signature(view, CHARUCO)[part] > 0.1
+            assert sign * view_signature(view, CHARUCO)[part] > 0.1
 
 
 def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
@@ -146,7 +151,7 @@ def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
 
 def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> None:
     rng = np.random.default_rng(4)
-    camera, capture = draw_camera(rng), Capture(CHARUCO)
+    camera, capture = draw_camera(rng), GuidedCapture(CHARUCO)
     for pose in draw_poses(rng, camera, CHARUCO, 40):
         view = corner_view(rng, camera, CHARUCO, pose, 0.05, "v")
         capture.update(view)
@@ -156,7 +161,7 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
     assert capture.finished
     assert len(capture.taken) >= 15
     assert not capture.update(capture.taken[-1])
-    fresh, blurred = Capture(CHARUCO), dataclasses.replace(view, blur_px=8.0)
+    fresh, blurred = GuidedCapture(CHARUCO), dataclasses.replace(view, blur_px=8.0)
     assert not fresh.update(blurred)
     assert not fresh.update(blurred)
     assert "blurred" in fresh.advice

@@ -10,9 +10,9 @@ import pytest
 
 from perchctl.calibration import FoundViews, check_calibration, find_views
 from perchctl.calibration import calibrate_camera as calibrate_found
-from perchctl.calibration.board.adjust import fit_camera, lens_covariance, parameters_of
+from perchctl.calibration.board.adjust import fit_camera, lens_covariance, lens_parameters
 from perchctl.calibration.board.detect import BoardView
-from perchctl.calibration.board.predict import limit_mm, position_errors_mm, predict_errors
+from perchctl.calibration.board.predict import allowed_error_mm, position_errors_mm, predict_errors
 from perchctl.calibration.board.solve import Calibration
 from perchctl.camera import image_files
 from perchctl.errors import InvalidValue
@@ -62,7 +62,7 @@ def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
     right = 0.62 * camera.size_px[0]
     cut = [v.keep(v.corners_px[:, 0] < right) for v in views]
     result = calibrate_camera([v for v in cut if len(v) >= 8])
-    assert max(e.axis_mm95 / limit_mm(e.z_m) for e in result.errors) < 1.0
+    assert max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in result.errors) < 1.0
     assert result.level == "care"
     assert "% of the picture is uncovered: add views with the board at the" in result.lacks[-1]
     assert "right" in result.lacks[-1]
@@ -95,7 +95,7 @@ def test_errors_that_go_together_widen_the_prediction() -> None:
             )
         )
     fit = fit_camera(bent, "plumb_bob")
-    error = fit.parameters - parameters_of(truth)
+    error = fit.parameters - lens_parameters(truth)
     std = np.sqrt(np.diag(lens_covariance(bent, fit)))
     assert (np.abs(error) < 3 * std).all()
 
@@ -105,7 +105,7 @@ def test_a_wrong_camera_moves_the_target_as_predicted() -> None:
     _, truth = drawn(2)
     off = np.array([[0.5, 0.0, -0.3], [0.0, 0.5, 0.2], [0.0, 0.0, 0.0]])
     camera = CameraModel(truth.size_px, truth.K + off, truth.dist)
-    d = parameters_of(camera) - parameters_of(truth)
+    d = lens_parameters(camera) - lens_parameters(truth)
     [e] = predict_errors(truth, np.outer(d, d), None, [0.8])
     true_mm = position_errors_mm(camera, truth, 0.8)
     # Draws of a single direction: the 95 % line is 1.96 times the error itself.

@@ -15,7 +15,7 @@ from typer.testing import Result
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import MountingRecording
-from perchctl.calibration.mounting.carry import CarrySolution
+from perchctl.calibration.mounting.carry import RotationSolution
 from perchctl.calibration.mounting.report import MountingReport
 from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array
@@ -164,7 +164,7 @@ def test_write_puts_the_numbers_into_the_profile_and_keeps_its_comments(
     assert list(profile.camera.mount.rpy_deg) == pytest.approx(record["rpy_deg"], abs=0.005)
     assert profile.camera.latency_s == pytest.approx(record["latency_s"], abs=5e-5)
     # What a flight rests on: the tip from the camera, in the camera's axes.
-    written = MountingReport(profile, None, None).written_gear_cam_m
+    written = MountingReport(profile, None, None).profile_gear_cam_m
     assert written == pytest.approx(record["gear_cam_m"], abs=3e-5)
 
 
@@ -219,7 +219,7 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
     assert "you wrote measured: each flight measures it" in "\n".join(c.lines())
 
 
-def carried(R: Array) -> CarrySolution:
+def carried(R: Array) -> RotationSolution:
     """A solution with that turn."""
     known = np.eye(3) * np.radians(0.05) ** 2
-    return CarrySolution(R, known, 0.0803, 0.001)
+    return RotationSolution(R, known, 0.0803, 0.001)

@@ -24,11 +24,11 @@ from perchctl.calibration import (
     record_mounting,
 )
 from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
-from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.calibration.mounting.recording import TargetPose
 from perchctl.commands import calibrate_mount
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.geometry import rotation_from_rpy
-from perchctl.link import MotionLink
+from perchctl.link import AttitudeLink
 from perchctl.sim import Scenario, SimProcess
 from perchctl.vision import Frame
 from tests.helpers.calibrating import calibrate
@@ -71,7 +71,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(calibrate_mount, "guide", press_after(10))
+    monkeypatch.setattr(calibrate_mount, "show_guidance", press_after(10))
     at_its_end = SimpleNamespace(isatty=lambda: True)  # a terminal's input
     monkeypatch.setattr(calibrate_mount, "sys", SimpleNamespace(stdin=at_its_end))
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
@@ -104,7 +104,7 @@ def test_turning_motors_end_it(
 ) -> None:
     """A vehicle in a hand must not have them on."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(MotionLink, "motors_run", True)
+    monkeypatch.setattr(AttitudeLink, "motors_run", True)
     words = ["-p", "crazyflie", "-u", sim.uri, "--source", sim.stream_url]
     said = calibrate("mount", *words)
     assert said.exit_code == 52
@@ -147,11 +147,11 @@ class _Film:
 class _Looks(PoseReader):
     """Gives the poses of a recording at their times, or none."""
 
-    def __init__(self, poses: list[SeenPose], mirrored: bool = False) -> None:
+    def __init__(self, poses: list[TargetPose], mirrored: bool = False) -> None:
         self._poses, self._is_mirrored = list(poses), mirrored
         self.mirrored, self.outlines, self.trouble = 0, (), ""
 
-    def look(self, frame: Frame) -> list[SeenPose]:
+    def read_poses(self, frame: Frame) -> list[TargetPose]:
         self.mirrored += self._is_mirrored
         due = [] if frame.repeated else [pose for pose in self._poses if pose.t_s <= frame.t_s]
         del self._poses[: len(due)]
@@ -238,7 +238,7 @@ def recordings() -> list[MountingRecording]:
         AttitudeSample(1.26, 0.1, -0.2, -3.1, np.array([0.02, 1.0, 2.0])),
     ]
     root, R = rng.normal(size=(6, 6)) * 1e-4, rotation_from_rpy(3.0, 0.4, -2.0)
-    poses = [SeenPose(t_s, R, rng.normal(size=3), root @ root.T) for t_s in (1.3, 1.33)]
+    poses = [TargetPose(t_s, R, rng.normal(size=3), root @ root.T) for t_s in (1.3, 1.33)]
     return [
         MountingRecording("carry", attitudes, poses, 3),
         MountingRecording("pivot", [], poses[:1]),

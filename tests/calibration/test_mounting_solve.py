@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import MountingRecording, PoseReader, profile_camera
-from perchctl.calibration.mounting.carry import CarrySolution, solve_carry
+from perchctl.calibration.mounting.carry import RotationSolution, solve_rotation
 from perchctl.calibration.mounting.pivot import solve_pivot
 from perchctl.calibration.mounting.recording import MountingPart, missing_motion
 from perchctl.errors import InvalidValue
@@ -25,7 +25,7 @@ from tests.helpers.mounting import hand, profile, seen
 ANGLE = st.floats(-np.pi, np.pi)
 
 
-def turn_error_deg(found: CarrySolution, held: Hand) -> float:
+def turn_error_deg(found: RotationSolution, held: Hand) -> float:
     off = Rotation.from_matrix(found.R_body_cam @ held.T_body_cam[:3, :3].T)
     return float(np.degrees(off.magnitude()))
 
@@ -45,7 +45,7 @@ def test_any_mounting_and_latency_is_found_from_nothing(
     yaw: float, roll: float, pitch: float, latency_s: float
 ) -> None:
     held = mounted(hand("carry", 3, latency_s=latency_s), rotation_from_rpy(roll, pitch, yaw))
-    found = solve_carry(seen(held, errors=False))
+    found = solve_rotation(seen(held, errors=False))
     assert turn_error_deg(found, held) < 0.005
     assert found.latency_s == pytest.approx(latency_s, abs=2e-5)
 
@@ -54,7 +54,7 @@ def test_intervals_hold_the_truth_and_errors_are_small() -> None:
     off, turns_deg, latencies_s = [], [], []
     for seed in range(20, 25):
         held = hand("carry", seed)
-        found = solve_carry(seen(held))
+        found = solve_rotation(seen(held))
         turned = (np.array(found.rpy_deg) - held.rpy_deg + 180.0) % 360.0 - 180.0
         off += (turned / found.rpy_sigma_deg).tolist()
         off.append((found.latency_s - held.latency_s) / found.latency_sigma_s)
@@ -70,7 +70,7 @@ def test_intervals_hold_the_truth_and_errors_are_small() -> None:
 @pytest.mark.parametrize("spoilt", [{"wrong": 0.15}, {"claimed": 20.0}])
 def test_wrong_poses_and_wrong_claims_do_not_hurt(spoilt: dict[str, float]) -> None:
     held = hand("carry", 6)
-    found = solve_carry(seen(held, **spoilt))  # type: ignore[arg-type]
+    found = solve_rotation(seen(held, **spoilt))  # type: ignore[arg-type]
     assert turn_error_deg(found, held) < 0.15
     assert abs(found.latency_s - held.latency_s) < 3e-3
 
@@ -145,7 +145,7 @@ def test_the_missing_motion_is_named(named: str) -> None:
     recording = LACKING[named]
     assert not missing_motion(CARRY)
     with pytest.raises(InvalidValue, match=f"the {recording.part} lacks motion:.*{named}"):
-        solve_carry(recording) if recording.part == "carry" else solve_pivot(recording)
+        solve_rotation(recording) if recording.part == "carry" else solve_pivot(recording)
 
 
 def carried_about(recording: MountingRecording) -> MountingRecording:
@@ -177,7 +177,7 @@ def test_a_carry_that_contradicts_itself_is_refused(
     recording: MountingRecording, said: str
 ) -> None:
     with pytest.raises(InvalidValue, match=said):
-        solve_carry(recording)
+        solve_rotation(recording)
 
 
 # --- through renderer, camera and pipeline -------------------------------------------------
@@ -193,7 +193,7 @@ def _few_pictures(part: MountingPart, seconds: float) -> Hand:
 def test_a_mounting_is_measured_from_pictures() -> None:
     camera = profile_camera(profile().camera)
     carry, pivot = _few_pictures("carry", 21.5), _few_pictures("pivot", 13.0)
-    carried = solve_carry(record_hand(carry, profile(), camera))
+    carried = solve_rotation(record_hand(carry, profile(), camera))
     assert turn_error_deg(carried, carry) < 0.15
     assert abs(carried.latency_s - carry.latency_s) < 3e-3
     pivoted = solve_pivot(record_hand(pivot, profile(), camera))
@@ -209,7 +209,7 @@ def test_a_picture_is_seen_as_it_is_and_mirrored_as_such(flipped: bool) -> None:
     reader, poses = PoseReader(profile(), camera, live=False), []
     for frame in islice(pictures(held, profile(), camera), 4):
         image = np.ascontiguousarray(frame.image[:, ::-1]) if flipped else frame.image
-        found = reader.look(Frame(frame.index, frame.t_arrival_s, image, frame.t_arrival_s))
+        found = reader.read_poses(Frame(frame.index, frame.t_arrival_s, image, frame.t_arrival_s))
         poses += found
         for pose in found:
             T_target_cam = T_target_cam_at(held, frame.t_exposure_s)
@@ -221,5 +221,5 @@ def test_a_picture_is_seen_as_it_is_and_mirrored_as_such(flipped: bool) -> None:
     assert bool(reader.outlines) is not flipped
     again = Frame(frame.index + 1, frame.t_arrival_s + 0.03, image, frame.t_arrival_s + 0.03)
     live = PoseReader(profile(), camera, live=True)
-    assert len(live.look(again)) == len(found)
-    assert live.look(replace(again, index=99)) == [], "a receiver's repetition is no picture"
+    assert len(live.read_poses(again)) == len(found)
+    assert live.read_poses(replace(again, index=99)) == [], "a receiver's repetition is no picture"

@@ -17,7 +17,7 @@ from perchctl.camera.aideck import (
     AiDeckSource,
     MosaicFilter,
     has_mosaic,
-    without_mosaic,
+    remove_mosaic,
 )
 from perchctl.camera.source import LiveSource
 from perchctl.profile import TargetConfig
@@ -167,7 +167,7 @@ def test_a_mosaic_is_known_from_grey_and_goes_whatever_its_order() -> None:
         assert has_mosaic(bayer(scene, gains))
     flat = np.full((40, 60), 150, np.uint8)
     for flip in (flat, flat[::-1], flat[:, ::-1]):
-        smooth = without_mosaic(np.ascontiguousarray(bayer(flip)))
+        smooth = remove_mosaic(np.ascontiguousarray(bayer(flip)))
         assert int(smooth.max()) - int(smooth.min()) <= 1
 
 
@@ -175,8 +175,8 @@ def test_a_colour_camera_is_found_once_and_stays_one(deck: AiDeck, read: Read) -
     mosaic, plain = bayer(picture(150)), picture(150)
     found = MosaicFilter()
     for _ in range(3):
-        assert (found(mosaic) == without_mosaic(mosaic)).all()
-    assert (found(plain) == without_mosaic(plain)).all(), "a scene that hides it changes nothing"
+        assert (found(mosaic) == remove_mosaic(mosaic)).all()
+    assert (found(plain) == remove_mosaic(plain)).all(), "a scene that hides it changes nothing"
     assert (MosaicFilter()(plain) == plain).all()
     deck.forever = [jpeg(mosaic)]
     assert next_frame(read()).encoded is None, "it is not the JPEG that came any more"

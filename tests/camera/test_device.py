@@ -16,8 +16,8 @@ from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     DeviceSource,
     camera_number,
-    open_capture,
-    set_up,
+    configure_capture,
+    open_video_capture,
 )
 from perchctl.camera.source import LiveSource
 from perchctl.errors import InvalidValue, NotFound
@@ -69,7 +69,7 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
 def test_a_missing_device_says_what_there_is() -> None:
     assert not Path("/dev/video97").exists()
     with pytest.raises(NotFound, match=r"camera:97 was not found; th(ere are|is computer)"):
-        open_capture("97", None, None)
+        open_video_capture("97", None, None)
 
 
 def test_opencv_is_asked_for_format_then_size_then_rate() -> None:
@@ -78,7 +78,7 @@ def test_opencv_is_asked_for_format_then_size_then_rate() -> None:
             asked.append((prop, value))
 
     asked: list[tuple[int, float]] = []
-    set_up(Driver(), (720, 576), CameraConfig(format="MJPG", rate_hz=25))
+    configure_capture(Driver(), (720, 576), CameraConfig(format="MJPG", rate_hz=25))
     assert [prop for prop, _ in asked] == [
         cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT,
         cv2.CAP_PROP_FPS, cv2.CAP_PROP_BUFFERSIZE,
@@ -162,7 +162,7 @@ def test_a_device_that_never_gives_a_picture_fails(opened: list[LiveSource]) -> 
     capture = Capture()
     capture.unplugged = True
     source = device(opened, Bus(capture).open)
-    assert not source.wait_first(WAIT_S)
+    assert not source.wait_first_frame(WAIT_S)
     assert "stopped delivering" in str(source.problem(float("-inf")))
     assert capture.reads == LOST_AFTER_FAILURES
     assert capture.released.wait(WAIT_S)

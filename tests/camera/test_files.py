@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.camera import (
     FrameSource,
-    Recording,
+    RecordedSource,
     open_camera,
     parse_source,
     profile_record,
@@ -43,7 +43,7 @@ def test_images_come_all_and_in_natural_order(tmp_path: Path) -> None:
     write_images(tmp_path, 12)
     (tmp_path / "notes.txt").write_text("no picture")
     source = open_camera(f"images:{tmp_path}", CLOCK, latency_s=0.07)
-    assert isinstance(source, Recording)
+    assert isinstance(source, RecordedSource)
     assert (source.rate_hz, source.count) == (30.0, 12)
     assert source.size_px == (32, 24)
     assert not source.live
@@ -91,7 +91,7 @@ def test_a_video_gives_every_frame_with_its_time(tmp_path: Path) -> None:
         writer.write(np.full((48, 64, 3), 10 * k, np.uint8))
     writer.release()
     source = open_camera(f"video:{path}", CLOCK)
-    assert isinstance(source, Recording)
+    assert isinstance(source, RecordedSource)
     assert (source.rate_hz, source.count) == (25.0, 20)
     assert source.size_px == (64, 48)
     frames = drain(source)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.camera import FrameHealth, NewestSlot
-from perchctl.camera.health import content
+from perchctl.camera.health import picture_kind
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
@@ -54,7 +54,7 @@ def renderers() -> list[Renderer]:
 def test_pictures_of_the_ceiling_are_usable(renderers: list[Renderer], below_m: float) -> None:
     for renderer in renderers:
         pose = make_T(rotation_from_rpy(0.1, -0.05, 0.7), (0.02, 0.01, 2.2 - below_m))
-        assert content(renderer.render([pose])) == "ok"
+        assert picture_kind(renderer.render([pose])) == "ok"
 
 
 @pytest.mark.parametrize("band_px", [0.0, 0.5, 0.8])
@@ -64,7 +64,7 @@ def test_snow(band_px: float, quality: int | None) -> None:
     if quality is not None:
         packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
-    assert content(image) == "snow"
+    assert picture_kind(image) == "snow"
 
 
 @pytest.mark.parametrize(("level", "sigma", "kind"), [
@@ -73,13 +73,13 @@ def test_snow(band_px: float, quality: int | None) -> None:
     (8, 6.0, "dark"),  # a covered lens
 ])  # fmt: skip
 def test_blank_screens_and_a_covered_lens(level: int, sigma: float, kind: str) -> None:
-    assert content(noisy(level, sigma)) == kind
+    assert picture_kind(noisy(level, sigma)) == kind
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31), st.floats(2.0, 20.0), st.floats(60.0, 200.0))
 def test_sensor_noise_alone_is_not_snow(seed: int, sigma: float, level: float) -> None:
-    assert content(noisy(level, sigma, seed)) == "ok"
+    assert picture_kind(noisy(level, sigma, seed)) == "ok"
 
 
 def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[str]:

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from perchctl.camera import jpeg as module
-from perchctl.camera.jpeg import JpegSplitter, grey_pixels, jpeg_extent
+from perchctl.camera.jpeg import JpegSplitter, decode_grey, jpeg_extent
 from tests.helpers.live import jpeg, part, resized
 
 PICTURES = [
@@ -92,7 +92,7 @@ def test_what_is_held_is_bounded_and_what_never_ends_is_given_up(
 @pytest.mark.parametrize("picture", PICTURES)
 def test_the_size_is_the_decoder_s_also_behind_a_thumbnail(picture: bytes) -> None:
     """Cameras write a small whole JPEG within a segment in front of the picture's own."""
-    image, small = grey_pixels(picture), jpeg(10, (16, 24))
+    image, small = decode_grey(picture), jpeg(10, (16, 24))
     assert image is not None
     inside = b"\xff\xe1" + struct.pack(">H", 2 + len(small)) + small
     for each in (picture, SOI + inside + picture[2:], SOI + b"\xff\xff" + picture[3:]):
@@ -105,10 +105,10 @@ def test_any_bytes_are_split_and_are_decoded_or_not(data: bytes) -> None:
     splitter = JpegSplitter()
     splitter.feed(SOI + data)
     assert len(splitter._buffer) <= len(data) + 2
-    grey_pixels(data)
+    decode_grey(data)
 
 
 def test_what_opencv_refuses_is_no_exception_and_only_a_whole_jpeg_has_an_end() -> None:
-    assert grey_pixels(resized(PICTURES[0], 40_000, 40_000)) is None
+    assert decode_grey(resized(PICTURES[0], 40_000, 40_000)) is None
     assert jpeg_extent(PICTURES[0][:-1]) is None
     assert jpeg_extent(PICTURES[0][:-2] + PICTURES[0]) == (len(PICTURES[0]) - 2, (0, 0))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from perchctl.camera import network, open_camera
-from perchctl.camera.jpeg import grey_pixels
+from perchctl.camera.jpeg import decode_grey
 from perchctl.camera.network import MjpegSource
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.errors import NotFound, TimedOut
@@ -78,9 +78,9 @@ def test_a_picture_that_is_cut_or_of_no_size_or_above_the_largest_is_not_decoded
 
     def decode(data: bytes) -> Any:
         tried.append(data)
-        return grey_pixels(data)
+        return decode_grey(data)
 
-    monkeypatch.setattr(network, "grey_pixels", decode)
+    monkeypatch.setattr(network, "decode_grey", decode)
     server.scripts.put([part(bad), part(whole), threading.Event()])
     source = stream(server, Clock(), opened)
     assert level(next_frame(source)) == 160
@@ -130,7 +130,7 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     assert source.problem(100.0) is None
     gate.set()
     until(lambda: source.problem(100.0) is not None)
-    assert source.connections == 2 + source.most_failed
+    assert source.connections == 2 + source.max_failures
     assert "gave no picture in 5 attempts: the stream ended" in str(source.problem(100.0))
 
 

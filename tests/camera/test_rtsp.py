@@ -149,11 +149,11 @@ def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
 def test_what_piled_up_is_known_to_be_old() -> None:
     waiting = TransferDelay()
     for k in range(50):
-        assert waiting.waited_s(k / 25, 100.0 + k / 25) == pytest.approx(0.0, abs=1e-9)
-    heap = [waiting.waited_s(k / 25, 102.4) for k in range(50, 60)]
+        assert waiting.extra_delay_s(k / 25, 100.0 + k / 25) == pytest.approx(0.0, abs=1e-9)
+    heap = [waiting.extra_delay_s(k / 25, 102.4) for k in range(50, 60)]
     assert heap == pytest.approx([2.4 - k / 25 for k in range(50, 60)], abs=0.02)
-    assert waiting.waited_s(60 / 25, 102.41) == pytest.approx(0.01, abs=0.01)
-    assert waiting.waited_s(None, 103.0) == 0.0
+    assert waiting.extra_delay_s(60 / 25, 102.41) == pytest.approx(0.01, abs=0.01)
+    assert waiting.extra_delay_s(None, 103.0) == 0.0
 
 
 @pytest.mark.parametrize(("slow", "for_s", "most_s"), [
@@ -163,8 +163,10 @@ def test_a_clock_of_the_camera_that_runs_slow_or_is_set_back_makes_nothing_old(
     slow: float, for_s: int, most_s: float
 ) -> None:
     waiting = TransferDelay()
-    assert max(waiting.waited_s(k / 25 * (1 - slow), k / 25) for k in range(25 * for_s)) <= most_s
+    assert (
+        max(waiting.extra_delay_s(k / 25 * (1 - slow), k / 25) for k in range(25 * for_s)) <= most_s
+    )
     # Nor one that is set back.
     waiting, times_s = TransferDelay(), (50.0, 50.04, 3.0, 3.04)
-    waits_s = [waiting.waited_s(t_s, 100.0 + k / 25) for k, t_s in enumerate(times_s)]
+    waits_s = [waiting.extra_delay_s(t_s, 100.0 + k / 25) for k, t_s in enumerate(times_s)]
     assert waits_s == pytest.approx([0.0] * 4, abs=1e-9)

@@ -25,7 +25,7 @@ from perchctl.campaign.compare import (
     Comparison,
     Sweep,
     compare_pairs,
-    whole_seeds,
+    results_by_seed,
 )
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.profile import load_profile
@@ -136,7 +136,7 @@ def test_seeds_count_that_every_profile_has_flown() -> None:
         for seed in (4, 3)
         for number in (1, 0)
     ]
-    seeds = whole_seeds([*results, perched(5)], 2)
+    seeds = results_by_seed([*results, perched(5)], 2)
     assert [(row[0].seed, row[0].attempts, row[1].attempts) for row in seeds] == [
         (3, 0, 1), (4, 0, 1),
     ]  # fmt: skip

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from perchctl.campaign import (
     FlightResult,
+    all_refused_error,
     campaign_summary,
     campaign_table,
     fly_all,
     fly_in_folder,
-    none_took_off,
     rate_record,
     rate_text,
 )
@@ -27,7 +27,7 @@ from perchctl.errors import Interrupted, SafetyAbort
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.simulate import fly_each, say_where_logs_are
+from perchctl.commands.simulate import print_log_folder, run_campaign
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT, short_profile
 from tests.helpers.results import aborted, landed, perched
@@ -113,18 +113,18 @@ def test_a_flat_battery_is_a_result_and_leaves_no_log(tmp_path: Path) -> None:
 
 def test_with_nothing_flown_there_is_nothing_to_report() -> None:
     with pytest.raises(Interrupted, match="0 of 2 flights were flown"):
-        fly_each(lambda *_: None, pytest.fail, 2, nullcontext(None))  # type: ignore[arg-type]
+        run_campaign(lambda *_: None, pytest.fail, 2, nullcontext(None))  # type: ignore[arg-type]
 
 
 def test_logs_that_lack_something_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
-    say_where_logs_are([PERCHED, replace(PERCHED, log_problem="no space left")], Path("logs"))
+    print_log_folder([PERCHED, replace(PERCHED, log_problem="no space left")], Path("logs"))
     assert capsys.readouterr().err.endswith("1 of 2 logs are incomplete: no space left\n")
 
 
 def test_where_none_took_off_it_is_not_the_seeds() -> None:
-    assert none_took_off([]) is None
-    assert none_took_off([REFUSED, LANDED]) is None
-    assert isinstance(none_took_off([REFUSED, REFUSED]), SafetyAbort)
+    assert all_refused_error([]) is None
+    assert all_refused_error([REFUSED, LANDED]) is None
+    assert isinstance(all_refused_error([REFUSED, REFUSED]), SafetyAbort)
 
 
 @pytest.mark.long

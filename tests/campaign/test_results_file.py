@@ -31,9 +31,9 @@ def written(path: Path, *seeds: int, profile: Profile = SIM, **options: Any) -> 
     every = range(100)
     with campaign_results(profile, every, FlightResult, out=path, **options) as results:
         assert all(replace(FLOWN, seed=earlier.seed) == earlier for earlier in results.earlier)
-        assert set(results.left) == {*every} - {earlier.seed for earlier in results.earlier}
+        assert set(results.remaining) == {*every} - {earlier.seed for earlier in results.earlier}
         for seed in seeds:
-            results.note(replace(FLOWN, seed=seed))
+            results.write_result(replace(FLOWN, seed=seed))
             last = json.loads(path.read_text().splitlines()[-1])
             assert (last["kind"], last["seed"], last["miss_m"]) == ("flight", seed, 0.1 / 3)
         return [earlier.seed for earlier in results.earlier]

@@ -22,7 +22,7 @@ from perchctl.camera import VERDICT_TEXTS
 from perchctl.check import Row, Verdict, camera
 from perchctl.check import profile as of_profile
 from perchctl.check.rehearsal import Rehearsal, rehearse
-from perchctl.check.row import Finding, ask
+from perchctl.check.row import Finding, evaluate_row
 from perchctl.errors import NotFound
 from perchctl.faults.edges import CameraFault, FaultyCamera
 from perchctl.faults.effects import FOR_EVER
@@ -82,8 +82,8 @@ def rehearsed(
 
 def rows_of(done: Rehearsal, profile: Profile = PROFILE) -> dict[str, Row]:
     found = camera.picture_rows(done, profile, CAMERA)
-    assert [row.name for row in found] == list(camera.names_of(profile))
-    loop = ask("loop", camera.loop_finding, done, profile)
+    assert [row.name for row in found] == list(camera.picture_row_names(profile))
+    loop = evaluate_row("loop", camera.loop_finding, done, profile)
     return {row.name: row for row in [*found, loop]}
 
 
@@ -224,7 +224,7 @@ def test_what_a_camera_delivers_otherwise_makes_its_row(
     ("http://x: no answer", "--cameras lists"),
 ])  # fmt: skip
 def test_a_missing_camera_skips_the_rest(text: str, advice: str) -> None:
-    first, *rest = camera.refused_rows(NotFound(text), PROFILE)
+    first, *rest = camera.failed_camera_rows(NotFound(text), PROFILE)
     assert (first.name, first.verdict) == ("camera", Verdict.FAIL)
     assert advice in first.advice
     assert {r.verdict for r in rest} == {Verdict.SKIPPED}

@@ -63,7 +63,7 @@ def rows_of(it: Scripted, sample: Telemetry | None = None) -> dict[str, Row]:
     def heard() -> list[Telemetry]:
         return [replace(rest, t_s=it.now_s)]
 
-    seen = capture.listen(heard, it, it.clock, it.wait)
+    seen = capture.collect_samples(heard, it, it.clock, it.wait)
     found = capture.mocap_rows_at_rest(seen, PROFILE)
     assert [row.name for row in found] == ["capture", *capture.BODY_ROWS]
     return {row.name: row for row in found}
@@ -129,13 +129,13 @@ def test_a_tilted_vehicle_is_not_judged() -> None:
 
 def test_without_a_vehicle_no_place_is_compared() -> None:
     it = Scripted()
-    seen = capture.listen(list, it, it.clock, it.wait)
+    seen = capture.collect_samples(list, it, it.clock, it.wait)
     *_, place = capture.mocap_rows_at_rest(seen, PROFILE)
     assert (place.verdict, "no telemetry" in place.found) == (Verdict.SKIPPED, True)
 
 
 def test_one_that_does_not_open_skips_the_rest() -> None:
-    rows = capture.refused_rows("no motion capture vicon:lab: no answer within 5 s", CONFIG)
+    rows = capture.failed_capture_rows("no motion capture vicon:lab: no answer within 5 s", CONFIG)
     assert [row.name for row in rows] == ["capture", *capture.BODY_ROWS]
     assert rows[0].verdict is Verdict.FAIL
     assert {row.verdict for row in rows[1:]} == {Verdict.SKIPPED}

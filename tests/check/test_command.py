@@ -17,7 +17,7 @@ from perchctl.check import CheckScope, Row, Verdict, camera, check, session
 from perchctl.check.capture import BODY_ROWS, COMPARED
 from perchctl.commands import app
 from perchctl.commands import check as command
-from perchctl.commands.check import exit_code, report, table
+from perchctl.commands.check import exit_code, format_rows, print_rows
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, options
 from tests.helpers.flights import ROOT
@@ -84,9 +84,9 @@ def test_ctrl_c_ends_with_what_was_found(
         if text.startswith(stage):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: nullcontext(sim))
-    rows = check(options("sim://", "sim:"), CheckScope(**QUICK, tell=tell))
-    code = report(rows, as_json=False)
+    monkeypatch.setattr(session, "start_simulated_vehicle", lambda *_: nullcontext(sim))
+    rows = check(options("sim://", "sim:"), CheckScope(**QUICK, announce=tell))
+    code = print_rows(rows, as_json=False)
     printed = capsys.readouterr()
     assert code == 130
     assert "Ctrl-C" in printed.err
@@ -110,14 +110,14 @@ ROWS = [
 
 
 def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
-    lines = table(ROWS).splitlines()
+    lines = format_rows(ROWS).splitlines()
     assert max(map(len, lines)) <= 80
     text = re.sub(r"\s+", " ", " ".join(lines))
     assert "FAIL battery the battery rests at 3.50 V -> charge it" in text
     assert "skip level the vehicle does not answer" in text
     assert lines[-1] == "1 pass, 1 warn, 1 FAIL, 2 skip: not fit to fly: battery"
-    assert table(ROWS[:2]).splitlines()[-1].endswith("nothing fails")
-    assert "not finished" in table(ROWS[:2], finished=False).splitlines()[-1]
+    assert format_rows(ROWS[:2]).splitlines()[-1].endswith("nothing fails")
+    assert "not finished" in format_rows(ROWS[:2], finished=False).splitlines()[-1]
 
 
 @pytest.mark.parametrize(("rows", "code"), [

@@ -22,7 +22,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.positioning import BodyPose, Placed
+from perchctl.positioning import BodyPose, VehiclePose
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
@@ -78,7 +78,7 @@ def recorded(
     heading = rng.uniform(-math.pi, math.pi)
     origin = np.array([0.4, -0.2, 0.01])
     samples: list[Telemetry] = []
-    places: list[Placed] = []
+    places: list[VehiclePose] = []
     for t_s in np.arange(0.0, LASTS_S, 0.025):
         _, R = motion(t_s, *own)
         roll, pitch, yaw = (float(a) for a in rpy_from_rotation(rot_z(heading) @ R))
@@ -93,8 +93,8 @@ def recorded(
         R_seen = world @ R @ body @ rotation_from_rpy(*rng.normal(0.0, 0.005, 3))
         place = scale * (mirror @ world @ (origin + place + rng.normal(0.0, 0.001, 3)))
         pose = BodyPose(tuple(place), quaternion_from_rotation(R_seen))
-        places.append(Placed.of(pose, config, float(t_s)))
-    return capture.hand_finding(capture.paired(samples, places), config)
+        places.append(VehiclePose.of(pose, config, float(t_s)))
+    return capture.comparison_finding(capture.pair_motion(samples, places), config)
 
 
 def test_a_true_capture_passes() -> None:
@@ -235,7 +235,7 @@ def test_what_is_asked_for_is_enough_however_long_it_stands(
         for after_s, place_m, (roll, pitch, yaw) in lifted_and_turned(HOME).stops
     ))  # fmt: skip
     moved = truly_moved(way, -before_s, 7.5 + after_s)
-    assert capture.hand_finding(moved, CONFIG).verdict is Verdict.PASS
+    assert capture.comparison_finding(moved, CONFIG).verdict is Verdict.PASS
 
 
 @given(wobble_deg=st.floats(0.0, 5.0), stands_s=st.floats(0.2, 20.0))
@@ -247,14 +247,14 @@ def test_a_hand_that_wobbles_has_tilted_nothing(wobble_deg: float, stands_s: flo
         Stop(0.8, up, (-wobble, wobble, turn)), Stop(1.5, up), Stop(1.0, HOME),
     ))  # fmt: skip
     moved = truly_moved(way, -0.5, 5.1 + stands_s)
-    assert "too few axes" in capture.hand_finding(moved, CONFIG).found
+    assert "too few axes" in capture.comparison_finding(moved, CONFIG).found
 
 
 def test_without_moments_of_both_nothing_is_said() -> None:
-    assert capture.hand_finding(None, CONFIG).verdict is Verdict.SKIPPED
+    assert capture.comparison_finding(None, CONFIG).verdict is Verdict.SKIPPED
     sample = telemetry(0.0)
-    assert capture.paired([sample, replace(sample, t_s=1.0)], []) is None
-    assert capture.paired([], []) is None
+    assert capture.pair_motion([sample, replace(sample, t_s=1.0)], []) is None
+    assert capture.pair_motion([], []) is None
 
 
 # --- Without a motion capture: the position that the vehicle reports --------------------------
@@ -286,7 +286,7 @@ def test_a_lift_makes_its_row(
 ) -> None:
     waits: list[float] = []
     link = Scripted(heights_m, moves_g)
-    finding = vehicle.lift_finding(vehicle.watch_lift(link, waits.append, 3.0))  # type: ignore[arg-type]
+    finding = vehicle.lift_finding(vehicle.record_lift(link, waits.append, 3.0))  # type: ignore[arg-type]
     assert finding.verdict == verdict, finding
     assert words in finding.found
     assert sum(waits) == pytest.approx(3.0)

@@ -78,7 +78,9 @@ class Lab:
 
         self._put_down()
         quick = CheckScope(**QUICK)
-        wanted = replace(quick, lift=True, lift_s=LIFT_S, listen_s=0.5, capture_s=0.5, tell=tell)
+        wanted = replace(
+            quick, lift=True, lift_s=LIFT_S, listen_s=0.5, capture_s=0.5, announce=tell
+        )
         found = check(options(self.sim.uri, profile=self.profile), wanted)
         return {row.name: row for row in found}
 
@@ -132,11 +134,11 @@ def test_what_is_set_up_wrong_is_named_and_not_flown_by(
 ) -> None:
     it = lab(sim, body=body)
     if fault is not None:
-        sim.lay(fault)
+        sim.begin_fault(fault)
     try:
         rows = it.lift(Verdict.FAIL)
     finally:
-        sim.heal()
+        sim.end_faults()
     assert rows[LIFTED].verdict is Verdict.FAIL, rows[LIFTED]
     assert re.search(words, rows[LIFTED].found)
     with pytest.raises(SafetyAbort, match="compared by hand on"):

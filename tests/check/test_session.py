@@ -78,7 +78,7 @@ def test_pictures_of_another_size_fail_their_row(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cv2.imwrite(str(tmp_path / "small.png"), np.full((240, 320), 99, np.uint8))
-    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: nullcontext(sim))
+    monkeypatch.setattr(session, "start_simulated_vehicle", lambda *_: nullcontext(sim))
     simulated = options("sim://", f"images:{tmp_path}")
     rows = {row.name: row for row in check(simulated, CheckScope(**QUICK))}
     assert rows["size"].verdict is Verdict.FAIL
@@ -94,14 +94,14 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
             if text.startswith("listening"):
                 passing.stop()
 
-        wanted = CheckScope(**(QUICK | {"listen_s": 0.5}), tell=tell)
+        wanted = CheckScope(**(QUICK | {"listen_s": 0.5}), announce=tell)
         rows = {row.name: row for row in check(options(passing.uri), wanted)}
     assert rows["packets"].verdict is Verdict.FAIL
 
 
 def test_a_scan_names_what_answers_and_why_no_radio_was_asked() -> None:
-    radio, found = vehicle.answering_rows([NOWHERE], "no Crazyradio is plugged in\nudev rules")
+    radio, found = vehicle.radio_scan_rows([NOWHERE], "no Crazyradio is plugged in\nudev rules")
     assert (radio.verdict, radio.advice) == (Verdict.SKIPPED, "udev rules")
     assert (found.verdict, found.found) == (Verdict.PASS, f"{NOWHERE} answers")
-    radio, nobody = vehicle.answering_rows([], "")
+    radio, nobody = vehicle.radio_scan_rows([], "")
     assert (radio.verdict, nobody.verdict) == (Verdict.PASS, Verdict.FAIL)

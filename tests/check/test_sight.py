@@ -10,9 +10,9 @@ import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
 from perchctl.check.camera import IN_VIEW, picture_rows
-from perchctl.check.rehearsal import Rehearsal, telemetry_for
-from perchctl.check.row import ask_all
-from perchctl.check.vehicle import BY_FLY, VEHICLE, Vehicle
+from perchctl.check.rehearsal import Rehearsal, rehearsal_telemetry
+from perchctl.check.row import evaluate_rows
+from perchctl.check.vehicle import BY_FLY, VEHICLE, VehicleStatus
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import Telemetry
 from perchctl.vision import CameraModel
@@ -67,8 +67,8 @@ def test_a_latency_that_is_written_down_is_doubted() -> None:
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
-    vehicle = Vehicle("radio://0/80/2M", telemetry=away)
-    rows = {row.name: row for row in ask_all(VEHICLE, vehicle, TARGET)}
+    vehicle = VehicleStatus("radio://0/80/2M", telemetry=away)
+    rows = {row.name: row for row in evaluate_rows(VEHICLE, vehicle, TARGET)}
     assert rows["positioning"].found == "by the target, see in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
     assert rows["estimator"].found == BY_FLY
@@ -80,9 +80,9 @@ def runaway() -> list[Telemetry]:
 
 
 def test_pictures_are_rehearsed_on_a_vehicle_that_stands() -> None:
-    (sample,) = telemetry_for(runaway, TARGET).telemetry()
+    (sample,) = rehearsal_telemetry(runaway, TARGET).telemetry()
     assert sample.position_m == (0.0, 0.0, TARGET.safety.ground_z_m)
     assert sample.velocity_mps == (0.0, 0.0, 0.0)
     assert sample.acc_z_g == AT_REST.acc_z_g
-    (sample,) = telemetry_for(runaway, PROFILE).telemetry()
+    (sample,) = rehearsal_telemetry(runaway, PROFILE).telemetry()
     assert sample.position_m == (3.0, -2.0, 9.0)

@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import Row, Verdict
-from perchctl.check.row import ask_all
-from perchctl.check.vehicle import VEHICLE, Vehicle, look
+from perchctl.check.row import evaluate_rows
+from perchctl.check.vehicle import VEHICLE, VehicleStatus, query_vehicle
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
@@ -48,8 +48,8 @@ BAD = Scenario(
 OLD = {"protocol_version": 11, "missing_log_variables": ("acc.z",)}
 
 
-def rows_of(vehicle: Vehicle, profile: Profile = PROFILE) -> dict[str, Row]:
-    return {row.name: row for row in ask_all(VEHICLE, vehicle, profile)}
+def rows_of(vehicle: VehicleStatus, profile: Profile = PROFILE) -> dict[str, Row]:
+    return {row.name: row for row in evaluate_rows(VEHICLE, vehicle, profile)}
 
 
 def looked_at(sim: SimProcess, silent_s: float = 0.0) -> dict[str, Row]:
@@ -57,9 +57,9 @@ def looked_at(sim: SimProcess, silent_s: float = 0.0) -> dict[str, Row]:
     probe = ProbeLink(sim.uri, LinkConfig(connect_timeout_s=30.0), time.monotonic)
     probe.connect()
     try:
-        seen = look(probe, sim.uri, LISTEN_S)
+        seen = query_vehicle(probe, sim.uri, LISTEN_S)
         if silent_s:
-            sim.silence(silent_s)
+            sim.silence_link(silent_s)
             seen = replace(seen, echoes=probe.echoes(LISTEN_S))
     finally:
         probe.close()
@@ -127,7 +127,7 @@ def test_without_telemetry_nothing_that_hangs_on_it_passes(
 
 # --- Each fault alone -------------------------------------------------------------------
 
-GOOD = Vehicle(
+GOOD = VehicleStatus(
     uri="radio://0/80/2M/E7E7E7E7E7",
     parameters={"system.selftestPassed": 1, "stabilizer.estimator": 2},
     echoes=[0.004] * 100,

@@ -17,9 +17,9 @@ from perchctl.faults.truth import (
     SUNK_M,
     WATCHED_S,
     DescentBound,
-    PlaceBound,
-    UnfeltDrift,
-    targets_of,
+    PositionBound,
+    UndetectedDrift,
+    target_places,
 )
 from perchctl.mission import Phase
 from perchctl.profile import Profile, load_profile
@@ -31,9 +31,9 @@ SCENARIO = Scenario(target_xy_m=(2.0, 0.0))
 SAFETY = SIM.safety
 
 
-def bound(*phases: Phase, scenario: Scenario = SCENARIO, at: tuple[float, float]) -> PlaceBound:
+def bound(*phases: Phase, scenario: Scenario = SCENARIO, at: tuple[float, float]) -> PositionBound:
     """Started at the origin, and `at` that place when the last of the phases was entered."""
-    made = PlaceBound(scenario, SIM)
+    made = PositionBound(scenario, SIM)
     made.enter(None, (0.0, 0.0))
     for phase in phases[:-1]:
         made.enter(phase, (0.0, 0.0))
@@ -78,7 +78,7 @@ def test_all_that_looks_like_its_target_may_be_flown_to() -> None:
     scenario = Scenario(
         target_xy_m=(2.0, 0.0), target_yaw_rad=0.5 * math.pi, neighbours=(alike, other)
     )
-    assert targets_of(scenario) == [(2.0, 0.0), pytest.approx((1.0, 0.0))]
+    assert target_places(scenario) == [(2.0, 0.0), pytest.approx((1.0, 0.0))]
     assert bound(P.PERCH, at=(0.0, 0.0), scenario=scenario).astray_m((1.0, 0.2)) == pytest.approx(
         0.2
     )
@@ -87,10 +87,10 @@ def test_all_that_looks_like_its_target_may_be_flown_to() -> None:
 def drifted(
     *effects: e.Effect, after_s: float, by_target: bool = True, phase: Phase = P.SEARCH
 ) -> float:
-    drift = UnfeltDrift(effects, SCENARIO, by_target=by_target)
+    drift = UndetectedDrift(effects, SCENARIO, by_target=by_target)
     for k in range(1, round(after_s / 0.1)):
-        drift.after_m(0.1 * k, phase)
-    return drift.after_m(after_s, phase)
+        drift.update_m(0.1 * k, phase)
+    return drift.update_m(after_s, phase)
 
 
 SLIDE = partial(e.estimate_error, step_m=(2.0, 0.0, 0.0), drift_mps=(0.3, 0.4, 9.0), for_s=4.0)
@@ -112,9 +112,9 @@ def test_what_nothing_on_board_can_know_is_allowed_on_top() -> None:
 
 def test_a_slide_of_before_is_forgotten_once_it_is_under_the_target() -> None:
     """And counts anew on the way down, where no picture steers."""
-    drift = UnfeltDrift((SLIDE,), SCENARIO, by_target=False)
+    drift = UndetectedDrift((SLIDE,), SCENARIO, by_target=False)
     way = [(1.0, P.SEARCH), (2.0, P.ALIGN), (3.0, P.ASCEND), (4.0, P.LANDING)]
-    assert [drift.after_m(*each) for each in way] == pytest.approx([0.5, 0.5, 0.0, 0.5])
+    assert [drift.update_m(*each) for each in way] == pytest.approx([0.5, 0.5, 0.0, 0.5])
 
 
 # --- the way down -----------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.errors import UsageError
 from perchctl.faults import FAULTS, select_faults
-from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, case_of, draw_case
+from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, draw_case, draw_fault_case
 from perchctl.faults.oracle import second_press_s
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator, Phase
@@ -26,7 +26,7 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
     assert set(USUAL_S) == set(AIR)
     for seed in range(20):
         for phase in fault.phases:
-            case = case_of(fault, phase, np.random.default_rng(seed), SCENARIO)
+            case = draw_fault_case(fault, phase, np.random.default_rng(seed), SCENARIO)
             assert 0.0 <= case.moment_s <= USUAL_S[phase]
             assert case.effects
             assert (case.landed_from is not None) == (phase is Phase.LANDING)
@@ -49,7 +49,7 @@ def test_the_same_seeds_draw_the_same_cases_for_ever() -> None:
 def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, stops: bool) -> None:
     """By the oracle's reading of the law and by the program's."""
     for seed in range(50):
-        case = case_of(BY_NAME[name], Phase.ALIGN, np.random.default_rng(seed), SCENARIO)
+        case = draw_fault_case(BY_NAME[name], Phase.ALIGN, np.random.default_rng(seed), SCENARIO)
         presses_s = case.effects[0].keywords["presses_s"]
         # It is asked the time at each press, and once more when it is read.
         times_s = iter((*presses_s, presses_s[-1]))

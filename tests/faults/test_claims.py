@@ -17,8 +17,8 @@ from perchctl.faults.oracle import (
     ROW_CLAIMS,
     SAY_OFF,
     UNCONFIRMED,
-    claims_of,
-    claims_of_rescue,
+    report_claims,
+    rescue_claims,
 )
 from perchctl.mission import Event, EventKind, Finding, FlightReport, Outcome, Phase
 from perchctl.mission.state import TERMINALS
@@ -72,16 +72,16 @@ def test_an_outcome_claims_what_its_exit_code_means(outcome: Outcome) -> None:
 
 def test_a_report_claims_all_that_it_says() -> None:
     perched = report(Phase.PERCHED, Outcome.PERCHED, "perched")
-    assert claims_of(perched) == {"hangs on the target", "hangs"}
+    assert report_claims(perched) == {"hangs on the target", "hangs"}
     landed = report(Phase.LANDED, Outcome.OPERATOR, "landed")
-    assert claims_of(landed) == {"stands", "hangs or stands"}
+    assert report_claims(landed) == {"stands", "hangs or stands"}
     hung = report(Phase.PERCHED, Outcome.TARGET_NOT_FOUND, "hung")
-    assert claims_of(hung) == {"hangs", "stands"}  # exit 50 says that it landed
+    assert report_claims(hung) == {"hangs", "stands"}  # exit 50 says that it landed
     cut = report(Phase.ABORTED, Outcome.EMERGENCY, "operator-stop", locked=True)
-    assert claims_of(cut) == {"motors off", "locked"}
+    assert report_claims(cut) == {"motors off", "locked"}
     not_known = report(Phase.ABORTED, Outcome.SAFETY, NOT_KNOWN)
-    assert claims_of(not_known) == {"hangs or stands"}
-    assert claims_of(report(Phase.ABORTED, Outcome.SAFETY, UNCONFIRMED)) == {"not seen down"}
+    assert report_claims(not_known) == {"hangs or stands"}
+    assert report_claims(report(Phase.ABORTED, Outcome.SAFETY, UNCONFIRMED)) == {"not seen down"}
 
 
 def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
@@ -91,7 +91,7 @@ def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
 @pytest.mark.parametrize("found", Finding)
 def test_what_a_rescue_says_counts_too(found: Finding) -> None:
     """By what it found: that it hangs is another claim than that it stands."""
-    claims = claims_of_rescue(Event.of_rescue(9.0, ValueError(), f"{found.value}; it fell hard"))
+    claims = rescue_claims(Event.of_rescue(9.0, ValueError(), f"{found.value}; it fell hard"))
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",
         "something holds the vehicle": "held off the target",
@@ -103,7 +103,7 @@ def test_what_a_rescue_says_counts_too(found: Finding) -> None:
 
 
 def test_what_is_no_rescue_s_note_claims_nothing() -> None:
-    assert claims_of_rescue(note("no battery reading")) == set()
+    assert rescue_claims(note("no battery reading")) == set()
     rescue = Event.of_rescue(9.0, ValueError(), Finding.UNSEEN.value)
     phase = replace(rescue, kind=EventKind.PHASE)
-    assert claims_of_rescue(phase) == set()
+    assert rescue_claims(phase) == set()

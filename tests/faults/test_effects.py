@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.camera.health import content
+from perchctl.camera.health import picture_kind
 from perchctl.faults import effects as e
 from perchctl.faults.edges import (
     LONGEST_S,
@@ -24,9 +24,9 @@ from perchctl.faults.edges import (
     FaultyClock,
     FaultyRadio,
     ProgramKilled,
-    order_of,
+    packet_kind,
 )
-from perchctl.faults.truth import WatchedVehicle, sample_of
+from perchctl.faults.truth import WatchedVehicle, true_sample
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link.crtp import encode
 from perchctl.link.mock import TELEMETRY_DELAY_S
@@ -98,7 +98,7 @@ class Rig:
 
     def _each(self, t_s: float) -> None:
         self.injector.each(t_s)
-        self.edges.pass_time(t_s)
+        self.edges.call_due(t_s)
 
     @property
     def now_s(self) -> float:
@@ -151,7 +151,7 @@ def test_it_begins_at_its_moment_in_its_phase(
 def test_orders_are_told_by_their_packets() -> None:
     orders = (PositionSetpoint(0.0, 0.0, 1.0, 0.0), RawThrust(5000), StopMotors(), EmergencyStop(),
               Land(0.0, 2.0))  # fmt: skip
-    names = [[order_of(packet) for packet in encode(order)] for order in orders]
+    names = [[packet_kind(packet) for packet in encode(order)] for order in orders]
     assert names[:4] == [["setpoint"], ["raw"], ["stop", "notify"], ["emergency-stop"]]
     assert "land" in names[4]
 
@@ -237,7 +237,7 @@ def test_what_each_camera_fault_does() -> None:
     assert all(np.array_equal(f.image, frozen[0].image) for f in frozen)
     assert len({f.t_s for f in frozen}) == len(frozen)
     for kind in ("snow", "dark"):
-        assert {content(frame.image) for _, frame in during(kind)} == {kind}
+        assert {picture_kind(frame.image) for _, frame in during(kind)} == {kind}
     assert np.array_equal(during("mirrored")[0][1].image[:, -1], np.full(48, 180))
     late = during("late", 0.2, from_s=1.3)
     assert len(late) > 8
@@ -340,7 +340,7 @@ def test_a_vehicle_that_starts_again_stops_its_motors_and_time_goes_on() -> None
     firmware = rig.vehicle.firmware
     rig.wait(0.1)
     for thrust in (0, 30000, 30000):
-        firmware.low_level(raw_thrust(thrust))
+        firmware.fly_setpoint(raw_thrust(thrust))
         rig.wait(0.3)
     assert max(firmware.motors) > 0.0
     rig.begin()
@@ -357,9 +357,9 @@ def test_the_magnet_lets_go_after_the_contact() -> None:
     rig.wait(1.0)
     vehicle.world.set_pose((*scenario.target_xy_m, top_m))
     rig.wait(0.4)
-    assert sample_of(vehicle).hanging
+    assert true_sample(vehicle).hanging
     rig.wait(0.5)
-    assert not sample_of(vehicle).hanging
+    assert not true_sample(vehicle).hanging
     assert vehicle.world.z_m < top_m - 0.05
 
 

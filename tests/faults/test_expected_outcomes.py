@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from perchctl.faults import effects as e
-from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES, ExpectedOutcome, unexpected
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES, ExpectedOutcome, unexpected_flags
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.truth import Facts
 
@@ -92,10 +92,10 @@ def test_what_came_before_the_cause_or_long_after_is_no_consequence_of_it(
             (9.9 + after_s, covered),
             (10.1 + after_s, (flag,)),
         ):
-            assert unexpected({flag: t_s}, facts) == counted
+            assert unexpected_flags({flag: t_s}, facts) == counted
 
 
 def test_other_flags_count_whatever_was_expected() -> None:
     flags: dict[Any, float] = {"fell": 10.5, "lied": 10.5}
-    assert unexpected(flags, Facts(stop_s=10.0)) == ("lied",)
-    assert unexpected(flags, Facts()) == ("fell", "lied")
+    assert unexpected_flags(flags, Facts(stop_s=10.0)) == ("lied",)
+    assert unexpected_flags(flags, Facts()) == ("fell", "lied")

@@ -24,7 +24,7 @@ from perchctl.commands.fly import POSITIONINGS, with_positioning
 from perchctl.errors import SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty
-from perchctl.faults.catalogue import BY_NAME, Fault, case_of, draw_case
+from perchctl.faults.catalogue import BY_NAME, Fault, draw_case, draw_fault_case
 from perchctl.faults.edges import PlantedError
 from perchctl.faults.effects import FOR_EVER, deck_silent
 from perchctl.faults.flight import fly_with_fault
@@ -34,7 +34,7 @@ from perchctl.flight import loop
 from perchctl.mission import Phase
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile, load_profile
-from perchctl.record import from_exact, to_exact
+from perchctl.record import from_exact_json, to_exact_json
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, SHORT
 
@@ -91,7 +91,9 @@ def flown(
     cv2.setNumThreads(1)
     scenario = draw_scenario(profile(by), SEED)
     rng = np.random.default_rng([draw, [f.name for f in FAULTS].index(name)])
-    return fly_with_fault(profile(by), case_of(BY_NAME[name], phase, rng, scenario), scenario, log)
+    return fly_with_fault(
+        profile(by), draw_fault_case(BY_NAME[name], phase, rng, scenario), scenario, log
+    )
 
 
 @pytest.mark.campaign
@@ -160,7 +162,7 @@ class HeightWatched(faulty.FaultyFlight):
 def deck_lost(phase: Phase, for_s: float, acc_z_mps2: float) -> tuple[HeightWatched, FaultResult]:
     cv2.setNumThreads(1)
     scenario = draw_scenario(profile(), SEED)
-    case = case_of(BY_NAME["deck-silent"], phase, np.random.default_rng(1), scenario)
+    case = draw_fault_case(BY_NAME["deck-silent"], phase, np.random.default_rng(1), scenario)
     case = replace(
         case, effects=(partial(deck_silent, for_s=for_s, acc_z_mps2=acc_z_mps2),), moment_s=0.2
     )
@@ -211,7 +213,7 @@ def test_the_log_ends_where_the_program_did(killed: tuple[FaultResult, Path]) ->
 def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: float) -> None:
     """By the true room: a bare ceiling has none where one was drawn."""
     scenario = replace(draw_scenario(profile(), SEED), target_xy_m=(2.0, 0.0))
-    case = case_of(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
+    case = draw_fault_case(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
     flight = faulty.FaultyFlight(profile(), case, scenario)
     flight._sample(0.0)
     flight._place_bound.enter(Phase.SEARCH, (0.0, 0.0))
@@ -224,7 +226,7 @@ def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: fl
 )
 def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> None:
     scenario = draw_scenario(profile(), SEED)
-    case = case_of(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
+    case = draw_fault_case(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
     flight = faulty.FaultyFlight(profile(), case, scenario)
     assert flight._sample(0.0).heard
     flight._injector.begin(0.0)
@@ -237,12 +239,12 @@ def test_a_refusal_says_that_nothing_was_started(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(faulty, "fly", refusing)
     scenario = draw_scenario(profile(), SEED)
-    case = case_of(BY_NAME["kick"], Phase.APPROACH, np.random.default_rng(0), scenario)
+    case = draw_fault_case(BY_NAME["kick"], Phase.APPROACH, np.random.default_rng(0), scenario)
     flight = faulty.FaultyFlight(profile(), case, scenario)
     standing = flight._sample(0.0)
     assert flight._mission()[0] == "refused"
     for k in range(100):
-        flight._oracle.see(standing._replace(t_s=0.01 * k, motors_on=True))
+        flight._oracle.update(standing._replace(t_s=0.01 * k, motors_on=True))
     assert flight._oracle.flags == {"lied": pytest.approx(0.5)}
 
 
@@ -330,8 +332,8 @@ def test_a_result_comes_back_from_its_record(fault: Fault) -> None:
     for seed in range(4):
         parameters = faulty._parameters(draw_case(seed, scenario, [fault]))
         result = replace(RESULTS[2], parameters=parameters)
-        record = json.loads(json.dumps(to_exact(result), allow_nan=False))
-        assert from_exact(FaultResult, record) == result
+        record = json.loads(json.dumps(to_exact_json(result), allow_nan=False))
+        assert from_exact_json(FaultResult, record) == result
 
 
 # --- the command ----------------------------------------------------------------------

@@ -43,7 +43,7 @@ class Script:
 
     def show(self, sample: Sample, for_s: float, **changes: Any) -> Script:
         for _ in range(max(1, round(for_s / DT_S))):
-            self.oracle.see(sample._replace(t_s=self.t_s, **changes))
+            self.oracle.update(sample._replace(t_s=self.t_s, **changes))
             self.t_s += DT_S
         return self
 
@@ -59,15 +59,15 @@ class Script:
         return self
 
     def claim(self, *claims: Claim) -> Script:
-        self.oracle.claims(frozenset(claims), self.t_s)
+        self.oracle.add_claims(frozenset(claims), self.t_s)
         return self
 
     def press(self) -> Script:
-        self.oracle.pressed(self.t_s)
+        self.oracle.note_press(self.t_s)
         return self
 
     def end(self) -> Script:
-        self.oracle.ended(self.t_s)
+        self.oracle.note_end(self.t_s)
         return self
 
     @property

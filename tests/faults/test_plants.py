@@ -52,7 +52,7 @@ def lands_fast(patch: Patch) -> None:
         return Land(land.height_m, max(0.1, (known[-1] - land.height_m) / 1.5))
 
     def by_itself(c: Context) -> Acted:
-        slow = c.by_sight or lander.is_in_reach(c)
+        slow = c.by_sight or lander.is_in_magnet_reach(c)
         return by_setpoints(c) if slow else lander._own_landing(c)
 
     patch.setattr(lander, "own_landing", fast)

@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import load_calibration
 from perchctl.faults.effects import Effect, reboots
 from perchctl.faults.oracle import Sample
-from perchctl.faults.truth import CUT_S, FactsRecorder, WatchedVehicle, sample_of
+from perchctl.faults.truth import CUT_S, FactsRecorder, WatchedVehicle, true_sample
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sim import Scenario
 from tests.faults.test_oracle import HANGING
@@ -51,20 +51,20 @@ def test_the_largest_raw_thrust_presses_at_any_mass(
             world.let_go()
         firmware.motors = firmware.driver.pwm((order,) * 4, world.battery_v)
         world.step(firmware.motors)
-    assert sample_of(heavy).pressing is pressing
+    assert true_sample(heavy).pressing is pressing
 
 
 def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehicle) -> None:
     x_m, y_m = vehicle.world.magnet.target_xy_m
     vehicle.world.set_pose((x_m + 0.04, y_m, 1.0), velocity_mps=(0.3, -0.4, 9.0))
     gear_m = SCENARIO.gear_body_m
-    sample = sample_of(vehicle)
+    sample = true_sample(vehicle)
     assert sample.aside_mps == pytest.approx(0.5)
     assert sample.miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
     assert sample.below_m == pytest.approx(SCENARIO.ceiling_z_m - gear_m[2] - 1.0)
     above = WatchedVehicle(replace(SCENARIO, target_above_ceiling_m=0.1), CAMERA, TargetConfig())
     above.world.set_pose((x_m, y_m, SCENARIO.ceiling_z_m - gear_m[2]))
-    assert sample_of(above).below_m == pytest.approx(0.1)
+    assert true_sample(above).below_m == pytest.approx(0.1)
 
 
 # --- facts ------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ class Recorded:
         for _ in range(round(for_s / DT_S)):
             if begun and self.facts.begin_s is None:
                 self.facts.begin_s = self.t_s
-            self.facts.see(sample._replace(t_s=self.t_s, **changes))
+            self.facts.update(sample._replace(t_s=self.t_s, **changes))
             self.t_s += DT_S
         return self
 

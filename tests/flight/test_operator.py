@@ -114,7 +114,7 @@ def test_before_the_flight_a_signal_leaves() -> None:
 
 HANGING = """
 import hashlib, sys, time
-from perchctl.commands.interrupt import signals_to_operator
+from perchctl.commands.interrupt import operator_signals
 from perchctl.commands.output import say
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.watchdog import Watchdog
@@ -130,7 +130,7 @@ dog = Watchdog(Profile(), switch.read)
 def send(command):
     print(type(command).__name__, switch.read().name, flush=True)
 
-with signals_to_operator(switch, say):
+with operator_signals(switch, say):
     sender = Sender(send, lambda: dog.poll(time.monotonic(), telemetry(time.monotonic())))
     now = time.monotonic()
     state = PlannerState(phase=Phase.ALIGN, t_s=now, hover_thrust=50000.0)

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import GroundCriteria
-from perchctl.flight.criteria import AtRest, apart, with_another_up
-from perchctl.flight.preflight import refuse_strange
+from perchctl.flight.criteria import RestCheck, apart, up_axis_problem
+from perchctl.flight.preflight import refuse_wrong_positions
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission import Operator, Outcome
 from perchctl.positioning import FeedStatus
@@ -60,15 +60,15 @@ REACH = changed({"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m":
 def test_a_place_that_is_none_is_named(
     place: ExternalPosition, profile: Profile, words: str | None
 ) -> None:
-    problem = GroundCriteria(REST, profile).world_problem(place)
+    problem = GroundCriteria(REST, profile).position_frame_problem(place)
     assert (problem is None) is (words is None)
     assert problem is None or re.search(words or "", problem.sentence)
 
 
 def test_a_body_that_goes_about_while_the_vehicle_stands_is_another_s() -> None:
     def told(places: list[Any]) -> list[bool]:
-        at_rest = AtRest()
-        return [at_rest.strange(place, MOCAP) is not None for place in places]
+        at_rest = RestCheck()
+        return [at_rest.moved_body_problem(place, MOCAP) is not None for place in places]
 
     walks = [at(0.02 * k, 0.0, 0.012) for k in range(8)]
     assert told(walks) == [False] * 6 + [True] * 2
@@ -84,7 +84,7 @@ def test_another_axis_up_is_named_by_the_attitude(
     """As long as the body's own axes are the vehicle's, in whatever heading it stands."""
     own = rotation_from_rpy(roll, pitch, yaw)
     tel = replace(REST, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
-    problem = with_another_up(at(0.0, 0.0, 0.0, turn @ own), tel)
+    problem = up_axis_problem(at(0.0, 0.0, 0.0, turn @ own), tel)
     up = named_up(turn)
     assert (problem is None) is (up == "z")
     assert problem is None or f"up is {up} in the motion capture" in problem.found
@@ -200,13 +200,13 @@ IN_A_HAND = {"acc_z_g": 1.3}
 def test_a_body_that_moves_is_judged_by_fresh_telemetry_and_a_fresh_position(
     turns: list[tuple[float, float, float, dict[str, float]]], refused: bool
 ) -> None:
-    at_rest = AtRest()
+    at_rest = RestCheck()
 
     def asked(x_m: float, tel_age_s: float, age_s: float, changes: dict[str, float]) -> None:
         place = at(x_m, 0.0, 0.012)
         sample = replace(REST, t_s=50.0 - tel_age_s, **changes)  # type: ignore[arg-type]
         status = FeedStatus(age_s, None, 9, place, 100.0, place)
-        refuse_strange(status, sample, MOCAP, 50.0, at_rest)
+        refuse_wrong_positions(status, sample, MOCAP, 50.0, at_rest)
 
     for turn in turns[:-1]:
         asked(*turn)

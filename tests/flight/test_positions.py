@@ -22,7 +22,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight import FlyOptions, WallClock, check_options, session
-from perchctl.flight.session import started_feed
+from perchctl.flight.session import start_position_feed
 from perchctl.link import CflibLink
 from perchctl.positioning import FeedStatus
 from perchctl.profile import LinkConfig, PositioningConfig, find_profile, load_profile
@@ -56,7 +56,7 @@ def fed(
         link = CflibLink(sim.uri, LinkConfig(), clock.now, positioning=config)
         try:
             link.connect()
-            feed = started_feed(stack, link, config, clock)
+            feed = start_position_feed(stack, link, config, clock)
             assert feed is not None
             yield link, feed.status
         finally:
@@ -79,12 +79,12 @@ def test_the_estimate_is_the_capture_s_and_follows_it(sim: SimProcess) -> None:
         assert newest.yaw_rad == pytest.approx(truth["rpy_rad"][2] + 2.0, abs=math.radians(5.0))
         until(lambda: status(time.monotonic()).rate_hz > 60.0)
 
-        sim.lay(CaptureFault(occluded=True))
+        sim.begin_fault(CaptureFault(occluded=True))
         until(lambda: "does not see the rigid body" in (status(time.monotonic()).problem or ""))
         sent = status(time.monotonic()).sent
         until(lambda: status(time.monotonic()).age_s > 0.3)
         assert status(time.monotonic()).sent == sent
-        sim.heal()
+        sim.end_faults()
         until(lambda: status(time.monotonic()).problem is None)
         assert status(time.monotonic()).sent > sent
 
@@ -105,7 +105,7 @@ def test_what_is_no_position_is_named_on_the_ground(
     words: str,
 ) -> None:
     if fault is not None:
-        sim.lay(fault)
+        sim.begin_fault(fault)
     config = config.model_copy(update={"connect_timeout_s": 3.0})
     with pytest.raises(kind, match=words), fed(sim, config):
         pass

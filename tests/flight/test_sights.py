@@ -52,7 +52,7 @@ def test_what_hangs_is_told_where_and_what_flies_nothing(touches: bool) -> None:
     sights, sent = hung()
     samples = at_rest()
     sights.begin(history(samples), samples[-1].t_s, touches=touches)
-    assert [p.position_m for p in sent] == [sights.feed.touching(0.0)] * touches
+    assert [p.position_m for p in sent] == [sights.feed.contact_position(0.0)] * touches
     assert not touches or sights.feed.status(samples[-1].t_s).age_s == 0.0
 
 
@@ -92,7 +92,7 @@ def test_an_attitude_that_stands_still_places_nobody(frozen: bool) -> None:
         telemetry(1.0 + SAMPLE_S * i, 1.0, **({"roll_rad": 0.1} if frozen and i else {}))
         for i in range(50)
     ]
-    sights.see(pose, history(samples), 1.5)
+    sights.add_pose(pose, history(samples), 1.5)
     assert bool(sent) is not frozen
 
 

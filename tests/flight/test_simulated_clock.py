@@ -13,7 +13,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.children import SharedTime
 from perchctl.flight.clock import SIM_PATIENCE_S, SimulatedClock
 from perchctl.sim import CONTROL_PERIOD_S
-from perchctl.sim.host import LOOP_PATIENCE_S, Runner
+from perchctl.sim.host import LOOP_PATIENCE_S, HostRunner
 
 CLOCK_MARGIN_S = SharedTime.MARGIN_S
 PERIOD_S = 0.02
@@ -38,7 +38,7 @@ class Rig:
     def __init__(self) -> None:
         self.wall_s = 100.0
         self.host, self.shared, self.runs = Host(), SharedTime(0.0, math.inf), True
-        self.runner = Runner(
+        self.runner = HostRunner(
             self.host, self.host, realtime=True, clock=lambda: self.wall_s,
             shared=self.shared,
         )  # type: ignore[arg-type] # fmt: skip

@@ -16,8 +16,8 @@ from perchctl.mission import (
     Touchdown,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Blow, Reckoning, advance_reckoning
-from perchctl.mission.report import HARD_MPS, touchdown_of
+from perchctl.mission.imu import DeadReckoning, Impact, advance_reckoning
+from perchctl.mission.report import HARD_MPS, find_touchdown
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.helpers.hangs import hang_in_the_camera
@@ -39,7 +39,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
     vehicle = SimulatedVehicle(scenario)
     link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
     link.connect()
-    motion, carried, last = ImuMotion(), Reckoning(), None
+    motion, carried, last = ImuMotion(), DeadReckoning(), None
     t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0
     place = (0.0, 0.0, 0.0)
     while t_s < min(9.0, hit_s + 0.6):
@@ -51,7 +51,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
         for _ in range(10):
             t_s += 0.002
             link.advance_to(t_s)
-            if dropped_s < t_s < hit_s and vehicle.world.contacts()[1]:
+            if dropped_s < t_s < hit_s and vehicle.world.contact_state()[1]:
                 hit_s, speed_mps = t_s, sink_mps
             sink_mps = -vehicle.world.vz_mps
         for sample in link.telemetry():
@@ -64,7 +64,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
     obs = Observation(last.t_s, last, imu=motion)
     blind_s = dropped_s if blind else None
     state = replace(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, blind_s=blind_s)
-    return speed_mps, touchdown_of(Context(state, obs, profile))
+    return speed_mps, find_touchdown(Context(state, obs, profile))
 
 
 @pytest.mark.parametrize("blind", [False, True])
@@ -85,17 +85,17 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
 @pytest.mark.parametrize(
     ("state", "blow", "told"),
     [
-        ({}, Blow(9.0, -0.9, 0.0, 3.1), True),
-        ({}, Blow(4.0, -0.9, 0.0, 3.1), False),  # long before
-        ({}, Blow(9.0, -0.9, 0.0, 3.1, 0.8), False),  # in the air
-        ({"phase": Phase.PERCHED}, Blow(9.0, -0.9, 0.0, 3.1), False),
-        ({}, Blow(), False),
+        ({}, Impact(9.0, -0.9, 0.0, 3.1), True),
+        ({}, Impact(4.0, -0.9, 0.0, 3.1), False),  # long before
+        ({}, Impact(9.0, -0.9, 0.0, 3.1, 0.8), False),  # in the air
+        ({"phase": Phase.PERCHED}, Impact(9.0, -0.9, 0.0, 3.1), False),
+        ({}, Impact(), False),
     ],
 )
-def test_only_the_floor_is_a_touchdown(state: dict[str, object], blow: Blow, told: bool) -> None:
+def test_only_the_floor_is_a_touchdown(state: dict[str, object], blow: Impact, told: bool) -> None:
     ended = replace(state_in(Phase.LANDED, z_m=0.0), **state)  # type: ignore[arg-type]
     obs = observation(10.0, 0.0, imu=ImuMotion(t_s=10.0, blow=blow))
-    assert touchdown_of(Context(ended, obs, PROFILE)) == (HARD if told else None)
+    assert find_touchdown(Context(ended, obs, PROFILE)) == (HARD if told else None)
 
 
 # --- Whoever flew the way down -------------------------------------------------------------------

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from perchctl.analysis.decide import decide
+from perchctl.analysis.decide import replay_decisions
 from perchctl.flight import fly
 from perchctl.mission import (
     Observation,
@@ -96,9 +96,9 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     assert (last.role, last.command, last.error) == ("failed", None, "ZeroDivisionError")
     turns = [*told.of_ticks, last]
     assert last.number == turns[-2].number + 1
-    assert not any(each.difference for each in decide(turns, rig.profile))
+    assert not any(each.difference for each in replay_decisions(turns, rig.profile))
     plan_by(monkeypatch, step_mission)  # mended
-    *others, again = decide(turns, rig.profile)
+    *others, again = replay_decisions(turns, rig.profile)
     assert not any(each.difference for each in others)
     assert again.difference == ("error", "ZeroDivisionError", None)
 
@@ -118,7 +118,9 @@ def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
     last = told.turns[-1]
     assert (last.role, last.error) == ("flown", None)
     assert (last.t_s, last.command) in rig.link.sent
-    assert not any(each.difference for each in decide([*told.of_ticks, last], rig.profile))
+    assert not any(
+        each.difference for each in replay_decisions([*told.of_ticks, last], rig.profile)
+    )
 
 
 def test_an_interrupted_planner_did_not_fail_and_no_turn_is_told_twice(

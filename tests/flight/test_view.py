@@ -20,7 +20,7 @@ from perchctl.flight import fly_lockstep, out_of_view
 from perchctl.flight.preflight import (
     LEAN_DEG,
     still_waiting_for,
-    target_from,
+    target_view_from,
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.positioning import FeedStatus
@@ -65,15 +65,15 @@ def test_put_where_the_refusal_says_it_flies(
     """In whatever heading it stands, and the higher the vehicle, the less it sees."""
     target = place(x, y, z, target_yaw)
     problem = out_of_view(target, FEET, yaw_rad, TARGET, CAMERA)
-    over = target_from((0.0, 0.0, TOP_M), yaw_rad, target, TARGET, CAMERA)
+    over = target_view_from((0.0, 0.0, TOP_M), yaw_rad, target, TARGET, CAMERA)
     leant_m = over.height_m * math.tan(math.radians(LEAN_DEG))
     # Farther aside of the camera, which is beside the body's axis, is as good as leaning.
     away = rot_z(yaw_rad)[:2, :2] @ over.aside_m / max(math.hypot(*over.aside_m), 1e-6)
     leaning = place(*(target.position_m[:2] + leant_m * away), z, target_yaw)
-    swayed = target_from((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
+    swayed = target_view_from((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
     assert (problem is None) is (over.whole and swayed.whole)
     if problem is None:
-        assert target_from(FEET, yaw_rad, target, TARGET, CAMERA).whole
+        assert target_view_from(FEET, yaw_rad, target, TARGET, CAMERA).whole
         return
     ways = re.findall(r"([\d.]+) m (forward|back|to the left|to the right)", problem.advice)
     signs = {"forward": (1, 0), "back": (-1, 0), "to the left": (0, 1), "to the right": (0, -1)}

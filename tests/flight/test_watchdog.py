@@ -261,7 +261,7 @@ def test_after_the_loop_only_the_operators_stop_cuts_and_at_once(closing: str) -
     """A perched vehicle is not locked by a late stop."""
     rig = Rig()
     if closing == "rescue":
-        rig.dog.rescuing()
+        rig.dog.note_rescue()
     else:
         rig.dog.end(motors_off=closing == "motors off")
     assert [rig.after(s) for s in (0.01, 0.5, 1.1, 9.0)] == [None] * 4

@@ -59,7 +59,7 @@ class Hand:
         turn = before[1].T @ after[1]  # so small a turn is its own vector
         rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * dt_s)
         world.place(*here, (after[0] - before[0]) / (2.0 * dt_s), rates)
-        world.feel(*((after[0] - 2.0 * here[0] + before[0]) / dt_s**2).tolist())
+        world.set_acceleration(*((after[0] - 2.0 * here[0] + before[0]) / dt_s**2).tolist())
 
 
 def lifted_and_turned(home: Place, yaw_rad: float = 0.0) -> Stops:

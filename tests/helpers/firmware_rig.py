@@ -8,7 +8,7 @@ from typing import Any
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.controller import MODE_POSITION, MODE_RAW, Setpoint
-from perchctl.sim.firmware.planner import Planner
+from perchctl.sim.firmware.planner import HighLevelPlanner
 from perchctl.sim.world import World
 
 STREAM_PERIOD_S = 0.02
@@ -36,7 +36,7 @@ class Rig:
         every = round(STREAM_PERIOD_S / CONTROL_PERIOD_S)
         for i in range(round(seconds / CONTROL_PERIOD_S)):
             if stream is not None and i % every == 0:
-                self.firmware.low_level(stream)
+                self.firmware.fly_setpoint(stream)
             self.firmware.step()
             heights.append(self.world.z_m)
         return heights
@@ -50,7 +50,7 @@ class Rig:
         return max(self.firmware.motors) == 0.0
 
     def take_off(self, height_m: float = 0.8, settle_s: float = 2.5) -> None:
-        self.firmware.high_level(Planner.take_off, height_m, 2.5, None)
+        self.firmware.give_order(HighLevelPlanner.take_off, height_m, 2.5, None)
         self.run(2.5 + settle_s)
 
     def hold(self, seconds: float = 2.0, z_m: float = 0.8) -> None:

@@ -23,8 +23,8 @@ def campaign(
     """As `perchctl simulate` has it."""
     # Not at the top: each process that flies loads this module.
     from perchctl.campaign import fly_all
-    from perchctl.commands.interrupt import signals_to
-    from perchctl.commands.simulate import executor_of, fly_each, stop_handler
+    from perchctl.commands.interrupt import handle_signals
+    from perchctl.commands.simulate import make_executor, run_campaign, stop_handler
 
     def flown(executor: Executor, note: Callable[[Ended], None]) -> None:
         def noted(result: Ended) -> None:
@@ -33,8 +33,8 @@ def campaign(
 
         fly_all(fly, range(flights), executor, noted)
 
-    with signals_to(stop_handler()):
-        return fly_each(flown, report, flights, executor_of(jobs, cluster, [], flights))
+    with handle_signals(stop_handler()):
+        return run_campaign(flown, report, flights, make_executor(jobs, cluster, [], flights))
 
 
 if __name__ == "__main__":

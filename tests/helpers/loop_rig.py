@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from perchctl.flight import FlightParts, fly
-from perchctl.flight.loop import GivesPositions
+from perchctl.flight.loop import PositionSource
 from perchctl.flight.watchdog import rescue
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.mission import (
@@ -107,7 +107,7 @@ class Vehicle:
     def problem(self, now_s: float) -> str | None:
         return "the script ended the link" if now_s >= self.dies_at_s else None
 
-    def external(self, place: ExternalPosition) -> bool:
+    def send_external(self, place: ExternalPosition) -> bool:
         self.places.append((self.now_s, place))
         return True
 
@@ -264,7 +264,7 @@ class Rig:
     profile: Profile = PROFILE
     setup: Pipeline = SETUP
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    positions: GivesPositions | None = None
+    positions: PositionSource | None = None
 
     def parts(self) -> FlightParts:
         return FlightParts(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import MountingRecording
-from perchctl.calibration.mounting.recording import MountingPart, SeenPose
+from perchctl.calibration.mounting.recording import MountingPart, TargetPose
 from perchctl.profile import Profile, load_profile
 from tests.helpers.hand import Hand, R_target_cam, attitudes, cam_target_m, draw_hand
 
@@ -67,7 +67,7 @@ def seen(
         R[k] = Rotation.from_rotvec(rng.normal(size=3) * 0.5).as_matrix() @ R[k]
         p[k] = p[k] + rng.normal(size=3) * 0.02
     poses = [
-        SeenPose(float(t), R[k], p[k], np.diag(claimed * sigma[k] ** 2))
+        TargetPose(float(t), R[k], p[k], np.diag(claimed * sigma[k] ** 2))
         for k, t in enumerate(stamped_s)
     ]
     return MountingRecording(held.part, attitudes(held, errors), poses)

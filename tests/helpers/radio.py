@@ -72,7 +72,7 @@ class Air:
                 self._server.handle(Packet(Port.LOG, _LOG_SETTINGS, _LOG_RESET))
                 self._waiting.clear()
             self._heard_s = now_s
-            self._waiting.extend(packet.encode() for packet in self._server.due())
+            self._waiting.extend(packet.encode() for packet in self._server.due_packets())
             return self._acknowledge(data)
 
     def _acknowledge(self, data: bytes) -> bytes:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from perchctl.campaign import FlightResult
-from perchctl.record import to_exact
+from perchctl.record import to_exact_json
 
 PERCHED = FlightResult(0, "perched", "hanging still", 0.002, 20.0, 1, False, False)
 LANDED = replace(PERCHED, outcome="landed", reason="battery at 2.9 V", miss_m=None, time_s=30.0)
@@ -27,5 +27,5 @@ def aborted(seed: int) -> FlightResult:
 
 def flown_record(result: FlightResult) -> dict[str, Any]:
     """What equal flights share on all computers: without log and timings."""
-    record: dict[str, Any] = to_exact(result)
+    record: dict[str, Any] = to_exact_json(result)
     return {k: v for k, v in record.items() if k not in ("cpu_s", "log", "log_problem")}

@@ -10,7 +10,7 @@ from typing import Any
 
 from perchctl.mission import Event, EventKind, Phase
 from perchctl.record import FlightLog
-from perchctl.record.exact import to_plain
+from perchctl.record.exact import to_rounded_json
 from perchctl.record.fields import event_record
 from tests.helpers import log as synthetic
 
@@ -44,7 +44,7 @@ def made(
 
 @cache
 def _flown() -> tuple[dict[str, Any], ...]:
-    records = [to_plain(record) for record in synthetic.ticks()]
+    records = [to_rounded_json(record) for record in synthetic.ticks()]
     for record in records:
         if record["frame_t_s"] is not None:  # there it is on another clock than the ticks
             record["frame_t_s"] += START_S
@@ -53,7 +53,7 @@ def _flown() -> tuple[dict[str, Any], ...]:
 
 @cache
 def _header() -> dict[str, Any]:
-    plain: dict[str, Any] = to_plain(synthetic.header())
+    plain: dict[str, Any] = to_rounded_json(synthetic.header())
     return plain
 
 

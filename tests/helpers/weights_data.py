@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
 from perchctl.geometry import Array
-from perchctl.weights.data import HEADER, Measurements, row_text, wrap
+from perchctl.weights.data import HEADER, Measurements, csv_row, wrap_angles
 
 BEST = np.array([0.275, 0.306, 0.728, 0.469])
 """The weights that `known` data are made with."""
@@ -55,7 +55,7 @@ def measured(
 
     def turned(pose: Array) -> Array:
         out = pose.copy()
-        out[:, 3] = wrap(out[:, 3] + turn_rad)
+        out[:, 3] = wrap_angles(out[:, 3] + turn_rad)
         return out
 
     return Measurements(
@@ -70,7 +70,7 @@ def measured(
 def write(data: Measurements, path: Path) -> Path:
     """As the documented CSV."""
     rows = zip(data.position, data.large, data.small, data.actual, strict=True)
-    lines = [row_text(int(p), k / 30.0, poses) for k, (p, *poses) in enumerate(rows)]
+    lines = [csv_row(int(p), k / 30.0, poses) for k, (p, *poses) in enumerate(rows)]
     path.write_text("".join([f"{HEADER}\n", *lines]), encoding="utf-8")
     return path
 

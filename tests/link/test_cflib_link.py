@@ -35,8 +35,8 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
     Telemetry,
-    is_cut,
-    may_fly,
+    is_emergency_stopped,
+    may_be_flying,
 )
 from tests.helpers.mission import AIRBORNE, READY, telemetry
 
@@ -156,7 +156,7 @@ def test_wrong_parameters_are_refused(
 def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) -> None:
     """Firmware facts, "Signs and units": the Crazyflie's pitch is nose up, ours nose down."""
     with linked(sim) as link:
-        assert newest(link).has(CAN_FLY)
+        assert newest(link).has_bit(CAN_FLY)
         let_pass(sim, 0.5)
         times = [sample.t_s for sample in link.telemetry()]
         assert len(times) > 20
@@ -189,13 +189,13 @@ def test_what_is_unknown_flies() -> None:
     standing = telemetry(10.0, 0.0, supervisor=READY, thrust=0.0)
     locked = telemetry(10.0, supervisor=LOCKED, thrust=0.0)
     old_s = 10.0 + FRESH_S + 0.01
-    assert may_fly(None, 10.0)
-    assert may_fly(standing, old_s)
-    assert not may_fly(standing, 10.1)
-    assert may_fly(telemetry(10.0, 2.0, supervisor=AIRBORNE, thrust=0.0), 10.0)
-    assert not is_cut(None, 10.0)
-    assert is_cut(locked, 10.1)
-    assert not is_cut(locked, old_s)
+    assert may_be_flying(None, 10.0)
+    assert may_be_flying(standing, old_s)
+    assert not may_be_flying(standing, 10.1)
+    assert may_be_flying(telemetry(10.0, 2.0, supervisor=AIRBORNE, thrust=0.0), 10.0)
+    assert not is_emergency_stopped(None, 10.0)
+    assert is_emergency_stopped(locked, 10.1)
+    assert not is_emergency_stopped(locked, old_s)
 
 
 @pytest.mark.long
@@ -265,7 +265,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         listener = ProbeLink(sim.uri, CONFIG, time.monotonic)
         listener.connect()
         sent = commands_sent(listener, sim)
-        assert newest(listener).has(FLYING)
+        assert newest(listener).has_bit(FLYING)
         listener.close()
         assert sent == []
         let_pass(sim, 1.0)
@@ -277,9 +277,9 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
 def test_closing_sends_no_zero_setpoint_when_nothing_is_known_any_more(sim: SimProcess) -> None:
     """The last sample shows a vehicle on the ground; what it does since then is unknown."""
     with linked(sim, landing_wait_s=0.5) as link:
-        assert not newest(link).has(FLYING)
+        assert not newest(link).has_bit(FLYING)
         sent = commands_sent(link, sim)
-        sim.silence(2.5)
+        sim.silence_link(2.5)
         until(lambda: link.problem(time.monotonic()))
         link.close()
         assert sent == []

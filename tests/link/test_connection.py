@@ -27,9 +27,9 @@ from perchctl.link import connection as room
 from perchctl.link.connection import (
     DEAD_S,
     Connection,
-    claim_vehicle,
+    lock_vehicle,
     open_connection,
-    plain_cause,
+    readable_cause,
     send_packets,
 )
 from perchctl.link.crtp import encode
@@ -106,7 +106,7 @@ class Bench:
 
     def place(self, x_m: float) -> bool:
         """Hand over a position from outside."""
-        return self.link.external(at(x_m))
+        return self.link.send_external(at(x_m))
 
 
 def at(x_m: float) -> ExternalPosition:
@@ -232,20 +232,20 @@ def test_a_second_program_is_refused_until_the_first_is_gone() -> None:
         vehicle.bind(("127.0.0.1", 0))
         vehicle.settimeout(0.05)
         uri = f"udp://127.0.0.1:{vehicle.getsockname()[1]}"
-        with claim_vehicle(uri):
+        with lock_vehicle(uri):
             with pytest.raises(ConnectionFailed, match="two would steer it two ways"):
                 open_connection(uri, 5.0)
             with pytest.raises(TimeoutError):
                 vehicle.recv(64)
-            claim_vehicle(RADIO).close()
-        claim_vehicle(uri).close()
+            lock_vehicle(RADIO).close()
+        lock_vehicle(uri).close()
 
 
 @pytest.mark.parametrize("farewell", [True, False])
 def test_a_connection_holds_the_vehicle_until_its_end_and_a_failed_one_does_not(
     farewell: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(room, "ready_cflib", lambda: None)
+    monkeypatch.setattr(room, "init_cflib", lambda: None)
     monkeypatch.setattr(Connection, "open", lambda *_: False)
     for _ in range(2):
         with pytest.raises(ConnectionFailed, match="no answer"):
@@ -253,9 +253,9 @@ def test_a_connection_holds_the_vehicle_until_its_end_and_a_failed_one_does_not(
     monkeypatch.setattr(Connection, "open", lambda *_: True)
     connection = open_connection(RADIO, 5.0)
     with pytest.raises(ConnectionFailed, match="in use"):
-        claim_vehicle(RADIO)
+        lock_vehicle(RADIO)
     connection.close(farewell=farewell)
-    claim_vehicle(RADIO).close()
+    lock_vehicle(RADIO).close()
 
 
 def test_without_a_place_for_the_lock_or_the_tables_it_flies_all_the_same(
@@ -263,13 +263,13 @@ def test_without_a_place_for_the_lock_or_the_tables_it_flies_all_the_same(
 ) -> None:
     (folder / "perchctl").write_text("")
     monkeypatch.setattr(room, "user_folder", lambda kind: folder / "perchctl")
-    claim_vehicle(RADIO).close()
+    lock_vehicle(RADIO).close()
     Connection()
 
 
 def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     """As cflib reports it: the error, then its traceback, which names the Crazyradio."""
-    said = plain_cause(
+    said = readable_cause(
         "Couldn't load link driver: [Errno 16] Resource busy\n\nTraceback ...\n  crazyradio.py, "
         "line 130, in __init__\n    self.dev.set_configuration(1)\nCrazyradio"
     )

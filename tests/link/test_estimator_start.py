@@ -19,10 +19,10 @@ from perchctl.link.external_position import (
     AGREE_WITHIN_S,
     RESET_PARAMETER,
     RESETS,
-    Standing,
+    StandingFeed,
     settle,
 )
-from perchctl.positioning import FeedStatus, Placed
+from perchctl.positioning import FeedStatus, VehiclePose
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import FLYING, Telemetry
 from tests.helpers.mission import READY, telemetry
@@ -50,7 +50,7 @@ class Bench:
     at_reset: Callable[[], None] = lambda: None
     values: dict[str, float] = field(default_factory=dict)
     orders: list[tuple[str, float]] = field(default_factory=list)
-    feed: Standing | None = None
+    feed: StandingFeed | None = None
 
     def clock(self) -> float:
         return self.now_s
@@ -79,8 +79,8 @@ class Bench:
     def status(self, now_s: float) -> FeedStatus:
         return FeedStatus(0.01, self.status_problem, 0 if self.status_problem else 9)
 
-    def place(self) -> Placed:
-        return Placed(self.now_s, np.array(self.place_m), rot_z(2.0))
+    def place(self) -> VehiclePose:
+        return VehiclePose(self.now_s, np.array(self.place_m), rot_z(2.0))
 
     def settle(self) -> None:
         feed: Any = self.feed or self
@@ -156,7 +156,7 @@ def test_what_stands_is_sent_as_often_as_the_profile_has_it(
 ) -> None:
     bench, sent_s = Bench(place_m=(0.0, 0.0, 0.03)), list[float]()
     monkeypatch.setattr(external_position, "time", SimpleNamespace(sleep=bench.wait))
-    bench.feed = Standing(lambda place: sent_s.append(bench.now_s), 0.03, rate_hz, bench.clock)
+    bench.feed = StandingFeed(lambda place: sent_s.append(bench.now_s), 0.03, rate_hz, bench.clock)
     bench.settle()
     assert np.diff(sent_s) == pytest.approx(1.0 / rate_hz)
     assert len(sent_s) > 0.5 * rate_hz

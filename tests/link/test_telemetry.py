@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.link import MotionLink
-from perchctl.link.listening import MOTION_BLOCK, ListeningLink
+from perchctl.link import AttitudeLink
+from perchctl.link.listening import MOTION_BLOCK, ReadOnlyLink
 from perchctl.link.telemetry import (
     BLOCKS,
     MOST_CARRIED_S,
     NEEDED,
     WRAP_MS,
-    Assembler,
+    SampleAssembler,
     Timebase,
     telemetry_from,
 )
@@ -79,7 +79,7 @@ STILL = {name: dict.fromkeys(variables, 0.0) for name, variables in BLOCKS.items
 
 
 def test_nothing_without_both_fast_blocks() -> None:
-    assembler = Assembler()
+    assembler = SampleAssembler()
     assert assembler.accept("attitude", STILL["attitude"], 0.0) is None
     assert assembler.accept("state", STILL["state"], 0.01) is None
     assert assembler.accept("attitude", STILL["attitude"], 0.01) is not None
@@ -87,7 +87,7 @@ def test_nothing_without_both_fast_blocks() -> None:
 
 @given(silent_ms=st.integers(0, 3000), speed_mps=st.floats(-1, 1))
 def test_a_dead_block_shows_in_the_sample(silent_ms: int, speed_mps: float) -> None:
-    assembler = Assembler()
+    assembler = SampleAssembler()
     assembler.accept("state", STILL["state"] | {"stateEstimate.vz": speed_mps}, 1.0)
     sample = assembler.accept("attitude", STILL["attitude"], 1.0 + silent_ms / 1e3)
     assert sample is not None
@@ -97,7 +97,7 @@ def test_a_dead_block_shows_in_the_sample(silent_ms: int, speed_mps: float) -> N
 
 
 def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
-    assembler = Assembler()
+    assembler = SampleAssembler()
     assembler.accept("state", STILL["state"], 1.0)
     assert assembler.accept("attitude", STILL["attitude"], 2.0, 1) is None
     assembler.accept("state", STILL["state"], 2.01, 1)
@@ -114,7 +114,7 @@ def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
 AT_REST = dict.fromkeys(MOTION_BLOCK, 0.0)
 
 
-class Listened(MotionLink):
+class Listened(AttitudeLink):
     """A link whose block sends when the test says so; `now_s` is its clock."""
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class Listened(MotionLink):
 
 def test_whether_motors_turn_is_the_newest_packet_s() -> None:
     """A link that only listens sends nothing for it."""
-    ListeningLink("usb://0", LinkConfig(), float)._prepare(None)  # type: ignore[arg-type]
+    ReadOnlyLink("usb://0", LinkConfig(), float)._prepare(None)  # type: ignore[arg-type]
     link = Listened()
     for bits in (FLYING, 0, FLYING | 0x2):
         link.hear(**{"supervisor.info": bits, "gyro.x": math.nan})

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.battery import (
+    battery_outlook,
     left_s,
-    outlook,
     read_battery,
     update_energy,
 )
@@ -186,7 +186,7 @@ def test_a_reading_that_stands_still_is_none() -> None:
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
         state = replace(state, energy=read_battery(Context(state, later, PROFILE)), t_s=later.t_s)
         c = Context(state, later, PROFILE)
-        assert (outlook(c).left_s is not None) is known
+        assert (battery_outlook(c).left_s is not None) is known
 
 
 @pytest.mark.parametrize(

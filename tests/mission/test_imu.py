@@ -18,8 +18,8 @@ from perchctl.mission.imu import (
     PUSHED_G,
     REACH_M,
     UNCORRECTED_S,
-    Reckoning,
-    add_sight,
+    DeadReckoning,
+    add_sighting,
     advance_reckoning,
 )
 from perchctl.vehicle import Telemetry
@@ -79,7 +79,7 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     before = telemetry(1.0, velocity_mps=(0.1, 0.0, 0.15))
     after = telemetry(1.7, velocity_mps=(0.1, 0.2, -0.5))
     imu = flown([before])
-    old = Reckoning(imu, velocity_mps=(0.0, 0.0, 0.05), estimated_mps=before.velocity_mps)
+    old = DeadReckoning(imu, velocity_mps=(0.0, 0.0, 0.05), estimated_mps=before.velocity_mps)
     heard = imu.with_sample(before, after)
     new = advance_reckoning(old, heard, after, believed=False)
     assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
@@ -136,18 +136,18 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
         (0.02, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), True, True),
     ):
         imu = flown([before])
-        old = add_sight(Reckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
+        old = add_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
         new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
         assert (new.unsure_s == after.t_s) is unsure
         assert new.below_m == (z_m if kept else math.inf)
-        assert add_sight(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).nearest_m == z_m
+        assert add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).nearest_m == z_m
 
 
 def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
     """It fell by 5 cm, and the setpoint that catches it is a metre above."""
     falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
     motion = flown(falls[:1])
-    reckoning = add_sight(Reckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
+    reckoning = add_sighting(DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
     late = telemetry(falls[-1].t_s + 1.5)
     for last, new in pairwise([*falls, late]):
         assert new is not late or 0.02 < reckoning.nearest_m < 0.1
@@ -162,7 +162,7 @@ def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: flo
     mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
     many samples show. `offset_g`: what the accelerometer reads too much."""
     lean_rad = 1.0 / 9.81
-    reckoning, motion, last = Reckoning(), ImuMotion(offset_g=(offset_g, 0.0, 0.0)), None
+    reckoning, motion, last = DeadReckoning(), ImuMotion(offset_g=(offset_g, 0.0, 0.0)), None
     for i in range(41):
         t_s = 1.0 + 0.01 * i
         new = telemetry(

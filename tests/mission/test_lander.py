@@ -24,9 +24,9 @@ from perchctl.mission import (
     planner,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Corrections, Reckoning
+from perchctl.mission.imu import Corrections, DeadReckoning
 from perchctl.mission.lander import PEEL_S
-from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
+from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountingMonitor
 from perchctl.mission.state import FLYING_PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -101,7 +101,7 @@ def context(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
         t_s=NOW_S - TICK_S, last=sample, blind_height_m=z_m,
         contact_z_m=z_m if held else None, reach_s=NOW_S - 2.0 if held else None,
-        reckoning=Reckoning(imu=ImuMotion(t_s=sample.t_s)),
+        reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = replace(state, **{**remembered, **changes})
     obs = observation(NOW_S, telemetry=replace(sample, **(tel or {})), target=None, **observed)
@@ -164,7 +164,7 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     began = replace(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TICK_S, **state)
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
     obs = at(HIGH_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
-    return type(lander.act(lander.observe(Context(began, obs, profile)))[1])
+    return type(lander.act(lander.remember_observation(Context(began, obs, profile)))[1])
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     positioning: str, astray: bool
 ) -> None:
     """By such positions a landing would speed up until it tilts over."""
-    begin = replace(state_in(Phase.ALIGN, NOW_S), mount=MountWatch(against=SIGHTS_IN_A_ROW))
+    begin = replace(state_in(Phase.ALIGN, NOW_S), mount=MountingMonitor(against=SIGHTS_IN_A_ROW))
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
     assert (state.phase, state.row, state.astray) == (Phase.LANDING, "mounting", astray)
@@ -259,7 +259,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 ) -> None:
     """On half of the hover thrust: in the air the accelerometer reads half a g."""
     half = 0.5 * HOVER_THRUST
-    aside = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
+    aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
         touch_s=NOW_S - 0.5, level_thrust=half, reckoning=aside,
@@ -284,7 +284,7 @@ def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
 def test_level_is_what_pictures_show_to_be_level() -> None:
     """An attitude that is 0.02 rad wrong makes 0.2 m/s of speed a second: pitched forward as it
     seems to hover, it would slide forward."""
-    leans = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.01), bias_mps2=(-0.2, 0.0, 0.0))
+    leans = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), bias_mps2=(-0.2, 0.0, 0.0))
     c, tilts = context("imu", reckoning=leans), []
     for age_s in (0.05, 2.0, 7.0):
         felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), (-0.2, 0.0), 0.0)
@@ -297,14 +297,19 @@ def test_level_is_what_pictures_show_to_be_level() -> None:
 
 
 def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
-    c = context("imu", reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
+    c = context("imu", reckoning=DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
-    state = lander.observe(Context(c.state, obs, c.profile)).state
+    state = lander.remember_observation(Context(c.state, obs, c.profile)).state
     assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
     moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
-    assert lander.observe(Context(moved, later, c.profile)).state.reckoning.velocity_mps[0] < 0.2
+    assert (
+        lander.remember_observation(Context(moved, later, c.profile)).state.reckoning.velocity_mps[
+            0
+        ]
+        < 0.2
+    )
 
 
 @pytest.mark.parametrize(("phase", "since_s", "is_there"), [
@@ -316,19 +321,19 @@ def test_what_carries_it_near_its_only_position_is_the_target(
     """Late pictures show it lower. On its way down the floor carries it, too."""
     c = context("sight", phase=phase, since={planner.Condition.CARRIED: NOW_S - since_s})
     reckoning = replace(c.state.reckoning, below_m=0.1)
-    state = lander.observe(c.evolve(reckoning=reckoning)).state
+    state = lander.remember_observation(c.evolve(reckoning=reckoning)).state
     assert (state.reckoning.below_m == 0.0) is is_there
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""
-    reckoning = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
     c = context("imu", blind_height_m=2.0, reckoning=reckoning)
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
     obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
     obs = replace(obs, imu=replace(obs.imu, t_s=NOW_S))
-    state = lander.observe(Context(c.state, obs, c.profile)).state
+    state = lander.remember_observation(Context(c.state, obs, c.profile)).state
     assert state.reckoning.velocity_mps[2] == pytest.approx(-0.4 if later_s else -0.7, abs=0.05)
     state = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.0, 0.0, -0.4)))
     _, command = lander.act(Context(state, obs, c.profile))
@@ -347,27 +352,27 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
         since={planner.Condition.DOWN: 0.0, planner.Condition.BATTERY_LOW: 1.0},
     )  # fmt: skip
     obs = observation(NOW_S + hung * profile.positioning.hold_s, HIGH_M)
-    after = lander.observe(Context(state, obs, profile)).state
+    after = lander.remember_observation(Context(state, obs, profile)).state
     assert (planner.Condition.DOWN in after.since) is not stale
     assert planner.Condition.BATTERY_LOW in after.since
     assert after.caught is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
     held = replace(state, caught=True)
-    assert lander.observe(Context(held, obs, profile)).state.setpoint == held.setpoint
+    assert lander.remember_observation(Context(held, obs, profile)).state.setpoint == held.setpoint
     if positioning == "target":
         assert (after.blind_s is not None) is stale
 
 
 # --- Where it is, in the end --------------------------------------------------------------------
 
-UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), Reckoning()
+UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoning()
 
 
 def ended(
     reach_s: float | None = None,
     imu: ImuMotion = UNMOVED,
-    reckoning: Reckoning = UNRECKONED,
+    reckoning: DeadReckoning = UNRECKONED,
     touch_s: float | None = None,
     **observed: Any,
 ) -> Finding:
@@ -403,7 +408,7 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = Reckoning(unsure_s=NOW_S - 3.0)
+    silence = DeadReckoning(unsure_s=NOW_S - 3.0)
     assert ended(reach_s, reckoning=silence) is Finding.UNKNOWN
     assert ended(reach_s, reckoning=silence, touch_s=NOW_S - 1.5) is Finding.STANDS
     seen = replace(silence, sight_s=NOW_S - 2.5)
@@ -419,7 +424,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     seen = {"target": None, "position_age_s": 11.0, "imu": UNMOVED}
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
-    before = replace(before, reckoning=Reckoning(UNMOVED, below_m=below_m))
+    before = replace(before, reckoning=DeadReckoning(UNMOVED, below_m=below_m))
     entered = replace(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
     new = lander.enter_landing(Context(entered, obs, BY_TARGET), before).state
     assert new.stopped_s == NOW_S

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.mounting import MountWatch, Sight, sight_of, update_watch
+from perchctl.mission.mounting import MountingMonitor, MountSample, mount_sample, update_monitor
 from perchctl.vehicle import Command, PositionSetpoint
 from tests.helpers.mission import CEILING_M, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Motors, at, fly
@@ -32,39 +32,39 @@ def turned(deg: float) -> Seen:
     return lambda t_s, p: p + M * (TARGET - p)
 
 
-def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[MountWatch, float]:
+def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[MountingMonitor, float]:
     """Half a second still, then straight on; the watch, and how far it flew until it spoke."""
     rng = np.random.default_rng(0)
-    watch, t_s, moved_m = MountWatch(), 0.0, 0.0
-    while moved_m < way_m and not watch.wrong:
+    watch, t_s, moved_m = MountingMonitor(), 0.0, 0.0
+    while moved_m < way_m and not watch.is_wrong:
         t_s += FRAME_S
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
         spoiled = seen(t_s, p) + complex(*rng.normal(0.0, noise_m, 2))
-        watch = update_watch(watch, Sight(t_s, p, spoiled))
+        watch = update_monitor(watch, MountSample(t_s, p, spoiled))
     return watch, moved_m
 
 
 @given(st.one_of(st.floats(75, 180), st.floats(-180, -75)))
 def test_a_turned_mounting_is_seen_and_measured(deg: float) -> None:
     watch, moved_m = flown(turned(deg))
-    assert watch.wrong
+    assert watch.is_wrong
     assert moved_m < 0.17
     assert abs(math.remainder(math.degrees(watch.turn_rad) - deg, 360.0)) < 15.0
 
 
 @given(st.floats(-30, 30))
 def test_a_mounting_that_leads_to_the_target_is_left_alone(deg: float) -> None:
-    assert not flown(turned(deg))[0].wrong
+    assert not flown(turned(deg))[0].is_wrong
 
 
-def _tilting(deg: float) -> MountWatch:
+def _tilting(deg: float) -> MountingMonitor:
     """A vehicle on its place, 1.5 m below, that leans by 5 deg to all sides for four seconds."""
-    watch, reach_m = MountWatch(), 1.5 * math.tan(math.radians(5.0))
+    watch, reach_m = MountingMonitor(), 1.5 * math.tan(math.radians(5.0))
     for i in range(120):
         t_s = i * FRAME_S
         lean = reach_m * complex(math.sin(4.0 * t_s), 0.8 * math.sin(5.0 * t_s + 1.0))
-        watch = update_watch(watch, Sight(t_s, 0j, turned(deg)(t_s, lean), lean))
+        watch = update_monitor(watch, MountSample(t_s, 0j, turned(deg)(t_s, lean), lean))
     return watch
 
 
@@ -73,7 +73,7 @@ def test_a_turned_mounting_shows_in_the_vehicles_own_tilts(deg: int) -> None:
     """Before it has gone anywhere. Taken for a target that jumps, it would be looked at afresh
     with each tilt, while the vehicle flies on."""
     watch = _tilting(deg)
-    assert watch.wrong
+    assert watch.is_wrong
     assert abs(math.remainder(math.degrees(watch.turn_rad) - deg, 360.0)) < 5.0
 
 
@@ -82,7 +82,7 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
     tel = telemetry(
         1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
     )
-    sight = sight_of(1.0, tel, np.array([0.5, 0.2, 2.2]))
+    sight = mount_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
     assert sight.vehicle == pytest.approx(0.3 + 0.1j)
     assert sight.target == pytest.approx(0.5 + 0.2j)
     assert sight.lean == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
@@ -91,7 +91,7 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountWatch(against=9, turn_rad=math.pi / 2)
+    watch = MountingMonitor(against=9, turn_rad=math.pi / 2)
     flight = fly(replace(state_in(Phase.ALIGN), mount=watch, setpoint=ahead), at())
     assert flight.state.row == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
@@ -109,7 +109,7 @@ def test_a_target_that_is_moved_is_no_turned_mounting(
         over_s = max(frames * FRAME_S, 1e-6)
         return TARGET + step * min(1.0, max(0.0, (t_s - at_s) / over_s))
 
-    assert not flown(moved)[0].wrong
+    assert not flown(moved)[0].is_wrong
 
 
 @pytest.mark.parametrize(
@@ -121,11 +121,11 @@ def test_a_world_that_moves_under_both_is_no_turned_mounting(
     shift_m: Callable[[int], float],
 ) -> None:
     """The estimate moves: target and vehicle, which follows it, move alike."""
-    watch = MountWatch()
+    watch = MountingMonitor()
     for i in range(900):
         shift = shift_m(i)
-        watch = update_watch(watch, Sight(i * FRAME_S, complex(shift), TARGET + shift))
-        assert not watch.wrong
+        watch = update_monitor(watch, MountSample(i * FRAME_S, complex(shift), TARGET + shift))
+        assert not watch.is_wrong
 
 
 class Follows(Motors):

@@ -11,7 +11,7 @@ import pytest
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.conditions import OTHERWISE_MPS, contact_error
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Reckoning
+from perchctl.mission.imu import DeadReckoning
 from perchctl.mission.lander import LEAST_ORDERS
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
@@ -403,7 +403,7 @@ def gains_beside(
     """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
     felt = Felt()
     begun = felt(at()(BEGIN_S))
-    state = replace(state, last=begun.telemetry, reckoning=Reckoning(imu=begun.imu))
+    state = replace(state, last=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu))
     for t_s in times(lasts_s):
         if not state.astray:
             beside = replace(state.reckoning, beside_mps=(0.0, beside_mps))

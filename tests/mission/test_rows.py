@@ -18,9 +18,9 @@ from perchctl.mission import (
     Phase,
     planner,
 )
-from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
+from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountingMonitor
 from perchctl.mission.state import FLYING_PHASES, Severity
-from perchctl.mission.table import TABLE, Transition, first_match
+from perchctl.mission.table import TABLE, Transition, first_transition
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -168,7 +168,7 @@ CASES: dict[str, Case] = {
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
-        state={"mount": MountWatch(against=SIGHTS_IN_A_ROW)},
+        state={"mount": MountingMonitor(against=SIGHTS_IN_A_ROW)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
@@ -340,9 +340,9 @@ def test_no_row_undoes_a_landing() -> None:
     """Whatever a table says: from a landing nothing leads back into the flight."""
     landing = replace(state_in(P.LANDING), severity=Severity.LAND, orders=1)
     context = planner.Context(landing, observation(BEGIN_S), PROFILE)
-    assert first_match(context, (ROGUE,)) is None
+    assert first_transition(context, (ROGUE,)) is None
     flying = planner.Context(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
-    assert first_match(flying, (ROGUE,)) is ROGUE
+    assert first_transition(flying, (ROGUE,)) is ROGUE
 
 
 @pytest.mark.parametrize("below_m", [0.1, 0.0])

@@ -16,7 +16,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.guidance import LOWEST_M, MOST_BRAKED_MPS, POSITION_GAIN_PER_S
-from perchctl.mission.imu import Reckoning
+from perchctl.mission.imu import DeadReckoning
 from perchctl.mission.lander import (
     BRAKE_RAD_PER_MPS,
     MOST_BRAKE_RAD,
@@ -60,7 +60,7 @@ def blinded(
     z_m: float, velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes: object
 ) -> PlannerState:
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
-    reckoning = Reckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
+    reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
     state = replace(
         state_in(Phase.LANDING, z_m=z_m), blind_s=BEGIN_S, blind_height_m=z_m,
         severity=Severity.LAND, reckoning=reckoning,
@@ -180,7 +180,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     state = replace(
         state_in(Phase.LANDING, z_m=1.9), contact_z_m=1.9, released_s=BEGIN_S - 1.0,
         reach_s=BEGIN_S - 6.0, blind_s=BEGIN_S - 3.0,
-        reckoning=Reckoning(imu=imu, velocity_mps=(x_mps, y_mps, -0.5)),
+        reckoning=DeadReckoning(imu=imu, velocity_mps=(x_mps, y_mps, -0.5)),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
     obs = replace(falls(BEGIN_S + TICK_S), imu=replace(imu, t_s=BEGIN_S + TICK_S))

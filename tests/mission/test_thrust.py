@@ -136,7 +136,9 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
     for t_s in times(0.38):
         obs = at(CONTACT_Z_M, thrust=reads)(t_s)
         state = replace(
-            lander.observe(Context(state, obs, PROFILE)).state, t_s=t_s, last=obs.telemetry
+            lander.remember_observation(Context(state, obs, PROFILE)).state,
+            t_s=t_s,
+            last=obs.telemetry,
         )
     c = Context(state, obs, PROFILE)
     assert c.thrust_is_known is CONDITIONS[Condition.MAGNET_HOLDS](c) is known

@@ -14,8 +14,8 @@ from perchctl.perception.online_calibration import (
     ATTITUDE_STEP_S,
     STAMPS_S,
     ConsistencySums,
-    add_moment,
-    consistency_moment,
+    add_rows,
+    consistency_rows,
     solve_consistency,
 )
 from perchctl.profile import Profile
@@ -119,10 +119,10 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
             estimated(t_s - told_s - ATTITUDE_STEP_S),
             estimated(t_s - told_s + ATTITUDE_STEP_S),
         )
-        sums = add_moment(
+        sums = add_rows(
             sums,
             t_s,
-            *consistency_moment(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
+            *consistency_rows(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
         )
     return sums
 

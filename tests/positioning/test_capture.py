@@ -18,7 +18,7 @@ import perchctl
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.positioning import PositionFeed, open_capture
 from perchctl.positioning import capture as capture_module
-from perchctl.positioning.capture import CaptureSetup, MotionCapture, setup_of
+from perchctl.positioning.capture import CaptureSetup, MotionCapture, capture_setup
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 from tests.helpers.capture import LIBRARY
@@ -167,12 +167,12 @@ def test_it_ends_with_a_parent_that_was_killed(
 ) -> None:
     code = (
         f"import sys, time; sys.path.append({str(ROOT)!r})\n"
-        "from perchctl.positioning.capture import MotionCapture, setup_of\n"
+        "from perchctl.positioning.capture import MotionCapture, capture_setup\n"
         "from perchctl.profile.positioning import PositioningConfig\n"
         f"config = PositioningConfig(by='mocap', host={fault!r}, body='cf', connect_timeout_s=1)\n"
         "class Told(MotionCapture):\n"
         "    def _words(self): print(self._child.pid, flush=True); time.sleep(60)\n"
-        "one = Told(setup_of(config), '', 'cf'); one._words()\n"
+        "one = Told(capture_setup(config), '', 'cf'); one._words()\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
@@ -203,7 +203,7 @@ def test_a_port_goes_where_the_library_wants_it(
     system: str, host: str, options: dict[str, str]
 ) -> None:
     config = PositioningConfig.model_validate({"by": "mocap", "system": system, "host": host})
-    assert setup_of(config).options == options
+    assert capture_setup(config).options == options
 
 
 def test_the_real_library_through_its_process() -> None:

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 from perchctl.check import Verdict
-from perchctl.check.capture import save_row
+from perchctl.check.capture import save_comparison_row
 from perchctl.check.row import failed, passed, skipped, warned
 from perchctl.commands import app
 from perchctl.errors import SafetyAbort
 from perchctl.flight import session
 from perchctl.positioning import compared
-from perchctl.positioning.compared import Comparison
+from perchctl.positioning.compared import CaptureComparison
 from perchctl.profile import PositioningConfig
 from tests.helpers.capture import compared as was_compared
 
@@ -40,8 +40,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state"
 
 
-def ago(seconds: float, passes: bool = True, found: str = "fine") -> Comparison:
-    return Comparison(set_up={}, at=NOW - timedelta(seconds=seconds), passed=passes, found=found)
+def ago(seconds: float, passes: bool = True, found: str = "fine") -> CaptureComparison:
+    return CaptureComparison(
+        set_up={}, at=NOW - timedelta(seconds=seconds), passed=passes, found=found
+    )
 
 
 def require(config: PositioningConfig = CONFIG, uri: str = URI) -> None:
@@ -59,7 +61,7 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
     assert at is not None
     age_s = (NOW - at).total_seconds()  # of whole microseconds
     if min(abs(age_s - DAY_S), abs(age_s + compared.AHEAD_S)) > 1e-3:
-        found, _ = ago(seconds, passes).objection(NOW) or ("", "")
+        found, _ = ago(seconds, passes).flight_objection(NOW) or ("", "")
         assert (found == "", "yet to" in found) == (allowed, passes and age_s < -compared.AHEAD_S)
 
 
@@ -78,7 +80,7 @@ def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None
 def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
     was_compared(CONFIG, URI)
     require()
-    path = compared.path_of(CONFIG, VEHICLE)
+    path = compared.comparison_path(CONFIG, VEHICLE)
     whole = path.read_text(encoding="utf-8")
     path.unlink()
     if how == "folder":
@@ -100,7 +102,10 @@ def test_another_set_up_or_vehicle_was_never_compared(
     other = CONFIG.model_copy(update=change)
     assert compared.load_comparison(other, vehicle).at is None
     # Nor by a file that was copied to its place.
-    mine, theirs = compared.path_of(CONFIG, VEHICLE), compared.path_of(other, vehicle)
+    mine, theirs = (
+        compared.comparison_path(CONFIG, VEHICLE),
+        compared.comparison_path(other, vehicle),
+    )
     theirs.write_bytes(mine.read_bytes())
     assert compared.load_comparison(other, vehicle).at is None
 
@@ -121,12 +126,15 @@ def test_what_says_nothing_of_the_axes_and_another_dongle_are_no_other_set_up() 
 ])  # fmt: skip
 def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     was_compared(CONFIG, URI)
-    row = save_row(lifted, CONFIG, URI, datetime.now().astimezone())
+    row = save_comparison_row(lifted, CONFIG, URI, datetime.now().astimezone())
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
         require()
     for again in (passed("fine"), skipped("it was not moved")):  # which takes no pass away
-        assert save_row(again, CONFIG, URI, datetime.now().astimezone()).verdict is Verdict.PASS
+        assert (
+            save_comparison_row(again, CONFIG, URI, datetime.now().astimezone()).verdict
+            is Verdict.PASS
+        )
     require()
 
 
@@ -145,7 +153,7 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     monkeypatch.setattr(compared, "write_files", full)
     if not removable:
         monkeypatch.setattr(Path, "unlink", full)
-    row = save_row(lifted, CONFIG, URI, datetime.now().astimezone())
+    row = save_comparison_row(lifted, CONFIG, URI, datetime.now().astimezone())
     assert row.verdict is verdict
     assert "No space left" in row.found
     if removable:

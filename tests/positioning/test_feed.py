@@ -18,7 +18,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.positioning import BodyPose, CaptureFrame, FeedStatus, Placed, PositionFeed
+from perchctl.positioning import BodyPose, CaptureFrame, FeedStatus, PositionFeed, VehiclePose
 from perchctl.positioning import feed as feeding
 from perchctl.positioning.feed import QUIET_S, STALE_S
 from perchctl.profile import PositioningConfig
@@ -107,7 +107,7 @@ def test_the_marker_frame_is_turned_and_moved_into_the_body_axes(
     T_world_body = make_T(rotation_from_rpy(*body_rpy), position_m)
     T_world_rigid = T_world_body @ make_T(rotation_from_rpy(*rigid_rpy), offset_m)
     pose = BodyPose(tuple(T_world_rigid[:3, 3]), quaternion_from_rotation(T_world_rigid[:3, :3]))
-    placed = Placed.of(pose, config)
+    placed = VehiclePose.of(pose, config)
     np.testing.assert_allclose(make_T(placed.R, placed.position_m), T_world_body, atol=1e-8)
 
 

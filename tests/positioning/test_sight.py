@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Place
-from perchctl.positioning import SightFeed
+from perchctl.positioning import TargetFeed
 from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, body_place, target_place
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision import Attitude, MarkerPose
@@ -38,20 +38,20 @@ class Sent:
         return not self.busy
 
 
-def feed(sent: Sent) -> SightFeed:
-    return SightFeed(sent, TARGET_ONLY, SETUP)
+def feed(sent: Sent) -> TargetFeed:
+    return TargetFeed(sent, TARGET_ONLY, SETUP)
 
 
 def shown(
-    it: SightFeed, at: Attitude, now_s: float, believed: Attitude | None = None,
+    it: TargetFeed, at: Attitude, now_s: float, believed: Attitude | None = None,
     now: Attitude | None = None, pose: MarkerPose | None = None, at_rest: bool = True,
 ) -> None:  # fmt: skip
     """A picture from `at`, which the vehicle's estimate had at `believed`, and has it at `now`."""
     then = believed or at
-    it.see(pose or seen(TARGET, at), then, now or then, now_s, at_rest=at_rest)
+    it.add_pose(pose or seen(TARGET, at), then, now or then, now_s, at_rest=at_rest)
 
 
-def flying(sent: Sent) -> SightFeed:
+def flying(sent: Sent) -> TargetFeed:
     """With the target's place measured from the ground, at the origin."""
     it = feed(sent)
     for i in range(GROUND_FRAMES):
@@ -81,7 +81,7 @@ def test_a_body_is_where_the_target_is_seen_from(
 def test_a_touching_gear_is_in_the_targets_centre(yaw: float) -> None:
     it = feed(Sent())
     it.target = TARGET
-    place_m = it.touching(yaw)
+    place_m = it.contact_position(yaw)
     assert place_m is not None
     np.testing.assert_allclose(seen(TARGET, attitude(0.0, place_m, yaw)).e_m, 0.0, atol=1e-12)
 
@@ -95,7 +95,7 @@ def test_what_steers_is_the_true_way_whatever_the_estimate_is_beside(
     believed = attitude(1.0, (0.1 + dx, 0.2 + dy, 1.0), yaw + turned)
     it = feed(Sent())
     it.target, it.off = TARGET, Place(np.array([-dx, -dy, 0.0]), -turned)
-    target = it.steered(target_at(1.0), believed)
+    target = it.with_fixed_target(target_at(1.0), believed)
     assert target.world_m is not None
     goal_m = np.asarray(target.world_m) - np.array(believed.position_m)
     np.testing.assert_allclose(goal_m, TARGET.position_m - np.array(true.position_m), atol=1e-9)
@@ -111,13 +111,13 @@ def test_standing_it_is_at_the_origin_until_the_target_has_been_seen_often_enoug
     for i in range(GROUND_FRAMES):
         assert it.target is None
         assert it.status(i * FRAME_S).problem
-        it.stand(i * FRAME_S)
+        it.send_origin(i * FRAME_S)
         shown(it, attitude(i * FRAME_S), i * FRAME_S)
     assert {place.position_m for place in sent.places} == {(0.0, 0.0, 0.0)}
     assert it.target is not None
     np.testing.assert_allclose(it.target.position_m, TARGET.position_m, atol=1e-9)
     count = len(sent.places)
-    it.stand(2.0)
+    it.send_origin(2.0)
     assert len(sent.places) == count  # from now on the sights tell
 
 

@@ -8,10 +8,10 @@ import pytest
 import yaml
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.files import mode_of
+from perchctl.files import file_mode
 from perchctl.places import data_folder
 from perchctl.profile import load_profile, writable_profile, write_profile_values
-from perchctl.profile.edit import with_values
+from perchctl.profile.edit import replace_values
 
 MEASURED = {
     "camera.mount.rpy_deg": (-0.41, 0.9, 89.62),
@@ -32,7 +32,7 @@ def at(values: object, dotted: str) -> object:
 def test_only_the_numbers_change(path: Path) -> None:
     """All comments and all other lines of a profile stay, in their order."""
     old = path.read_text(encoding="utf-8")
-    new = with_values(old, MEASURED)
+    new = replace_values(old, MEASURED)
     for dotted, value in MEASURED.items():
         assert at(yaml.safe_load(new), dotted) == value
     changed = [line for line in old.splitlines() if line not in new.splitlines()]
@@ -55,8 +55,8 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_every_layout_takes_them(name: str) -> None:
     old = LAYOUTS[name]
-    new = with_values(old, MEASURED)
-    assert with_values(new, MEASURED) == new
+    new = replace_values(old, MEASURED)
+    assert replace_values(new, MEASURED) == new
     kept = [line.partition("#")[2] for line in old.splitlines() if "#" in line]
     assert [line.partition("#")[2] for line in new.splitlines() if "#" in line] == kept
 
@@ -66,11 +66,11 @@ def test_an_alias_is_not_written_through() -> None:
     shared = "camera: {latency_s: &late 0.1}\nsimulation: {camera_jitter_s: *late}\n"
     behind = "kalman: {k1: &late 0.1}\ncamera: {latency_s: *late}\n"
     for text, other in ((shared, "simulation.camera_jitter_s"), (behind, "kalman.k1")):
-        values = yaml.safe_load(with_values(text, {"camera.latency_s": 0.09}))
+        values = yaml.safe_load(replace_values(text, {"camera.latency_s": 0.09}))
         assert (at(values, "camera.latency_s"), at(values, other)) == (0.09, 0.1)
     lists = "camera: {mount: {rpy_deg: &same [0, 0, 1]}}\nplanner: {unread: *same}\n"
     with pytest.raises(ValueError, match="layout"):
-        with_values(lists, {"camera.mount.rpy_deg": (0.0, 0.0, 2.0)})
+        replace_values(lists, {"camera.mount.rpy_deg": (0.0, 0.0, 2.0)})
 
 
 def test_the_old_file_is_kept_beside_and_never_lost(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_permissions_stay_and_the_old_text_is_for_the_same_eyes(tmp_path: Path) 
         path.write_text("extends: sim\nplanner: {ascend: {near_m: 0.35}}\n", encoding="utf-8")
         path.chmod(mode)
         aside = write_profile_values(path, {"camera.latency_s": 0.09})
-        assert (mode_of(path), mode_of(aside)) == (mode, mode)
+        assert (file_mode(path), file_mode(aside)) == (mode, mode)
 
 
 def test_a_read_only_or_a_shipped_profile_is_not_written_to(

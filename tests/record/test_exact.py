@@ -16,20 +16,20 @@ from hypothesis import strategies as st
 from perchctl.errors import InvalidValue
 from perchctl.mission import (
     ExternalPositions,
-    FrameSeen,
+    FrameRecord,
     Observation,
     Operator,
     Outcome,
     Phase,
-    PoseSeen,
     SentCommand,
     Turn,
     TurnInputs,
+    UnfilteredPose,
 )
 from perchctl.mission.state import Condition
-from perchctl.record import from_exact, to_exact
-from perchctl.record.exact import decode_line, encode, to_plain
-from perchctl.record.read import exact_of, turn_of
+from perchctl.record import from_exact_json, to_exact_json
+from perchctl.record.exact import decode_line, encode, to_rounded_json
+from perchctl.record.read import parse_exact, parse_turn
 from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (
     EmergencyStop,
@@ -63,8 +63,8 @@ def bits(value: Any) -> Any:
 
 
 def comes_back(kind: Any, value: Any) -> bool:
-    text = json.dumps(to_exact(value), allow_nan=False)
-    return bool(bits(from_exact(kind, json.loads(text))) == bits(value))
+    text = json.dumps(to_exact_json(value), allow_nan=False)
+    return bool(bits(from_exact_json(kind, json.loads(text))) == bits(value))
 
 
 @given(vectors, vectors, st.none() | vectors, floats, st.sampled_from(Operator))
@@ -122,8 +122,8 @@ def whole_turn() -> Turn:
     sample = synthetic.telemetry(1.0, 0.3)
     return Turn(
         7, "redone", 1.0, 1.3, TurnInputs((replace(sample, t_s=0.9), sample), look=False,
-        frame=FrameSeen(3, 0.9, 0.95, "woven", True, 12)),
-        {"joint": PoseSeen(0.9, np.ones(3), 0.1)},
+        frame=FrameRecord(3, 0.9, 0.95, "woven", True, 12)),
+        {"joint": UnfilteredPose(0.9, np.ones(3), 0.1)},
         Observation(1.3, sample, synthetic.target(1.0, 1.0)), Land(0.0, 2.0),
         Phase.LANDING, "fence", True, 2, ExternalPositions(0.1, None, 3, 99.0, None),
         Outcome.SAFETY, "beyond the fence", "KeyError",
@@ -135,12 +135,12 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
     line = turn_line(turn)
     assert line.count(b"\n") == 1
     assert line.count(b"position_m") == 2  # the newest sample stands there once
-    assert bits(turn_of(decode_line(line))) == bits(turn)
+    assert bits(parse_turn(decode_line(line))) == bits(turn)
     # A sample that was left out as nonsense is the newest of its turn all the same.
     assert turn.observation is not None
     older = replace(turn.observation, telemetry=turn.taken.samples[0])
     turn = replace(turn, observation=older)
-    assert bits(turn_of(decode_line(turn_line(turn)))) == bits(turn)
+    assert bits(parse_turn(decode_line(turn_line(turn)))) == bits(turn)
 
 
 @pytest.mark.parametrize(
@@ -152,9 +152,9 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
     """In a turn, and sent in the loop's place. Three kinds have no field at all."""
     assert comes_back(Turn, Turn(0, "flown", 0.0, 0.0, TurnInputs(), command=command))
     line = sent_line(sent := SentCommand(0.1 + 0.2, "watchdog", command))
-    assert bits(exact_of(SentCommand, decode_line(line))) == bits(sent)
+    assert bits(parse_exact(SentCommand, decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
-        exact_of(SentCommand, decode_line(line) | {"t_s": "soon"})
+        parse_exact(SentCommand, decode_line(line) | {"t_s": "soon"})
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_a_command_of_each_kind_comes_back(command: Any) -> None:
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
     record = decode_line(turn_line(whole_turn())) | changes
     with pytest.raises(InvalidValue, match=r"turn at .* s cannot be read") as caught:
-        turn_of(record)
+        parse_turn(record)
     assert why in str(caught.value)
 
 
@@ -178,16 +178,16 @@ def test_a_turn_of_an_earlier_version_comes_back() -> None:
     """A field that is missing has its default; one that is no more is passed over."""
     record = decode_line(turn_line(whole_turn())) | {"timing": {"planner_s": 0.001}}
     del record["attempts"]
-    assert turn_of(record).attempts == 0
+    assert parse_turn(record).attempts == 0
     del record["began_s"]
     with pytest.raises(InvalidValue, match="began_s"):
-        turn_of(record)
+        parse_turn(record)
 
 
 @pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()])])
 def test_what_has_no_exact_form_is_refused(value: Any) -> None:
     with pytest.raises(TypeError, match="no exact form"):
-        to_exact([value])
+        to_exact_json([value])
 
 
 # --- rounded, one line a record ---------------------------------------------------------
@@ -219,5 +219,5 @@ def test_encoding_is_one_line_and_stable(record: dict[str, Any]) -> None:
     line = encode(record)
     assert line.count(b"\n") == 1
     back = decode_line(line)
-    assert back == {k: v for k, v in to_plain(record).items() if v is not None}
+    assert back == {k: v for k, v in to_rounded_json(record).items() if v is not None}
     assert encode(back) == line

@@ -14,7 +14,7 @@ import pytest
 from perchctl.mission import ExternalPositions, Phase, PlannerState
 from perchctl.mission.state import BatteryOutlook
 from perchctl.record import LogWatcher, path_beside, read_log
-from perchctl.record.exact import to_plain
+from perchctl.record.exact import to_rounded_json
 from perchctl.record.fields import FIELDS, tick_record
 from perchctl.record.messages import TICK_SCHEMA
 from perchctl.record.write import log_path
@@ -53,7 +53,7 @@ def test_a_flight_comes_back(tmp_path: Path, live: bool) -> None:
     assert len(log.records) == len(written)
     for back, record in zip(log.records, written, strict=True):
         assert list(back) == list(FIELDS)
-        assert back == to_plain(record)
+        assert back == to_rounded_json(record)
     assert log.events == [
         {"t_s": 1.5, "event": "hold", "phase": "ALIGN", "severity": "hold", "reason": "no picture"}
     ]
@@ -111,7 +111,7 @@ def test_every_field_is_filled_by_something() -> None:
         record = tick_record(tick, (0.0, 0.0, 1.0), 0.01)
         seen |= {key for key, value in record.items() if value is not None}
         assert record["cmd"] == name
-        for key, value in to_plain(record).items():
+        for key, value in to_rounded_json(record).items():
             kind: Any = TICK_SCHEMA["properties"][key]  # type: ignore[index]
             assert value is None or type(value) in KINDS[kind["type"]], key
         height_m = {"land": -0.05, "position": 3.0}.get(name)

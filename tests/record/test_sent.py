@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.analysis import FlightAnalysis, show_record, show_text
-from perchctl.analysis.story import story_of
+from perchctl.analysis.story import tell_story
 from perchctl.flight import fly
 from perchctl.flight.watchdog import rescue
 from perchctl.mission import Operator, SentCommand
@@ -51,7 +51,7 @@ def test_what_one_sends_in_one_go_is_told_together(log: Path) -> None:
     assert starts_s == pytest.approx([4.0, 6.8, 9.0, 9.5])
     assert "watchdog  position setpoint (2), land (1)" in show_text(flight)
     assert show_record(flight)["sent"][0]["commands"] == {"position setpoint": 2, "land": 1}
-    told = [s for s in story_of(flight) if "took over" in s.text]
+    told = [s for s in tell_story(flight) if "took over" in s.text]
     assert [s.t_s + read.start_s for s in told] == pytest.approx([4.0, 6.8, 9.0])
     assert told[0].text.endswith("for 0.7 s: position setpoint (2), land (1)")
     assert told[2].grade == "bad"

@@ -44,7 +44,7 @@ def recorded(folder: Path, seed: int) -> Replay:
 
 def check_seen(found: Replay) -> None:
     assert found.seen is not None
-    assert (found.differences, found.seen.differences, found.seen.ended) == ([], [], "")
+    assert (found.differences, found.seen.differences, found.seen.end_reason) == ([], [], "")
     assert found.seen.frames > 50
 
 
@@ -53,7 +53,7 @@ def check_seen(found: Replay) -> None:
 def test_a_flight_replays(tmp_path: Path, faults: tuple[str, ...]) -> None:
     found = flown(tmp_path, 101, faults)
     assert found is not None
-    assert found.same, found.differences
+    assert found.is_identical, found.differences
     assert found.ticks > 100
 
 
@@ -73,7 +73,7 @@ def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
 def test_seeded_flights_replay(tmp_path: Path, seed: int) -> None:
     found = flown(tmp_path, seed)
     assert found is not None
-    assert found.same, found.differences
+    assert found.is_identical, found.differences
 
 
 @pytest.mark.campaign
@@ -85,7 +85,7 @@ def test_seeded_flights_with_faults_replay(tmp_path: Path) -> None:
         folder = tmp_path / str(seed)
         folder.mkdir()
         found = flown(folder, seed, EVERY_FAULT)
-        assert found is None or found.same, (seed, found.differences)
+        assert found is None or found.is_identical, (seed, found.differences)
         replayed += found is not None and found.ticks > 0
     assert replayed >= LEAST_REPLAYED
 

@@ -14,7 +14,7 @@ import pytest
 
 import perchctl
 from perchctl.analysis import replay
-from perchctl.analysis.decide import first_differing
+from perchctl.analysis.decide import field_difference
 from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.mission import Turn, guidance, step_mission
@@ -62,7 +62,7 @@ def test_a_changed_constant_is_named_by_tick_and_field(monkeypatch: pytest.Monke
     assert first.recorded != first.replayed
     assert first.recorded == pytest.approx(first.replayed, abs=1e-12)
     at = next(each for each in found.decided if each.difference is not None)
-    assert (first.tick, first.t_s) == (at.tick, log.since(at.turn.t_s))
+    assert (first.tick, first.t_s) == (at.tick, log.to_flight_s(at.turn.t_s))
     assert len(found.differences) <= found.ticks
     (said,) = [line for line in found.lines() if "command.z_m was" in line]
     assert repr(first.replayed) in said
@@ -86,7 +86,7 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     assert (said.tick, said.field) == (first, "reason")
     assert "hanging" in said.replayed
     assert old.header["version"] == 3
-    assert replay(old).same
+    assert replay(old).is_identical
 
 
 @pytest.mark.parametrize(
@@ -102,12 +102,12 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     ],
 )
 def test_the_first_field_is_named(one: Any, other: Any, name: str) -> None:
-    found = first_differing("c", one, other)
+    found = field_difference("c", one, other)
     assert found is not None
     assert found[0] == name
     assert json.dumps(found[1]) != json.dumps(found[2])
-    assert first_differing("c", one, one) is None
-    assert first_differing("c", float("nan"), float("nan")) is None
+    assert field_difference("c", one, one) is None
+    assert field_difference("c", float("nan"), float("nan")) is None
 
 
 @pytest.mark.parametrize(("field", "value"), [("row", "fence"), ("held", True), ("attempts", 9)])
@@ -129,7 +129,7 @@ def test_of_a_killed_flight_what_is_there_is_replayed(tmp_path: Path, name: str)
     plain = b"".join(lines[:300]) + lines[300][:200]
     path.write_bytes(PERCHED.read_bytes()[:70_000] if name.endswith(".gz") else plain)
     found = replay(read_log(path))
-    assert found.same
+    assert found.is_identical
     assert found.ticks > 100
     assert any("ends in the flight" in note for note in found.notes)
 
@@ -148,7 +148,7 @@ def test_a_lost_record_ends_the_replay_and_another_version_is_said(tmp_path: Pat
     """What the planner remembered of a lost turn is not known."""
     lines = lines_of()
     found = replay(read_log(log_of(tmp_path, [*lines[:200], *lines[205:]])))
-    assert found.same
+    assert found.is_identical
     assert found.ticks < 200
     assert any("is not in the log" in note for note in found.notes)
     lines[0] = altered(lines[0], perchctl="0.0.9")

@@ -54,6 +54,6 @@ def test_a_flight_in_real_time_replays(tmp_path: Path) -> None:
     log = read_log(path)
     found = replay(log, recorded_pictures(path))
     assert found.seen is not None
-    assert (found.differences, found.seen.differences, found.seen.ended) == ([], [], "")
+    assert (found.differences, found.seen.differences, found.seen.end_reason) == ([], [], "")
     assert found.ticks > 100
     assert found.seen.frames > 50

@@ -23,7 +23,7 @@ import pytest
 
 from perchctl.analysis import replay
 from perchctl.analysis.replayer import Replay
-from perchctl.record import recorded_pictures, to_exact
+from perchctl.record import recorded_pictures, to_exact_json
 from perchctl.vision import filter as the_filter
 from perchctl.vision import pose
 from perchctl.vision.markers import edge_fit
@@ -56,7 +56,7 @@ def beyond(found: Replay) -> list[tuple[int, str, Any, Any]]:
             (each.turn.poses, each.poses),
             (_target(each.turn.observation), _target(each.observation)),
         )
-        for far in _far("", to_exact(one), to_exact(other))
+        for far in _far("", to_exact_json(one), to_exact_json(other))
     ]
 
 
@@ -81,7 +81,7 @@ def _far(name: str, one: Any, other: Any) -> Iterator[tuple[str, Any, Any]]:
 def test_the_pictures_show_what_they_showed() -> None:
     found = seen_again()
     assert found.seen is not None
-    assert (found.seen.frames, found.seen.ended) == (PICTURES, "")
+    assert (found.seen.frames, found.seen.end_reason) == (PICTURES, "")
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
     if not found.log.computer_differences:
         assert not found.seen.differences, f"{found.seen.differences[0].text}; {ANEW}"
@@ -112,7 +112,7 @@ def test_a_changed_constant_of_the_pipeline_is_noticed(
     """By 1 in 1000: on this computer, and on one where the last bits are others."""
     monkeypatch.setattr(module, name, getattr(module, name) * 1.001)
     found = seen_again()
-    assert not found.same
+    assert not found.is_identical
     assert beyond(found)
 
 

@@ -79,8 +79,8 @@ def test_what_was_seen_is_seen_again(flight: tuple[FlightLog, list[Picture]]) ->
     log, pictures = flight
     found = seen_again(log, pictures)
     assert found.seen is not None
-    assert (found.differences, found.seen.differences, found.seen.ended) == ([], [], "")
-    assert found.same
+    assert (found.differences, found.seen.differences, found.seen.end_reason) == ([], [], "")
+    assert found.is_identical
     assert len(found.seen.turns) == len(log.turns)
     assert found.ticks == len(log.records)
     assert any(turn.role == "waiting" for turn in log.turns)
@@ -98,10 +98,10 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
     redone = [turn for turn in log.turns if turn.role == "redone"]
     assert redone
     found = seen_again(log, pictures)
-    assert found.same
+    assert found.is_identical
     assert found.ticks == len(log.records) == len(found.decided) - len(redone)
     assert found.seen is not None
-    assert not found.seen.ended
+    assert not found.seen.end_reason
 
 
 def test_a_source_that_ends_does_so_again(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_a_source_that_ends_does_so_again(tmp_path: Path) -> None:
     log, pictures = flown(tmp_path, Rig(camera=Camera(frames=40)))
     observed = [turn.observation for turn in log.turns if turn.observation is not None]
     assert observed[-1].camera_problem == "the scripted camera has ended"
-    assert seen_again(log, pictures).same
+    assert seen_again(log, pictures).is_identical
 
 
 def test_with_another_latency_the_pictures_are_of_another_time(
@@ -132,7 +132,7 @@ def test_with_another_latency_the_pictures_are_of_another_time(
         log, flight[1], changed_profile(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup
     )
     assert found.seen is not None
-    assert not found.seen.ended
+    assert not found.seen.end_reason
     assert given_s == pytest.approx([t_s - 0.02 for t_s in as_flown_s])
     assert given_s
 
@@ -170,9 +170,9 @@ def test_what_is_wrong_with_the_pictures_ends_them_and_not_the_planner_s_replay(
     log, pictures = begun(flight[0]), flight[1]
     found = replay(log, change(pictures), pipeline=Rig().setup)
     assert found.seen is not None
-    assert why in found.seen.ended
-    assert found.seen.ended in found.notes
-    assert (found.differences, found.seen.differences, found.same) == ([], [], same)
+    assert why in found.seen.end_reason
+    assert found.seen.end_reason in found.notes
+    assert (found.differences, found.seen.differences, found.is_identical) == ([], [], same)
     assert abs(found.seen.frames - frames) <= 5  # a repeated one is a frame, and no picture
     assert len(found.seen.turns) < len(log.turns) == 50
     assert found.ticks > 20  # the planner needs no picture
@@ -195,4 +195,4 @@ def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -
     assert found.seen is not None
     (differs,) = found.seen.differences
     assert (differs.tick, differs.field) == (10, "camera_age_s")
-    assert not found.same
+    assert not found.is_identical

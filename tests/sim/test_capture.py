@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.positioning import CaptureFrame, Placed
+from perchctl.positioning import CaptureFrame, VehiclePose
 from perchctl.profile import PositioningConfig
 from perchctl.sim import CaptureFault, CaptureSettings
 from perchctl.sim.capture import SimCapture
@@ -75,7 +75,7 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
     R = rotation_from_rpy(0.1, -0.2, 1.3)
     seen = watched(SimCapture(settings), 0.5, Room(quaternion=quaternion_from_rotation(R)))[-1]
     config = PositioningConfig(by="mocap", body_rpy_deg=rpy_deg, body_position_m=offset_m)
-    placed = Placed.of(seen.bodies["crazyflie"], config)
+    placed = VehiclePose.of(seen.bodies["crazyflie"], config)
     assert placed.position_m == pytest.approx(AT)
     assert np.allclose(placed.R, R, atol=1e-6)
 
@@ -109,9 +109,9 @@ def test_an_occluded_body_is_missing_for_its_time_only() -> None:
 def test_frozen_bodies_stay_to_the_last_digit_until_they_are_healed() -> None:
     room, capture = Room(), SimCapture(replace(EXACT, position_noise_m=0.001))
     watched(capture, 0.3, room)
-    capture.lay(CaptureFault(frozen=True))
+    capture.begin_fault(CaptureFault(frozen=True))
     room.x_m = 1.0
     frozen = watched(capture, 0.3, room)[5:]
     assert len({frame.bodies["crazyflie"].position_m for frame in frozen}) == 1
-    capture.heal()
+    capture.end_faults()
     assert watched(capture, 0.3, room)[-1].bodies["crazyflie"].position_m[0] > 0.9

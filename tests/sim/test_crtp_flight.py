@@ -34,7 +34,7 @@ LIFTED_M = 0.022  # 1 cm over the floor
 
 def lose(pilot: Pilot, send: Callable[[], None]) -> None:
     """One packet (or one burst of them) that never arrives."""
-    pilot.sim.silence(PACKET_S)
+    pilot.sim.silence_link(PACKET_S)
     send()
     pilot.advance(0.01)
 
@@ -436,7 +436,7 @@ def test_an_ordered_take_off_needs_no_link(pilot: Pilot) -> None:
     pilot.unlock()
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(0.25)
-    pilot.sim.silence(35.0)
+    pilot.sim.silence_link(35.0)
     for _ in range(7):
         pilot.sim.advance(5.0)
         assert height(pilot) == pytest.approx(0.5, abs=0.1)

@@ -274,7 +274,7 @@ def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
 
 def test_a_lost_packet_hangs_cflibs_connect(spoiled: SimProcess) -> None:
     """Row "UdpDriver sets needs_resending=False: with loss a connect can hang for ever"."""
-    spoiled.silence(0.01)
+    spoiled.silence_link(0.01)
     with contextlib.closing(Client(spoiled.uri, None)) as client:
         assert not client.connect(wait_s=0.3)  # its first packet was lost
         spoiled.advance(0.1)
@@ -288,7 +288,7 @@ def test_a_silent_peer_is_never_reported(pilot: Pilot) -> None:
     """Row "a silent peer is never reported": no answer, no error; then it is back."""
     lost: list[str] = []
     pilot.cf.connection_lost.add_callback(lambda _, why: lost.append(why))
-    pilot.sim.silence(1.0)
+    pilot.sim.silence_link(1.0)
     assert not pilot.echo(5, wait_s=0.3)
     pilot.sim.advance(1.0)
     pilot.t_s = round(pilot.t_s + 1.0, 6)

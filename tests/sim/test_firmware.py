@@ -49,7 +49,7 @@ def test_a_reboot_keeps_no_parameter_and_no_unlock() -> None:
     rig = make_rig()
     firmware = rig.firmware
     firmware.set_parameter("posCtlPid.thrustBase", 52000)
-    firmware.low_level(raw_thrust(0))  # unlocks the thrust
+    firmware.fly_setpoint(raw_thrust(0))  # unlocks the thrust
     firmware.reboot()
     assert firmware.t_s == 0.0
     assert firmware.get_parameter("posCtlPid.thrustBase") == 36000
@@ -85,7 +85,7 @@ def test_drift_runs_from_the_first_take_off_and_moves_the_vehicle() -> None:
 
 def test_with_a_deck_external_positions_count_for_nothing() -> None:
     rig = make_rig()
-    rig.firmware.external((5.0, 5.0, 5.0), (1.0, 0.0, 0.0, 0.0))
+    rig.firmware.take_external((5.0, 5.0, 5.0), (1.0, 0.0, 0.0, 0.0))
     rig.run(2.0)
     assert rig.firmware.log_value("kalman.varPX") < 1e-3
     assert abs(rig.firmware.log_value("stateEstimate.x")) < 0.02
@@ -108,9 +108,9 @@ def feed(rig: Rig, seconds: float, scale: float = 1.0, stream: Setpoint | None =
     """Send the true position, in units of `1 / scale` m, at 100 Hz."""
     for i in range(round(seconds / 0.01)):
         if stream is not None and i % 2 == 0:
-            rig.firmware.low_level(stream)
+            rig.firmware.fly_setpoint(stream)
         world = rig.world
-        rig.firmware.external((scale * world.x_m, scale * world.y_m, scale * world.z_m))
+        rig.firmware.take_external((scale * world.x_m, scale * world.y_m, scale * world.z_m))
         for _ in range(5):
             rig.firmware.step()
 
@@ -143,8 +143,8 @@ def test_what_is_no_number_does_no_harm() -> None:
     rig = deckless()
     feed(rig, 0.5)
     for number in (math.nan, math.inf):
-        rig.firmware.external((number, 0.0, 0.0))
-        rig.firmware.external((0.0, 0.0, number), (0.0, number, 0.0, 0.0))
+        rig.firmware.take_external((number, 0.0, 0.0))
+        rig.firmware.take_external((0.0, 0.0, number), (0.0, number, 0.0, 0.0))
     feed(rig, 0.1)
     assert np.linalg.norm(errors_m(rig)) < 0.01
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
-from perchctl.sim.powertrain import MOTOR_FORCE_N, STANDSTILL_V, Cell, motor_v, thrust_n
+from perchctl.sim.powertrain import MOTOR_FORCE_N, STANDSTILL_V, Cell, motor_voltage, thrust_n
 
 HOVER_A = 3.8
 LEVELS_V = (3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
@@ -19,13 +19,13 @@ LEVELS_V = (3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
 
 @given(st.floats(0.001, 0.3))
 def test_the_inverse_undoes_the_curve(newtons: float) -> None:
-    assert thrust_n(motor_v(newtons)) == pytest.approx(newtons, rel=1e-9)
+    assert thrust_n(motor_voltage(newtons)) == pytest.approx(newtons, rel=1e-9)
 
 
 def test_the_dead_band() -> None:
     assert pytest.approx(0.455, abs=0.001) == STANDSTILL_V
     assert thrust_n(STANDSTILL_V) == thrust_n(0.1) == 0.0
-    assert thrust_n(motor_v(MOTOR_FORCE_N)) == pytest.approx(MOTOR_FORCE_N)
+    assert thrust_n(motor_voltage(MOTOR_FORCE_N)) == pytest.approx(MOTOR_FORCE_N)
     assert MotorDriver().pwm((6999.0,) * 4, 4.1) is MOTORS_OFF
     assert pytest.approx(7000, abs=1) == THRUST_MIN
 

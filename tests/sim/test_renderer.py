@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Neighbour, Renderer, Scenario
-from perchctl.sim.optics import lens_of
+from perchctl.sim.optics import shared_lens
 from perchctl.target.drawing import marker_corners_m
 from perchctl.vision import CameraModel
 
@@ -110,7 +110,7 @@ def corner_errors_px(
 
 def evenly_lit(image: NDArray[np.uint8], camera: CameraModel) -> NDArray[np.uint8]:
     """The picture without the lens's shade."""
-    return np.clip(image * (255.0 / lens_of(camera).shade), 0, 255).astype(np.uint8)
+    return np.clip(image * (255.0 / shared_lens(camera).shade), 0, 255).astype(np.uint8)
 
 
 def read_ids(image: NDArray[np.uint8]) -> list[int]:

@@ -16,7 +16,7 @@ from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target import Board, draw_target, parse_length
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.prints import PrintCheck, size_ratio
-from perchctl.target.reading import PlainReader, check_target
+from perchctl.target.reading import ArucoReader, check_target
 from perchctl.target.sheets import parse_page
 from perchctl.vision import CameraModel
 from tests.target.rig import target_of
@@ -192,7 +192,7 @@ def test_rectangles_are_disjoint_and_the_area_is_the_raster_s_at_any_resolution(
 def test_any_two_ids_are_both_read_from_the_bitmap(target: TargetConfig) -> None:
     """The white ring leaves the large marker readable and makes the small one so."""
     image = draw_target(target).bitmap(480.0 / target.large.side_m)
-    assert set(PlainReader(target).read(image)) == {"large", "small"}
+    assert set(ArucoReader(target).read(image)) == {"large", "small"}
 
 
 # --- the ratio of the two prints, and when it is named an error ----------------------------------

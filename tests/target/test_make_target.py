@@ -19,7 +19,7 @@ from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import TargetConfig, load_profile
 from perchctl.target import Board, board_pdf, target_pdf
-from perchctl.target.reading import PlainReader
+from perchctl.target.reading import ArucoReader
 from perchctl.target.sheets import parse_page
 from tests.target.rig import sized
 
@@ -82,7 +82,7 @@ def test_the_pdf_at_600_dpi_is_read_and_true_to_size(page: str) -> None:
     front, back = page_picture(pdf, 0), page_picture(pdf, 1)
     assert front.shape == pytest.approx((height * PX_PER_MM, width * PX_PER_MM), abs=1.0)
     centre = np.array([width, height]) / 2.0
-    found = PlainReader(TARGET).read(front)
+    found = ArucoReader(TARGET).read(front)
     assert set(found) == {"large", "small"}
     for name, side_mm in (("large", 150.0), ("small", 25.0)):
         rough = found[name]  # type: ignore[index]

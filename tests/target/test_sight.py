@@ -24,9 +24,9 @@ from perchctl.target.sight import (
     BlindRange,
     FieldOfView,
     blind_range,
+    circle_outline,
     overhead_reach_m,
     square_outline,
-    turned_outline,
 )
 from perchctl.vision import project, square_corners
 from tests.helpers.flights import short_profile
@@ -206,7 +206,7 @@ def test_the_paper_s_ranges_and_where_they_differ(paper_design: TargetDesign) ->
 
 def test_z3_is_the_geometry_s() -> None:
     view = FieldOfView(PAPER_CAMERA, margin_px=0.0)
-    upright, turned = square_outline(0.15), turned_outline(0.15)
+    upright, turned = square_outline(0.15), circle_outline(0.15)
     nearest_m = 0.15 * 380.0 / 480.0
     assert view.nearest_m(upright, *AHEAD) == pytest.approx(nearest_m, rel=2e-3)
     assert view.nearest_m(turned, *AHEAD) == pytest.approx(math.sqrt(2.0) * nearest_m, rel=2e-3)

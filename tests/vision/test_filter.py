@@ -31,7 +31,7 @@ from perchctl.vision.filter import (
     start_track,
     step_track,
 )
-from perchctl.vision.pipeline import follow
+from perchctl.vision.pipeline import step_detections
 from perchctl.vision.target_selection import measurement
 from perchctl.vision.types import MarkerTrack
 from tests.helpers.seen import seen_from
@@ -177,7 +177,7 @@ def errors(setup: Pipeline, in_world: bool, bias_rad: float, scale: float) -> Ar
                 here = (float(position[0]), float(position[1]), float(position[2]))
                 attitude = Attitude(k / HZ, roll + bias_rad, pitch - bias_rad, yaw, here)
             seen = seen_from(T, TARGET_M, k / HZ, rng, scale=scale)
-            state, output = follow(state, seen, attitude, setup)
+            state, output = step_detections(state, seen, attitude, setup)
             target, pose = output.target, next(iter(output.poses.values()), None)
             if target is None or pose is None:
                 continue

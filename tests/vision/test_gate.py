@@ -15,12 +15,12 @@ from perchctl.geometry import make_T, rot_z, rotation_from_rpy
 from perchctl.profile import KalmanConfig, MergeConfig
 from perchctl.vision import Attitude, MarkerPose, Pipeline, PipelineOutput, PipelineState
 from perchctl.vision.filter import Measurement, make_filter
-from perchctl.vision.pipeline import follow
+from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import (
     ESTABLISHED_FRAMES,
     FORGET_S,
     REACQUIRE_S,
-    Sight,
+    FramePose,
     _is_clear,
     judged,
 )
@@ -61,7 +61,7 @@ class Watch:
                 jx, jy, jz = self.jumped_m
                 here = (x + jx, y + jy, z + jz)
                 attitude = Attitude(t, 0.02 * np.sin(2 * t), 0.0, yaw, here)
-            self.state, output = follow(self.state, seen, attitude, self.setup)
+            self.state, output = step_detections(self.state, seen, attitude, self.setup)
             outputs.append(output)
             self.k += 1
         return outputs
@@ -120,7 +120,9 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
         1.0, 0.0,
     )  # fmt: skip
     z = np.array([off_rad, *off_m])
-    sight = Sight(0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True)
+    sight = FramePose(
+        0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
+    )
     constants = make_filter(KalmanConfig(), in_world=True)
     stranger = Stranger(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
     lock = Lock(track=track, pose=pose, in_world=True, frames=9, whole=True)
@@ -262,5 +264,5 @@ def test_of_two_targets_in_view_one_is_told(build: Build) -> None:
     watch.show(LOCKED)
     T = make_T(rot_z(0.0), TARGET_M - [0.0, 0.0, RANGE_M])
     seen = seen_from(T, TARGET_M, watch.k / HZ, watch.rng)
-    _, output = follow(watch.state, replace(seen, targets=2), None, watch.setup)
+    _, output = step_detections(watch.state, replace(seen, targets=2), None, watch.setup)
     assert "more than one target in view" in output.lock_note

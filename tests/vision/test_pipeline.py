@@ -42,7 +42,7 @@ from perchctl.vision import (
     estimate,
     step,
 )
-from perchctl.vision.tracks import expected_corners, update_sight
+from perchctl.vision.tracks import expected_corners, update_sighting
 from perchctl.vision.types import Sighting, Stage
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -314,7 +314,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
             points = SETUP.corners_m["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())
-        sight = update_sight(sight, pose, attitude, SETUP)
+        sight = update_sighting(sight, pose, attitude, SETUP)
 
 
 def rms(values: list[float]) -> float:

@@ -23,7 +23,7 @@ from perchctl.geometry import (
     wrap_rad,
 )
 from perchctl.profile import KalmanConfig, PoseConfig, TargetConfig
-from perchctl.sim.renderer import spoil
+from perchctl.sim.renderer import add_analogue_faults
 from perchctl.vision import (
     Attitude,
     Frame,
@@ -37,7 +37,7 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.filter import PRINT, make_filter
-from perchctl.vision.merge import disagree
+from perchctl.vision.merge import markers_disagree
 from perchctl.vision.pose import normal_cam
 from perchctl.vision.target_selection import measurement
 from perchctl.vision.types import Detection
@@ -319,7 +319,7 @@ def test_a_wrong_print_excuses_no_gap_between_the_markers() -> None:
     large = solved(["large"], setup, place)
     smaller = solved(["small"], setup, (0.0, 0.0, 1.0, 0.0, 0.05, -0.04))
     assert np.abs(large.e_m - smaller.e_m).max() < 4.0 * large.sigma_m.max()
-    assert disagree(large, smaller, 0.03)
+    assert markers_disagree(large, smaller, 0.03)
 
 
 def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
@@ -389,6 +389,6 @@ def test_the_claimed_spread_is_the_error_s_where_rows_shake(build: Build) -> Non
 
     def picture(rvec: Array, tvec: Array, k: int) -> NDArray[np.uint8]:
         clean = render(rvec, tvec, blur_px=0.8, noise=2.0, seed=k)
-        return spoil(clean, 0.3, np.random.default_rng(k))
+        return add_analogue_faults(clean, 0.3, np.random.default_rng(k))
 
     assert squared(build(target=TRUE_PRINT), 0.3, 0.6, picture, 24) < 1.5

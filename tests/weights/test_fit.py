@@ -15,7 +15,7 @@ from tests.helpers.weights_data import BEST, independent, known, measured
 
 
 def fitted(data: Measurements) -> np.ndarray:
-    return fit.closed_form(fit.errors_of(data).sums.sum(axis=1))
+    return fit.closed_form(fit.marker_errors(data).sums.sum(axis=1))
 
 
 def test_the_closed_form_finds_the_known_weights() -> None:
@@ -25,7 +25,7 @@ def test_the_closed_form_finds_the_known_weights() -> None:
 
 def test_it_is_the_regression_that_numpy_finds() -> None:
     data = independent(3)
-    errors = fit.errors_of(data)
+    errors = fit.marker_errors(data)
     for k in range(4):
         d = errors.large[:, k] - errors.small[:, k]
         design = np.column_stack([d, np.ones_like(d)])
@@ -37,7 +37,7 @@ def test_it_is_the_regression_that_numpy_finds() -> None:
 @given(start=st.floats(0.0, 1.0), seed=st.integers(0, 50), best=st.floats(0.05, 0.95))
 def test_lms_ends_at_the_closed_form_from_any_start(start: float, seed: int, best: float) -> None:
     for data in (known(seed, np.full(4, best)), independent(seed)):
-        weights, _ = fit.lms(fit.errors_of(data), start)
+        weights, _ = fit.lms(fit.marker_errors(data), start)
         assert np.abs(weights - fitted(data)).max() < 0.01
 
 
@@ -46,7 +46,7 @@ def test_lms_without_a_position_is_lms_of_the_others() -> None:
     rest = data.position != 1
     errors = (data.large - data.actual)[rest], (data.small - data.actual)[rest]
     others = measured(data.position[rest], data.actual[rest], *errors)
-    held_out = fit.lms(fit.errors_of(data))[1][0]
+    held_out = fit.lms(fit.marker_errors(data))[1][0]
     assert np.abs(held_out - fitted(others)).max() < 0.003
     assert np.abs(held_out - fitted(data)).max() > 0.006
 
@@ -75,8 +75,8 @@ def test_data_astride_the_seam_give_the_weights_of_data_turned_by_90_degrees() -
 def test_outliers_are_left_out_and_counted() -> None:
     clean, spoilt = independent(7), independent(7)
     spoilt.large[::97, 2] += 0.05
-    assert fit.errors_of(clean).use.all()
-    out = ~fit.errors_of(spoilt).use
+    assert fit.marker_errors(clean).use.all()
+    out = ~fit.marker_errors(spoilt).use
     assert out.sum(axis=0).tolist() == [0, 0, len(spoilt.large[::97]), 0]
     assert abs(fitted(spoilt)[2] - fitted(clean)[2]) < 0.01
 
@@ -94,7 +94,7 @@ def judged(errors: fit.Errors) -> tuple[dict[str, fit.FittedWeights], fit.Eviden
 
 def test_evidence_holds_whole_positions_out() -> None:
     data = independent(10, positions=12)
-    errors = fit.errors_of(data)
+    errors = fit.marker_errors(data)
     fits, found = judged(errors)
     rest = data.position != errors.positions[0]
     apart = (data.large - data.actual)[rest], (data.small - data.actual)[rest]
@@ -108,7 +108,7 @@ def test_evidence_holds_whole_positions_out() -> None:
 
 
 def test_a_useless_marker_leaves_nothing_to_prove() -> None:
-    _, found = judged(fit.errors_of(independent(11, small=(0.5, 0.5, 0.5, 0.5))))
+    _, found = judged(fit.marker_errors(independent(11, small=(0.5, 0.5, 0.5, 0.5))))
     assert not found.proven("closed_form").any()
 
 
@@ -116,7 +116,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     """Of the weights, and of the RMS error, whose truth is known: 0.8 of the variance."""
     inside = []
     for seed in range(40):
-        errors = fit.errors_of(independent(seed, per=30))
+        errors = fit.marker_errors(independent(seed, per=30))
         fits, found = judged(errors)
         closed = fits["closed_form"]
         inside += (np.abs(closed.raw - [0.8, 0.5, 0.2, 0.2]) < closed.half).tolist()

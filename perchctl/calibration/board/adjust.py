@@ -32,7 +32,7 @@ class NoSolution(ArithmeticError):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CameraFit:
     """A camera and the boards' poses that fit the views.
 
     Attributes:
@@ -47,7 +47,7 @@ class Fit:
     @property
     def parameters(self) -> Array:
         """The lens parameters, (p,), in the order of `PARAMETERS`."""
-        return parameters_of(self.camera)
+        return lens_parameters(self.camera)
 
     @property
     def rms_px(self) -> float:
@@ -60,7 +60,7 @@ class Fit:
         return _spread_px(np.concatenate(self.residuals))
 
 
-def parameters_of(camera: CameraModel) -> Array:
+def lens_parameters(camera: CameraModel) -> Array:
     """Return fx, fy, cx, cy and the distortion of a camera, (p,); four coefficients of plumb_bob
     get k3 = 0."""
     K, dist = camera.K, camera.dist
@@ -69,7 +69,7 @@ def parameters_of(camera: CameraModel) -> Array:
     return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dist])
 
 
-def fit_camera(views: Sequence[BoardView], model: str) -> Fit:
+def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
     """Return the camera and the poses with the least squared residuals.
 
     Raises NoSolution.
@@ -91,7 +91,7 @@ def fit_camera(views: Sequence[BoardView], model: str) -> Fit:
     return _fit_of(views, CameraModel(size_px, np.array(K, float), np.ravel(dist), model), poses)
 
 
-def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> Fit | None:
+def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | None:
     """Return the best poses for a camera held fixed; None where it cannot see some board."""
     poses = []
     for view in views:
@@ -104,34 +104,36 @@ def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> Fit | None:
     return _fit_of(views, camera, np.array(poses))
 
 
-def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Fit:
+def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> CameraFit:
     """Return the fit of a camera and poses, with its residuals."""
     residuals = tuple(
         view.corners_px - project(view.object_m, pose[:3], pose[3:], camera)
         for view, pose in zip(views, poses, strict=True)
     )
-    return Fit(camera, poses, residuals)
+    return CameraFit(camera, poses, residuals)
 
 
-def derivatives(camera: CameraModel, pose: Array, points_m: Array) -> tuple[Array, Array]:
+def projection_derivatives(
+    camera: CameraModel, pose: Array, points_m: Array
+) -> tuple[Array, Array]:
     """Return the derivatives of the pixels of points (n, 3) at a pose (rvec and tvec, (6,)) by the
     lens parameters (2 n, p) and by the pose (2 n, 6)."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
-    p = len(parameters_of(camera))
+    p = len(lens_parameters(camera))
     if camera.model == "fisheye":
         points = points_m.reshape(-1, 1, 3)
         _, J = cv2.fisheye.projectPoints(points, rvec, tvec, camera.K, camera.dist)
         return np.asarray(J[:, :p], np.float64), np.asarray(J[:, p : p + 6], np.float64)
-    _, J = cv2.projectPoints(points_m, rvec, tvec, camera.K, parameters_of(camera)[4:])
+    _, J = cv2.projectPoints(points_m, rvec, tvec, camera.K, lens_parameters(camera)[4:])
     return np.asarray(J[:, 6 : 6 + p], np.float64), np.asarray(J[:, :6], np.float64)
 
 
-def lens_covariance(views: Sequence[BoardView], fit: Fit) -> Array:
+def lens_covariance(views: Sequence[BoardView], fit: CameraFit) -> Array:
     """Return the covariance of the lens parameters (p, p), each board's pose being free."""
     rows = []
     for view, pose, residual in zip(views, fit.poses, fit.residuals, strict=True):
-        lens, outside = derivatives(fit.camera, pose, view.object_m)
+        lens, outside = projection_derivatives(fit.camera, pose, view.object_m)
         Q, _ = np.linalg.qr(outside)
         rows.append((lens - Q @ (Q.T @ lens), residual.ravel()))
     p = len(fit.parameters)
@@ -160,8 +162,8 @@ _REJECTION_ROUNDS = 10
 
 
 def reject_outliers(
-    views: Sequence[BoardView], fit: Fit
-) -> tuple[Fit, list[BoardView], list[Rejection]]:
+    views: Sequence[BoardView], fit: CameraFit
+) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
     """Return the fit without outliers, the views that it rests on, and what was left out.
 
     Raises:
@@ -196,7 +198,7 @@ def reject_outliers(
 
 
 def _find_outliers(
-    views: Sequence[BoardView], fit: Fit, whole: dict[str, BoardView]
+    views: Sequence[BoardView], fit: CameraFit, whole: dict[str, BoardView]
 ) -> tuple[list[NDArray[np.bool_]], dict[str, str]]:
     masks, rms = [], []
     for residual in fit.residuals:
@@ -232,26 +234,33 @@ _LEAST_KNOWN = 1e-10
 
 
 def jackknife_covariance(
-    blocks: Sequence[tuple[Array, Array]], known: Array, curved: float = 1.0, sure: float = 1.0
+    blocks: Sequence[tuple[Array, Array]],
+    known: Array,
+    curvature_factor: float = 1.0,
+    information_factor: float = 1.0,
 ) -> Array:
     """Return the covariance (p, p) at a minimum: the inverse information, or what leaving out each
     block in turn (the jackknife) shows where that is more.
 
     Args:
         blocks: information J' J (p, p) and gradient J' r (p,) of each block of rows.
-        known: information (p, p) beside theirs.
-        curved: by which factor a robust cost is curved less than `blocks` say.
-        sure: by which factor its information is less or more than they say.
+        known: prior information (p, p), added to theirs.
+        curvature_factor: ratio of the robust cost's true curvature to the information in `blocks`.
+        information_factor: further factor on it, of the M-estimator's sandwich covariance.
     """
     seen = np.sum([information for information, _ in blocks], axis=0)
     # Unlike units are brought to one scale.
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known + curved * seen), 1e-300))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known + curvature_factor * seen), 1e-300))
     both = np.outer(scale, scale)
     known = known + np.diag(_LEAST_KNOWN / scale**2)
-    inverted = np.asarray(np.linalg.inv((known + curved * sure * seen) * both))
+    inverted = np.asarray(
+        np.linalg.inv((known + curvature_factor * information_factor * seen) * both)
+    )
     moves = np.array(
         [
-            np.linalg.solve((known + curved * (seen - information)) * both, scale * gradient)
+            np.linalg.solve(
+                (known + curvature_factor * (seen - information)) * both, scale * gradient
+            )
             for information, gradient in blocks
         ]
     )

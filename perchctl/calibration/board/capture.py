@@ -76,7 +76,7 @@ _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.7, 0.7])
 _TILT_GAIN = 2.0
 
 
-def signature(view: BoardView, board: Board) -> Array:
+def view_signature(view: BoardView, board: Board) -> Array:
     """Return where and how a view shows the board, (5,): the middle of its corners as a part of the
     picture's width and height, its size as a part of the picture, and by how much its right and
     its lower side are farther away than the others."""
@@ -96,7 +96,7 @@ def signature(view: BoardView, board: Board) -> Array:
     return np.array([x, y, min(1.0, size), *np.clip(tilt, -1.0, 1.0)])
 
 
-def distance(one: Array, other: Array) -> float:
+def signature_distance(one: Array, other: Array) -> float:
     """Return how different two signatures are; beyond `NEW_BEYOND` a view is new."""
     return float(np.abs(one - other) @ _WEIGHTS)
 
@@ -136,7 +136,7 @@ def capture_views(
 
     Raises TimedOut: the camera is gone before there may be enough.
     """
-    capture = Capture(board)
+    capture = GuidedCapture(board)
     try:
         for _, frame in poll_frames(source, clock, sleep):
             if stopped():
@@ -145,7 +145,7 @@ def capture_views(
                 continue
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")
             taken = capture.update(seen)
-            show(capture.guided(frame, seen, taken))
+            show(capture.guided_frame(frame, seen, taken))
             if capture.finished:
                 break
     except TimedOut as gone:
@@ -154,7 +154,7 @@ def capture_views(
     return FoundViews(tuple(capture.taken))
 
 
-class Capture:
+class GuidedCapture:
     """The memory of a guided capture: the views `taken`, and what to do next, `advice`."""
 
     def __init__(self, board: Board) -> None:
@@ -180,12 +180,12 @@ class Capture:
             return False
         width = seen.size_px[0]
         sharpest_px = min((view.blur_px for view in self.taken), default=np.inf)
-        here = signature(seen, self._board)
+        here = view_signature(seen, self._board)
         if before is None or _moved_px(before, seen) > _STILL_SHARE * width:
             self.advice = "hold still"
         elif seen.blur_px > min(max(_BLUR_SHARE * width, 1.0), 2.5 * sharpest_px):
             self.advice = "too blurred: more light, or hold still"
-        elif any(distance(here, there) <= NEW_BEYOND for there in self._signatures):
+        elif any(signature_distance(here, there) <= NEW_BEYOND for there in self._signatures):
             self.advice = next_advice(self._signatures)
         else:
             self.taken.append(seen)
@@ -194,7 +194,7 @@ class Capture:
             return True
         return False
 
-    def guided(self, frame: Frame, seen: BoardView | str, taken: bool) -> GuidedFrame:
+    def guided_frame(self, frame: Frame, seen: BoardView | str, taken: bool) -> GuidedFrame:
         """Return what to show of a frame."""
         outlines: tuple[tuple[str, Array], ...] = ()
         if isinstance(seen, BoardView):

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.calibration.board.adjust import Fit, fit_poses, lens_covariance
+from perchctl.calibration.board.adjust import CameraFit, fit_poses, lens_covariance
 from perchctl.calibration.board.detect import FoundViews, Rejection
-from perchctl.calibration.board.predict import limit_mm, position_errors_mm, predict_errors
+from perchctl.calibration.board.predict import allowed_error_mm, position_errors_mm, predict_errors
 from perchctl.calibration.board.solve import rejected_views, robust_fit, tilts_deg
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
@@ -46,7 +46,7 @@ class Deviation:
     @property
     def share(self) -> float:
         """Share of the limit; zero where the pictures themselves do not fix it so well."""
-        return self.mm / limit_mm(self.z_m) if self.mm > self.mm95 else 0.0
+        return self.mm / allowed_error_mm(self.z_m) if self.mm > self.mm95 else 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,9 @@ def check_calibration(camera: CameraModel, found: FoundViews) -> CheckResult:
     return CheckResult(passed, reason, fixed.rms_px, free.rms_px, deviations, tuple(rejections))
 
 
-def _verdict(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[bool, str]:
+def _verdict(
+    fixed: CameraFit, free: CameraFit, deviations: Sequence[Deviation]
+) -> tuple[bool, str]:
     """Return whether the fixed camera passes, and why."""
     if fixed.rms_px > max(RMS_FACTOR * free.rms_px, RMS_FLOOR_PX):
         return False, (
@@ -115,14 +117,14 @@ def _verdict(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[bo
         return False, (
             f"at {worst.z_m * 100:.0f} cm the target would be {worst.mm:.1f} mm from where "
             f"these pictures put it (+-{worst.mm95:.1f} mm), and "
-            f"{0.5 * limit_mm(worst.z_m):.1f} mm is allowed"
+            f"{0.5 * allowed_error_mm(worst.z_m):.1f} mm is allowed"
         )
     return True, f"reprojection RMS {fixed.rms_px:.2f} px ({free.rms_px:.2f} px at best)"
 
 
-def _check_evidence(free: Fit, deviations: Sequence[Deviation]) -> None:
+def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
     """Raises InvalidValue where the pictures could not show a wrong focal length."""
-    if deviations and all(d.mm95 <= UNSURE_FACTOR * limit_mm(d.z_m) for d in deviations):
+    if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(
         f"{len(free.poses)} pictures (board tilted by at most {tilts_deg(free.poses).max():.0f} "

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.board.adjust import SIGMAS_95, derivatives, fit_poses
+from perchctl.calibration.board.adjust import SIGMAS_95, fit_poses, projection_derivatives
 from perchctl.calibration.board.detect import BoardView
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, undistort
@@ -43,12 +43,12 @@ class RangeError:
     axis_mm95: float
 
 
-def limit_mm(z_m: float) -> float:
+def allowed_error_mm(z_m: float) -> float:
     """Return the error that perching allows: 1 mm, or 1 % of the distance where that is more."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
-def coverage(views: Sequence[BoardView]) -> NDArray[np.bool_]:
+def covered_cells(views: Sequence[BoardView]) -> NDArray[np.bool_]:
     """Return the cells of the picture (rows, columns) that lie inside of some board's corners."""
     rows, columns = CELLS
     cells_seen = np.zeros(CELLS, dtype=np.uint8)
@@ -71,7 +71,7 @@ def predict_errors(
         lines_mm = []
         for place in _places(camera, z_m, covered):
             corners_m = _marker_m(camera, z_m)
-            lens, pose = derivatives(camera, np.concatenate([_FACING, place]), corners_m)
+            lens, pose = projection_derivatives(camera, np.concatenate([_FACING, place]), corners_m)
             # Corners stay where they are, so the pose moves against the lens.
             moved = np.linalg.lstsq(pose, lens, rcond=None)[0][3:]
             lines_mm.append(1e3 * SIGMAS_95 * np.sqrt(np.trace(moved @ covariance @ moved.T)))

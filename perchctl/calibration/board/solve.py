@@ -14,14 +14,19 @@ from numpy.typing import NDArray
 from perchctl.calibration.board.adjust import (
     MODEL_NAMES,
     PARAMETERS,
-    Fit,
+    CameraFit,
     NoSolution,
     fit_camera,
     lens_covariance,
     reject_outliers,
 )
 from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection
-from perchctl.calibration.board.predict import RangeError, coverage, limit_mm, predict_errors
+from perchctl.calibration.board.predict import (
+    RangeError,
+    allowed_error_mm,
+    covered_cells,
+    predict_errors,
+)
 from perchctl.calibration.files import calibration_text
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
@@ -53,7 +58,7 @@ class Calibration:
     """
 
     board: str
-    fit: Fit
+    fit: CameraFit
     covariance: Array
     views: tuple[BoardView, ...]
     rejections: tuple[Rejection, ...]
@@ -68,30 +73,30 @@ class Calibration:
         return self.fit.camera
 
     @property
-    def std(self) -> Array:
+    def parameter_std(self) -> Array:
         """Standard deviation of each lens parameter, (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def level(self) -> Level:
         """Verdict by the predicted error straight ahead of the camera, where perching happens;
-        aside twice the limit will do."""
-        ahead = max(e.axis_mm95 / limit_mm(e.z_m) for e in self.errors)
-        aside = max(e.mm95 / limit_mm(e.z_m) for e in self.errors)
+        to the side twice the limit is accepted."""
+        ahead = max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in self.errors)
+        aside = max(e.mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.lacks:
             return "fly"
         return "care" if ahead <= CARE_FACTOR else "stop"
 
     @property
-    def sentence(self) -> str:
+    def verdict_text(self) -> str:
         """The verdict in words, with the two distances that matter."""
         near, far = (e for e in self.errors if e.z_m in (0.1, 1.0))
         text = (
             f"{TITLES[self.level]}: the target's centre is within {near.axis_mm95:.2g} mm at "
             f"10 cm and {far.axis_mm95:.2g} mm at 1 m (95 %)"
         )
-        aside = max(self.errors, key=lambda e: e.mm95 / limit_mm(e.z_m))
-        if aside.mm95 > ASIDE_FACTOR * limit_mm(aside.z_m):
+        aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
+        if aside.mm95 > ASIDE_FACTOR * allowed_error_mm(aside.z_m):
             text += f", aside {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
         return text
 
@@ -101,12 +106,14 @@ class Calibration:
         for r in self.rejections:
             what = f"corners {', '.join(map(str, r.corners))} of {r.view}" if r.corners else r.view
             lines.append(f"rejected {what}: {r.reason}")
-        values = zip(("fx", "fy", "cx", "cy"), self.fit.parameters, self.std, strict=False)
+        values = zip(
+            ("fx", "fy", "cx", "cy"), self.fit.parameters, self.parameter_std, strict=False
+        )
         lens = ", ".join(f"{name} {value:.2f} +- {std:.2f}" for name, value, std in values)
         lines.append(
             f"{len(self.views)} views, RMS {self.fit.rms_px:.3f} px, {self.camera.model}, {lens} px"
         )
-        return [*lines, *self.lacks, self.sentence]
+        return [*lines, *self.lacks, self.verdict_text]
 
     def record(self) -> dict[str, Any]:
         """Return the measured part of the object of `calibrate --json`."""
@@ -122,8 +129,8 @@ class Calibration:
             "views_used": len(self.views),
             "views_rejected": rejected_views(self.rejections),
             "pictures_without_board": rejected_views(self.missing),
-            "std": dict(zip(names, self.std.tolist(), strict=True)),
-            "error_mm": [vars(e) | {"limit_mm": limit_mm(e.z_m)} for e in self.errors],
+            "std": dict(zip(names, self.parameter_std.tolist(), strict=True)),
+            "error_mm": [vars(e) | {"limit_mm": allowed_error_mm(e.z_m)} for e in self.errors],
             "coverage": float(self.covered.mean()),
             "warnings": list(self.lacks),
             "verdict": self.level,
@@ -141,7 +148,7 @@ class Calibration:
                 "views_used": len(self.views),
                 "views_rejected": len(rejected_views(self.rejections)),
                 "parameters": " ".join(PARAMETERS[self.camera.model]),
-                "parameter_std": self.std[None],
+                "parameter_std": self.parameter_std[None],
                 "parameter_covariance": self.covariance,
             },
         )
@@ -169,7 +176,7 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
     fit, kept, rejections = robust_fit(found.views, models)
     _check_count(kept, pictures)
     # Tilt and coverage first: their messages name best what to add.
-    covered = coverage(kept)
+    covered = covered_cells(kept)
     _check_variety(fit, covered)
     covariance = lens_covariance(kept, fit)
     _check_focal(fit.parameters, np.sqrt(np.diag(covariance)))
@@ -188,14 +195,14 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
 
 def robust_fit(
     views: Sequence[BoardView], models: Sequence[str] = MODEL_NAMES
-) -> tuple[Fit, list[BoardView], list[Rejection]]:
+) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
     """Return the fit of the views without outliers, by the simplest of `models` that follows the
     lens (one that cannot would call the views at the picture's rim outliers); those views, and
     what was left out.
 
     Raises InvalidValue: the views fit no camera.
     """
-    best: Fit | None = None
+    best: CameraFit | None = None
     for model in models:
         try:
             fit = fit_camera(views, model)
@@ -250,7 +257,7 @@ def _check_count(views: Sequence[BoardView], pictures: int) -> None:
         )
 
 
-def _check_variety(fit: Fit, covered: NDArray[np.bool_]) -> None:
+def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
     """Raises InvalidValue when views are all frontal or leave most of the image empty."""
     tilts = tilts_deg(fit.poses)
     tilted = int((tilts >= MIN_TILT_DEG).sum())
@@ -279,7 +286,7 @@ def _check_focal(parameters: Array, std: Array) -> None:
         )
 
 
-def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[str]:
+def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
     lacks = []
     if not _is_usable(fit.camera):
         lacks.append("the lens model folds back inside of the picture: add views at its rims")

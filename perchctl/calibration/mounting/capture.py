@@ -63,7 +63,7 @@ def record_mounting(
             return
         if frame is None:
             continue
-        poses = reader.look(frame)
+        poses = reader.read_poses(frame)
         progress.advance_time(frame.t_s if not source.live else now_s)
         if frame.repeated and not reader.trouble:  # no picture without a target: no picture
             continue
@@ -71,7 +71,7 @@ def record_mounting(
         recording.mirrored_pictures = reader.mirrored
         if reader.mirrored >= MIRRORED_PICTURES and not recording.poses:
             raise InvalidValue(MIRRORED)
-        show(progress.guided(frame, bool(poses), reader))
+        show(progress.guided_frame(frame, bool(poses), reader))
 
 
 class _Progress:
@@ -97,7 +97,7 @@ class _Progress:
         self._start_s = now_s if self._start_s is None else self._start_s
         self._seconds = now_s - self._start_s
 
-    def guided(self, frame: Frame, seen: bool, reader: PoseReader) -> GuidedFrame:
+    def guided_frame(self, frame: Frame, seen: bool, reader: PoseReader) -> GuidedFrame:
         recording = self._recording
         self._with_target.append(seen)
         if self._seconds - self._judged_s >= JUDGED_EVERY_S:

@@ -43,16 +43,16 @@ LATENCY, KNOTS = 12, 13
 
 
 @dataclass(frozen=True, eq=False)
-class CarrySolution:
+class RotationSolution:
     """The carry's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
-        R_body_cam: (3, 3); turn_cov_rad2 (3, 3) of a small turn of it in body axes.
+        R_body_cam: (3, 3); rotation_cov_rad2 (3, 3) of a small turn of it in body axes.
         latency_s: from exposure to the picture's timestamp; positive is a late picture.
     """
 
     R_body_cam: Array
-    turn_cov_rad2: Array
+    rotation_cov_rad2: Array
     latency_s: float
     latency_sigma_s: float
 
@@ -70,11 +70,11 @@ class CarrySolution:
         here = np.array(rpy_from_rotation(self.R_body_cam))
         J = np.stack([np.array(rpy_from_rotation(R @ self.R_body_cam)) - here for R in small], 1)
         J = ((J + np.pi) % (2.0 * np.pi) - np.pi) / step
-        x, y, z = np.degrees(np.sqrt(np.diagonal(J @ self.turn_cov_rad2 @ J.T))).tolist()
+        x, y, z = np.degrees(np.sqrt(np.diagonal(J @ self.rotation_cov_rad2 @ J.T))).tolist()
         return x, y, z
 
 
-def solve_carry(recording: MountingRecording) -> CarrySolution:
+def solve_rotation(recording: MountingRecording) -> RotationSolution:
     """Solve for the camera's turn in the body and its latency.
 
     Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
@@ -86,15 +86,15 @@ def solve_carry(recording: MountingRecording) -> CarrySolution:
     poses = pose_arrays(recording)
     bias = np.zeros(3)
     scale = np.zeros(3)
-    body = integrate(t_s, gyro, bias, scale)
-    R_body_cam, latency_s = first_guess(body, poses)
+    body = integrate_gyro(t_s, gyro, bias, scale)
+    R_body_cam, latency_s = guess_rotation(body, poses)
     R_world_target = _middle_target(body, poses, R_body_cam, latency_s)
     knots_s = np.linspace(t_s[0], t_s[-1], 1 + max(1, round((t_s[-1] - t_s[0]) / KNOT_S)))
     walk = np.zeros((len(knots_s) - 1, 3))
     known = _known(knots_s)
     cov_rad2 = poses.cov[:, :3, :3] + np.eye(3) * FLOOR_RAD**2
     for _ in range(_STEPS):
-        at = interpolate(integrate(t_s, gyro, bias, scale), poses.t_s - latency_s)
+        at = interpolate_rotation(integrate_gyro(t_s, gyro, bias, scale), poses.t_s - latency_s)
         hats = np.stack([np.interp(at.t_s, knots_s, one) for one in np.eye(len(knots_s))[1:]], 1)
         R_cam_world = (_turns(hats @ walk) @ at.R_world_body @ R_body_cam).transpose(0, 2, 1)
         predicted = R_cam_world @ R_world_target
@@ -102,10 +102,10 @@ def solve_carry(recording: MountingRecording) -> CarrySolution:
         late = -at.rate_radps @ R_body_cam
         turned = np.broadcast_to(R_body_cam.T, R_cam_world.shape)
         walked = np.einsum("nk,nij->nikj", hats, R_cam_world).reshape(len(hats), 3, -1)
-        of_bias = R_cam_world @ at.of_bias
-        of_scale = R_cam_world @ at.of_scale
-        parts = (turned, -R_cam_world, of_bias, of_scale, late[:, :, None], walked)
-        rows = weighed_rows(np.concatenate(parts, axis=2), misfit, cov_rad2, known, late)
+        bias_jacobian = R_cam_world @ at.bias_jacobian
+        scale_jacobian = R_cam_world @ at.scale_jacobian
+        parts = (turned, -R_cam_world, bias_jacobian, scale_jacobian, late[:, :, None], walked)
+        rows = weight_residuals(np.concatenate(parts, axis=2), misfit, cov_rad2, known, late)
         step = rows.step(np.concatenate([np.zeros(6), bias, scale, [0.0], walk.ravel()]))
         R_body_cam = _turns(step[TURN]) @ R_body_cam
         R_world_target = _turns(step[TARGET]) @ R_world_target
@@ -115,7 +115,9 @@ def solve_carry(recording: MountingRecording) -> CarrySolution:
         walk = walk + step[KNOTS:].reshape(-1, 3)
     cov = rows.covariance()
     _check(rows, latency_s, cov)
-    return CarrySolution(R_body_cam, cov[TURN, TURN], latency_s, math.sqrt(cov[LATENCY, LATENCY]))
+    return RotationSolution(
+        R_body_cam, cov[TURN, TURN], latency_s, math.sqrt(cov[LATENCY, LATENCY])
+    )
 
 
 def _known(knots_s: Array) -> Array:
@@ -131,22 +133,26 @@ def _known(knots_s: Array) -> Array:
 
 
 def _middle_target(
-    body: Integrated, poses: PoseArrays, R_body_cam: Array, latency_s: float
+    body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
     """Return the target's turn in the world, the middle one of all pictures'."""
-    each = interpolate(body, poses.t_s - latency_s).R_world_body @ R_body_cam @ poses.R_cam_target
+    each = (
+        interpolate_rotation(body, poses.t_s - latency_s).R_world_body
+        @ R_body_cam
+        @ poses.R_cam_target
+    )
     distance = np.abs(each[:, None] - each[None, :: 1 + len(each) // 60]).sum(axis=(2, 3))
     return np.asarray(each[np.argmin(np.median(distance, axis=1))])
 
 
-def _check(rows: Rows, latency_s: float, cov: Array) -> None:
+def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
     """Raises InvalidValue unless vehicle and camera agree, and well enough."""
     off_rad = float(np.median(np.linalg.norm(rows.misfit, axis=1)))
-    if off_rad > MOST_MISFIT_RAD or rows.left_out > MOST_LEFT_OUT:
+    if off_rad > MOST_MISFIT_RAD or rows.rejected_share > MOST_LEFT_OUT:
         raise InvalidValue(
             f"the turns that the vehicle felt and those that the camera saw differ by "
-            f"{math.degrees(off_rad):.1f} deg ({100 * rows.left_out:.0f} % of the pictures do "
-            f"not fit at all): target and camera must not move in the room or on the vehicle; "
+            f"{math.degrees(off_rad):.1f} deg ({100 * rows.rejected_share:.0f} % of the pictures "
+            f"do not fit at all): target and camera must not move in the room or on the vehicle; "
             f"then {HOW_TO_RECORD['carry']}"
         )
     sigma = np.sqrt(np.diagonal(cov))
@@ -174,21 +180,21 @@ def _check(rows: Rows, latency_s: float, cov: Array) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Integrated:
+class GyroRotation:
     """The integrated rotation R_world_body (n, 3, 3) at t_s (n,), with its rates (n, 3).
 
-    `of_bias` and `of_scale` (n, 3, 3): by how much a change of the gyroscope's constant error
-    (rad/s) and of its scale (a share) turn the body, in world axes.
+    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the body's rotation, in world axes,
+    by the gyroscope's bias (rad/s) and by its scale error.
     """
 
     t_s: Array
     R_world_body: Array
     rate_radps: Array
-    of_bias: Array
-    of_scale: Array
+    bias_jacobian: Array
+    scale_jacobian: Array
 
 
-def integrate(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Array) -> Integrated:
+def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Array) -> GyroRotation:
     """Integrate the gyroscope (n, 3), its errors taken off: rate = (gyro - bias) (1 + scale).
 
     Between two samples the rate goes straight from one to the other, to fourth order (Magnus).
@@ -199,12 +205,12 @@ def integrate(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Array) ->
     before, after = rate[:-1], rate[1:]
     steps = _turns(0.5 * dt * (before + after) + dt**2 / 12.0 * np.cross(before, after))
     R = np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
-    return Integrated(
+    return GyroRotation(
         t_s=t_s,
         R_world_body=R,
         rate_radps=rate,
-        of_bias=_integral(-R * (1.0 + scale), dt),
-        of_scale=_integral(R * unbiased[:, None, :], dt),
+        bias_jacobian=_integral(-R * (1.0 + scale), dt),
+        scale_jacobian=_integral(R * unbiased[:, None, :], dt),
     )
 
 
@@ -214,7 +220,7 @@ def _integral(values: Array, dt: Array) -> Array:
     return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
 
-def interpolate(whole: Integrated, t_s: Array) -> Integrated:
+def interpolate_rotation(whole: GyroRotation, t_s: Array) -> GyroRotation:
     """Return the rotation at other times (m,), which are clipped to the recording's."""
     grid = whole.t_s
     t_s = np.clip(t_s, grid[0], grid[-1])
@@ -227,12 +233,12 @@ def interpolate(whole: Integrated, t_s: Array) -> Integrated:
     def between(values: Array) -> Array:
         return np.asarray(values[k] + share[..., None] * (values[k + 1] - values[k]))
 
-    return Integrated(
+    return GyroRotation(
         t_s=t_s,
         R_world_body=whole.R_world_body[k] @ _turns(way),
         rate_radps=whole.rate_radps[k] + share * change,
-        of_bias=between(whole.of_bias),
-        of_scale=between(whole.of_scale),
+        bias_jacobian=between(whole.bias_jacobian),
+        scale_jacobian=between(whole.scale_jacobian),
     )
 
 
@@ -261,7 +267,7 @@ _FIT_ROUNDS = 3
 _HALF_COUNTED_RAD = 0.02
 
 
-def first_guess(whole: Integrated, poses: PoseArrays) -> tuple[Array, float]:
+def guess_rotation(whole: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
     """Return a guess of R_body_cam and the latency. Raises InvalidValue without pairs of pictures
     some tenths of a second apart."""
     first, second = _pairs(poses.t_s)
@@ -273,8 +279,8 @@ def first_guess(whole: Integrated, poses: PoseArrays) -> tuple[Array, float]:
     seen = _vectors(R[first] @ R[second].transpose(0, 2, 1))
     guesses = []
     for latency_s in LATENCIES_S.tolist():
-        a = interpolate(whole, poses.t_s[first] - latency_s).R_world_body
-        b = interpolate(whole, poses.t_s[second] - latency_s).R_world_body
+        a = interpolate_rotation(whole, poses.t_s[first] - latency_s).R_world_body
+        b = interpolate_rotation(whole, poses.t_s[second] - latency_s).R_world_body
         R_body_cam, misfit = _fit_turn(_vectors(a.transpose(0, 2, 1) @ b), seen)
         guesses.append((misfit, latency_s, R_body_cam))
     _, latency_s, R_body_cam = min(guesses, key=lambda guess: guess[0])
@@ -315,9 +321,9 @@ _MEDIAN_OF_CHI2 = 2.366  # with three degrees of freedom
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Misfits (n, 3) of poses in the order of time, their derivative `design` (n, 3, p), inverse
-    covariances (n, 3, 3), how much each counts (n,), and the information (p, p) beside theirs."""
+class PoseResiduals:
+    """Residuals `misfit` (n, 3) of poses in time order, their Jacobian `design` (n, 3, p), inverse
+    covariances (n, 3, 3), robust weights `counted` (n,), and prior information `known` (p, p)."""
 
     design: Array
     misfit: Array
@@ -326,12 +332,12 @@ class Rows:
     known: Array
 
     @property
-    def distance2(self) -> Array:
+    def chi2(self) -> Array:
         """Squared size of each misfit in standard deviations, (n,)."""
         return _distance2(self.misfit, self.inverse)
 
     @property
-    def left_out(self) -> float:
+    def rejected_share(self) -> float:
         """Share of the poses that hardly count."""
         return float((self.counted < _COUNTS_LITTLE).mean())
 
@@ -343,14 +349,14 @@ class Rows:
         weighted = ((self.inverse[some] * counted) @ design).reshape(-1, p)
         return design.reshape(-1, p).T @ weighted, -weighted.T @ self.misfit[some].ravel()
 
-    def step(self, pulled: Array | float = 0.0) -> Array:
-        """Return the Gauss-Newton step (p,) to the least misfit; `pulled` (p,) is what `known`
-        pulls to zero of the parameters."""
+    def step(self, prior_offset: Array | float = 0.0) -> Array:
+        """Return the Gauss-Newton step (p,) to the least misfit; `prior_offset` (p,) is from the
+        prior's mean."""
         information, gradient = self.normal_equations()
-        pull = self.known @ np.broadcast_to(pulled, gradient.shape)
+        pull = self.known @ np.broadcast_to(prior_offset, gradient.shape)
         return np.asarray(np.linalg.solve(information + self.known, gradient - pull))
 
-    def moved(self, step: Array) -> Rows:
+    def after_step(self, step: Array) -> PoseResiduals:
         """Return the rows after a step (p,) of a linear problem."""
         misfit = self.misfit + self.design @ step
         return replace(self, misfit=misfit, counted=_weights(_distance2(misfit, self.inverse)))
@@ -361,15 +367,15 @@ class Rows:
         blocks = [
             self.normal_equations(k) for k in np.array_split(np.arange(len(self.misfit)), BLOCKS)
         ]
-        return jackknife_covariance(blocks, self.known, *_robust_shares(self.distance2))
+        return jackknife_covariance(blocks, self.known, *_robust_shares(self.chi2))
 
 
-def weighed_rows(
+def weight_residuals(
     design: Array, misfit: Array, cov: Array, known: Array, late: Array | None = None
-) -> Rows:
-    """Return the rows of poses whose misfits have these covariances (n, 3, 3), up to a factor, and
-    beside it, where `late` (n, 3) says what a second of delay does to each, by the likeliest
-    jitter of their timestamps."""
+) -> PoseResiduals:
+    """Return the residuals of poses, weighted by their covariances (n, 3, 3) times a common factor
+    that is estimated. With `late` (n, 3), the derivative by a second of delay, the likeliest jitter
+    of the timestamps is estimated, too, and added to the covariances."""
     best_cost, best = np.inf, cov
     for jitter_s in (0.0,) if late is None else _JITTERS_S:
         spread = cov
@@ -384,7 +390,7 @@ def weighed_rows(
         if cost < best_cost:
             best_cost = cost
             best = inverse / factor2
-    return Rows(design, misfit, best, _weights(_distance2(misfit, best)), known)
+    return PoseResiduals(design, misfit, best, _weights(_distance2(misfit, best)), known)
 
 
 def _distance2(misfit: Array, inverse: Array) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perchctl.calibration.mounting.carry import MOST_LEFT_OUT, Rows, weighed_rows
+from perchctl.calibration.mounting.carry import MOST_LEFT_OUT, PoseResiduals, weight_residuals
 from perchctl.calibration.mounting.recording import (
     HOW_TO_RECORD,
     MountingRecording,
@@ -66,17 +66,17 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     found = np.zeros(6)
     cov = np.broadcast_to(np.eye(3), (n, 3, 3))
     for _ in range(_STEPS):
-        rows = weighed_rows(design, design @ found - p_m, cov, np.zeros((6, 6)))
+        rows = weight_residuals(design, design @ found - p_m, cov, np.zeros((6, 6)))
         found = found + rows.step()
         cov = _misfit_covariance(poses, found[3:])
     tip_m = found[:3]
     cov_m2 = rows.covariance()[:3, :3]
     _check_slip(poses, rows)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
-    if rows.left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
+    if rows.rejected_share > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
         raise InvalidValue(
             f"the tip is known to {1e3 * sigma_m:.1f} mm only, at most "
-            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * rows.left_out:.0f} % of the "
+            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * rows.rejected_share:.0f} % of the "
             f"pictures do not fit: {HOW_TO_RECORD['pivot']}"
         )
     return PivotSolution(
@@ -94,7 +94,7 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
     return np.asarray(J @ poses.cov @ J.transpose(0, 2, 1) + np.eye(3) * FLOOR_M**2)
 
 
-def _check_slip(poses: PoseArrays, rows: Rows) -> None:
+def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
     """Raises InvalidValue if the tip jumped from one point to another at some moment.
 
     For moments all over the recording, each with a point before and one after: that with the
@@ -110,7 +110,7 @@ def _check_slip(poses: PoseArrays, rows: Rows) -> None:
         for _ in range(_SLIP_STEPS):
             step = two.step()
             found = found + step
-            two = two.moved(step)
+            two = two.after_step(step)
         share = 1.0 - _size(two) / alone
         if share > explains:
             explains = share
@@ -123,6 +123,6 @@ def _check_slip(poses: PoseArrays, rows: Rows) -> None:
         )
 
 
-def _size(rows: Rows) -> float:
+def _size(rows: PoseResiduals) -> float:
     """Return the size of all misfits together; single wrong ones add little."""
-    return float(np.log1p(rows.distance2 / 3.0).mean())
+    return float(np.log1p(rows.chi2 / 3.0).mean())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.calibration.mounting.recording import TargetPose
 from perchctl.camera import VERDICT_TEXTS
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.perception import Perception
@@ -38,7 +38,7 @@ class PoseReader:
         self.outlines: tuple[tuple[str, Array], ...] = ()
         self.trouble = ""
 
-    def look(self, frame: Frame) -> list[SeenPose]:
+    def read_poses(self, frame: Frame) -> list[TargetPose]:
         """Return the target's poses in a frame: one, or one in each of its two fields."""
         judged = self._perception.health.assess(frame, self._live)
         if judged == "repeated":
@@ -58,7 +58,7 @@ class PoseReader:
         return seen
 
 
-def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
+def _best_pose(output: PipelineOutput, t_s: float) -> TargetPose | None:
     pose = output.poses.get("joint") or min(output.poses.values(), key=_uncertainty, default=None)
     if pose is None or pose.camera_cov is None or not np.isfinite(pose.camera_cov).all():
         return None
@@ -66,7 +66,7 @@ def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
     turns = dR.reshape(3, 3, 3) @ R.T  # of each component of the rotation vector, skew-symmetric
     J = np.eye(6)
     J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
-    return SeenPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, J @ pose.camera_cov @ J.T)
+    return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, J @ pose.camera_cov @ J.T)
 
 
 def _uncertainty(pose: MarkerPose) -> float:

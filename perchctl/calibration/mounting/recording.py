@@ -43,7 +43,7 @@ class AttitudeSample:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPose:
+class TargetPose:
     """The target in the camera's frame.
 
     `t_s` is the camera's own timestamp, before any latency is taken off. Of `covariance` (6, 6)
@@ -64,7 +64,7 @@ class MountingRecording:
 
     part: MountingPart
     attitudes: list[AttitudeSample] = field(default_factory=list)
-    poses: list[SeenPose] = field(default_factory=list)
+    poses: list[TargetPose] = field(default_factory=list)
     mirrored_pictures: int = 0
 
     @staticmethod
@@ -108,7 +108,7 @@ class MountingRecording:
                     parts.append(MountingRecording(record["part"], mirrored_pictures=mirrored))
                 elif "covariance" in record:
                     values = (_numbers(record, key, *shape) for key, shape in _POSE_SHAPES.items())
-                    parts[-1].poses.append(SeenPose(*values))
+                    parts[-1].poses.append(TargetPose(*values))
                 else:
                     t_s, gyro_radps = _numbers(record, "t_s"), _numbers(record, "gyro_radps", 3)
                     roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()

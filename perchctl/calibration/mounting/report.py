@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.calibration.board.adjust import SIGMAS_95
-from perchctl.calibration.mounting.carry import CarrySolution, solve_carry
+from perchctl.calibration.mounting.carry import RotationSolution, solve_rotation
 from perchctl.calibration.mounting.pivot import PivotSolution, solve_pivot
 from perchctl.calibration.mounting.recording import MountingRecording
 from perchctl.geometry import Array
@@ -52,20 +52,20 @@ class MountingReport:
     """What was measured of a profile's vehicle; a part that was not done is None."""
 
     profile: Profile
-    carried: CarrySolution | None
-    pivoted: PivotSolution | None
+    rotation: RotationSolution | None
+    pivot: PivotSolution | None
 
     @property
     def gear_body_m(self) -> Array:
         """The tip in body axes; the profile's where no pivot was done."""
-        if self.pivoted is None:
+        if self.pivot is None:
             return np.array(self.profile.vehicle.gear_body_m)
         T = self.profile.camera.mount.T_body_cam
-        R_body_cam = T[:3, :3] if self.carried is None else self.carried.R_body_cam
-        return np.asarray(T[:3, 3] + R_body_cam @ self.pivoted.gear_cam_m)
+        R_body_cam = T[:3, :3] if self.rotation is None else self.rotation.R_body_cam
+        return np.asarray(T[:3, 3] + R_body_cam @ self.pivot.gear_cam_m)
 
     @property
-    def written_gear_cam_m(self) -> Array:
+    def profile_gear_cam_m(self) -> Array:
         """The tip in the camera's frame, by the profile, (3,)."""
         T = self.profile.camera.mount.T_body_cam
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
@@ -74,11 +74,11 @@ class MountingReport:
         """Return the values to write into the profile, by dotted key: what was measured, but for a
         latency that each flight is to measure."""
         values: dict[str, float | tuple[float, ...]] = {}
-        if self.carried is not None:
-            values["camera.mount.rpy_deg"] = _rounded(self.carried.rpy_deg, 2)
+        if self.rotation is not None:
+            values["camera.mount.rpy_deg"] = _rounded(self.rotation.rpy_deg, 2)
             if self.profile.camera.latency_s != "measured":
-                values["camera.latency_s"] = round(max(self.carried.latency_s, 0.0), 4)
-        if self.pivoted is not None:
+                values["camera.latency_s"] = round(max(self.rotation.latency_s, 0.0), 4)
+        if self.pivot is not None:
             values["vehicle.gear_body_m"] = _rounded(self.gear_body_m, 5)
         return values
 
@@ -94,17 +94,17 @@ class MountingReport:
     def _values(self) -> list[_Value]:
         """Return what was measured."""
         camera, values = self.profile.camera, []
-        if (carried := self.carried) is not None:
-            angles = np.array(carried.rpy_deg)
-            sigmas = np.array(carried.rpy_sigma_deg)
+        if (rotation := self.rotation) is not None:
+            angles = np.array(rotation.rpy_deg)
+            sigmas = np.array(rotation.rpy_sigma_deg)
             written = np.array(camera.mount.rpy_deg)
             values.append(_Value("turn", "rpy_deg", "deg", 1.0, 2, angles, sigmas, written))
-            late, sigma = np.array([carried.latency_s, carried.latency_sigma_s])
+            late, sigma = np.array([rotation.latency_s, rotation.latency_sigma_s])
             known = None if camera.latency_s == "measured" else np.array(camera.latency_s)
             values.append(_Value("latency", "latency_s", "ms", 1e3, 1, late, sigma, known))
-        if (pivoted := self.pivoted) is not None:
-            tip, sigmas = pivoted.gear_cam_m, pivoted.gear_cam_sigma_m
-            written = self.written_gear_cam_m
+        if (pivot := self.pivot) is not None:
+            tip, sigmas = pivot.gear_cam_m, pivot.gear_cam_sigma_m
+            written = self.profile_gear_cam_m
             values.append(_Value("gear's tip", "gear_cam_m", "mm", 1e3, 2, tip, sigmas, written))
         return values
 
@@ -137,6 +137,6 @@ def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) ->
     pivot = by_part.get("pivot")
     return MountingReport(
         profile,
-        None if carry is None else solve_carry(carry),
+        None if carry is None else solve_rotation(carry),
         None if pivot is None else solve_pivot(pivot, profile.target.size_sigma),
     )

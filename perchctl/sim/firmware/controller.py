@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_v
+from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_voltage
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 Motors = tuple[float, float, float, float]
@@ -54,7 +54,7 @@ class Setpoint:
     yaw_rate_dps: float = 0.0
     thrust: float = 0.0
 
-    def levelled(self) -> Setpoint:
+    def level_setpoint(self) -> Setpoint:
         """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
         mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, VELOCITY)
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
@@ -100,7 +100,7 @@ class Pid:
         """Return the output after one period; `turning`: on the circle of 360 degrees."""
         error, change = desired - measured, measured - self._measured
         if turning:
-            error, change = cap_deg(error), cap_deg(change)
+            error, change = wrap_deg(error), wrap_deg(change)
         bound = self._i_limit
         integral = max(-bound, min(bound, self._integral + error * self._period))
         self._integral = integral
@@ -111,7 +111,7 @@ class Pid:
         return max(-self._limit, min(self._limit, output))
 
 
-def cap_deg(angle: float) -> float:
+def wrap_deg(angle: float) -> float:
     """Return the same angle within +-180 degrees."""
     return math.remainder(angle, 360.0)
 
@@ -167,9 +167,9 @@ class Controller:
             self._reset(now)
         if mode[5] == VELOCITY:
             turned_deg = setpoint.yaw_rate_dps * ATTITUDE_DT_S
-            self.desired_yaw_deg = cap_deg(self.desired_yaw_deg + turned_deg)
+            self.desired_yaw_deg = wrap_deg(self.desired_yaw_deg + turned_deg)
         elif mode[5] == ABSOLUTE:
-            self.desired_yaw_deg = cap_deg(setpoint.yaw_deg)
+            self.desired_yaw_deg = wrap_deg(setpoint.yaw_deg)
         self._position_in -= 1
         if self._position_in == 0:
             self._position_in = POSITION_EVERY
@@ -258,7 +258,7 @@ class MotorDriver:
             return MOTORS_OFF
         scale = FULL_COMMAND / supply_v
         p1, p2, p3, p4 = (
-            scale * motor_v(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
+            scale * motor_voltage(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
             for request in requests
         )
         most = max(p1, p2, p3, p4)

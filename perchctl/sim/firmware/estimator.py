@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.sim.firmware.controller import Estimate, cap_deg
-from perchctl.sim.firmware.outside import POSITION, Imu, OutsideFilter, Quaternion, Vector
+from perchctl.sim.firmware.controller import Estimate, wrap_deg
+from perchctl.sim.firmware.outside import POSITION, ExternalFilter, Imu, Quaternion, Vector
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 if TYPE_CHECKING:
@@ -57,10 +57,10 @@ class Estimator:
         self._velocity_noise = (0.0, 0.0, 0.0)
         self._past: deque[Vector] = deque(maxlen=_VELOCITY_LATE + 1)
         self._velocity_mps: Vector = (0.0, 0.0, 0.0)
-        self.outside: OutsideFilter | None = None
+        self.outside: ExternalFilter | None = None
         self._imu: Imu | None = None
         if scenario.extra.get("external_position"):
-            self.outside, self._imu = OutsideFilter(parameters), Imu(scenario)
+            self.outside, self._imu = ExternalFilter(parameters), Imu(scenario)
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
@@ -72,7 +72,7 @@ class Estimator:
         if self.outside is not None:
             self.outside.reset()
 
-    def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
+    def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
         """Take one measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self._parameters["stabilizer.estimator"] == KALMAN:
             self.outside.position(position_m)
@@ -127,7 +127,7 @@ class Estimator:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         lift = 2 * (w * y - x * z)
         pitch = math.asin(lift if -1.0 <= lift <= 1.0 else math.copysign(1.0, lift))
-        now.roll_deg = cap_deg(_DEG * (roll + bias[0]))
+        now.roll_deg = wrap_deg(_DEG * (roll + bias[0]))
         now.pitch_deg = -_DEG * (pitch + bias[1])  # the firmware's pitch is nose up
         now.yaw_deg = _DEG * math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
         if len(self._white) < 12:
@@ -192,7 +192,7 @@ class Estimator:
         now.vx_mps, now.vy_mps, now.vz_mps = vx + dx + nx, vy + dy + ny, vz + dz + nz
 
     def _move_outside(
-        self, outside: OutsideFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
+        self, outside: ExternalFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
     ) -> None:
         if imu.add(
             (world.fx_mps2, world.fy_mps2, world.fz_mps2),

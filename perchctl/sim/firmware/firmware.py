@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from perchctl.sim.firmware.controller import MODE_RAW, MOTORS_OFF, Controller, MotorDriver, Setpoint
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import Quaternion, Vector
-from perchctl.sim.firmware.planner import Planner
+from perchctl.sim.firmware.planner import HighLevelPlanner
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import LOG_VARIABLES, PARAMETERS, LogVariable, Parameter
@@ -56,7 +56,7 @@ class Firmware:
         self._low_level = False
         self._thrust_locked = True
         self.estimator = Estimator(self.scenario, self._parameters)
-        self.planner = Planner()
+        self.planner = HighLevelPlanner()
         self.supervisor = Supervisor()
         self.controller = Controller()
         self.driver = MotorDriver()
@@ -88,7 +88,7 @@ class Firmware:
         if step % PLANNER_EVERY == 0:
             self._consult_planner(t_s)
             if self.estimator.outside is not None:
-                self._pressed = self.world.contacts()[0] > 0.0
+                self._pressed = self.world.contact_state()[0] > 0.0
         if step % SUPERVISOR_EVERY == 0:
             ended = supervisor.update(
                 t_s,
@@ -104,7 +104,7 @@ class Firmware:
             self._watch_battery(t_s)
         setpoint = self._setpoint if supervisor.motors_allowed else _NULL
         if supervisor.state is State.LEVEL_OUT:
-            setpoint = setpoint.levelled()
+            setpoint = setpoint.level_setpoint()
         requests = self.controller.update(setpoint, self.estimator.now)
         if not supervisor.motors_allowed:
             requests = MOTORS_OFF
@@ -117,7 +117,7 @@ class Firmware:
 
     # Commands -----------------------------------------------------------------------
 
-    def low_level(self, setpoint: Setpoint) -> None:
+    def fly_setpoint(self, setpoint: Setpoint) -> None:
         """Fly this setpoint; it takes over from the high-level commander.
 
         Raw thrust is limited, and forced to 0 until one packet with thrust 0 has come since boot
@@ -139,17 +139,17 @@ class Firmware:
         self._inform_planner()
         self._low_level = False
 
-    def high_level(self, order: Callable[..., object], *values: Any) -> None:
-        """Give an order, a method of `Planner`; a low-level stream has priority over it."""
+    def give_order(self, order: Callable[..., object], *values: Any) -> None:
+        """Give an order, a method of `HighLevelPlanner`; a low-level stream has priority."""
         order(self.planner, *values, self.t_s)
 
     def emergency_stop(self) -> None:
         """Stop the motors and lock, within one supervisor update."""
         self.supervisor.emergency = True
 
-    def external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
+    def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
         """Take a position from outside, m, or a pose: w, x, y, z, body to world."""
-        self.estimator.external(position_m, quaternion)
+        self.estimator.take_external(position_m, quaternion)
 
     # What can be read ---------------------------------------------------------------
 

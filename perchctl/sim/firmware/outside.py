@@ -117,7 +117,7 @@ _REVERSION = 1e-3
 `attitudeReversion`)."""
 
 
-class OutsideFilter:
+class ExternalFilter:
     """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate.
 
     `covariance` (9, 9) is what it knows of its own errors: position, velocity and attitude, with
@@ -156,12 +156,12 @@ class OutsideFilter:
         self.velocity_mps = (vx + t * fx, vy + t * fy, vz + t * fz)
         half = 0.5 * t
         turn = (1.0, half * p, half * q, half * r)
-        w, x, y, z = normalized(multiplied(self.quaternion, turn))
+        w, x, y, z = normalize_quaternion(multiply_quaternions(self.quaternion, turn))
         if not flying:
             keep, (a, _, _, d) = 1.0 - _REVERSION, self._initial
             share = _REVERSION if w * a + z * d >= 0.0 else -_REVERSION
             reverted = (keep * w + share * a, keep * x, keep * y, keep * z + share * d)
-            w, x, y, z = normalized(reverted)
+            w, x, y, z = normalize_quaternion(reverted)
         self.quaternion = (w, x, y, z)
         self._grow(force)
         far_m, fast_mps = max(map(abs, self.position_m)), max(map(abs, self.velocity_mps))
@@ -181,7 +181,7 @@ class OutsideFilter:
         if not math.isfinite(norm) or norm < 0.5:
             return
         w, x, y, z = self.quaternion
-        left = multiplied(measured, (w, -x, -y, -z))
+        left = multiply_quaternions(measured, (w, -x, -y, -z))
         if abs(left[0]) < 1e-6 * norm:
             return  # half a turn, which has no direction
         twice = 2.0 / left[0]
@@ -213,7 +213,7 @@ class OutsideFilter:
         x, y, z = self.velocity_mps
         self.velocity_mps = (x + ex, y + ey, z + ez)
         turn = (1.0, 0.5 * a, 0.5 * b, 0.5 * c)
-        self.quaternion = normalized(multiplied(turn, self.quaternion))
+        self.quaternion = normalize_quaternion(multiply_quaternions(turn, self.quaternion))
 
     def _bound(self) -> None:
         bounded = np.clip(np.diag(self.covariance), _LEAST, _MOST)
@@ -233,13 +233,13 @@ class OutsideFilter:
         )
 
 
-def normalized(quaternion: Quaternion) -> Quaternion:
+def normalize_quaternion(quaternion: Quaternion) -> Quaternion:
     w, x, y, z = quaternion
     scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     return scale * w, scale * x, scale * y, scale * z
 
 
-def multiplied(first: Quaternion, second: Quaternion) -> Quaternion:
+def multiply_quaternions(first: Quaternion, second: Quaternion) -> Quaternion:
     """Return the turn by `second` and then by `first`."""
     w, x, y, z = first
     a, b, c, d = second

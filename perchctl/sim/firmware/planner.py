@@ -52,7 +52,7 @@ class Polynomial:
         return AxisState(value, rate, accel)
 
 
-class Planner:
+class HighLevelPlanner:
     """States idle, flying, landing; setpoints for the commander at 100 Hz."""
 
     def __init__(self) -> None:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     RefinedCorners,
+    apply_homography,
     doubled_area,
-    mapped,
+    homography_to_unit,
     mean_side_px,
     side_lengths_px,
-    to_unit,
     within,
 )
 from perchctl.vision.markers.detector import Picture, make_quadrilateral_finder
@@ -40,7 +40,7 @@ _SAME = 0.15  # of a side
 _SHEET = 1.3  # half sides of a marker that are surely paper
 
 
-def expected_in_blur(
+def find_expected_blurred(
     picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
     """Return the first marker near to where it is expected (4, 2) px. Fits that begin with little
@@ -57,19 +57,19 @@ def expected_in_blur(
         if resemblance(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
             continue
         for blur_px in blurs_px:
-            seen = aligned(picture, name, start, blur_px=blur_px)
+            seen = align_marker(picture, name, start, blur_px=blur_px)
             if seen is not None:
                 return {name: seen}
     return {}
 
 
-def hidden_in_blur(picture: Picture) -> dict[MarkerName, RefinedCorners]:
+def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
     """Return a marker anywhere: the best of all quadrilaterals."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _best(image, quads, setup.patterns):
-        seen = aligned(picture, name, corners_px, blur_px=_BLUR_PX)
+        seen = align_marker(picture, name, corners_px, blur_px=_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
@@ -122,7 +122,9 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
     if min(patch.shape) <= size or size < _MIN_TEMPLATE_PX:
         return corners_px
     grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
-    template = _template(pattern, mapped(to_unit(local - first), grid), side_px * scale)
+    template = _template(
+        pattern, apply_homography(homography_to_unit(local - first), grid), side_px * scale
+    )
     score = cv2.matchTemplate(patch.astype(np.float32), template, cv2.TM_CCOEFF_NORMED)
     _, _, _, peak = cv2.minMaxLoc(score)
     return np.asarray(corners_px + (np.array(peak) - first) / scale, dtype=np.float64)
@@ -157,7 +159,7 @@ _MIN_GROWTH, _MAX_GROWTH = 0.6, 1.6  # of the mean side
 _MIN_EVENNESS = 0.6  # shortest side over the longest
 
 
-def aligned(
+def align_marker(
     picture: Picture,
     name: MarkerName,
     start_px: Array,
@@ -179,8 +181,8 @@ def aligned(
     found = align(image, start_px, drawing, picture.camera, blur_px)
     if (
         found is None
-        or not verified(found, max_sigma)
-        or (alone and not told_apart(found))
+        or not is_verified(found, max_sigma)
+        or (alone and not is_distinctive(found))
         or found.moved_px > max(reach * side_px, _MIN_REACH_PX)
     ):
         return None
@@ -201,7 +203,7 @@ def aligned(
     return RefinedCorners(found.corners_px, sigma_px, True)
 
 
-def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
+def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
     """Return True if the picture looks like the drawing. Without the marker the pattern's
     correlation stays below 0.72 at the right strength; on it, it is above 0.95."""
     return (
@@ -213,7 +215,7 @@ def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
     )
 
 
-def told_apart(found: Alignment) -> bool:
-    """Return True if another codeword would look different. Of 36 others that `verified` took for
-    the marker, all had a flip above 0.5."""
+def is_distinctive(found: Alignment) -> bool:
+    """Return True if another codeword would look different. Of 36 others that `is_verified` took
+    for the marker, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA

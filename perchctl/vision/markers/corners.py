@@ -31,19 +31,19 @@ _INCREMENTS: Array = np.array(
 """Of each corner, how far an increment's terms move it in the marker's own coordinates."""
 
 
-def from_unit(corners: Array) -> Array:
+def homography_from_unit(corners: Array) -> Array:
     """Return the homography (3, 3) of the unit square to corners (4, 2)."""
     H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
-def to_unit(corners: Array) -> Array:
+def homography_to_unit(corners: Array) -> Array:
     """Return the homography (3, 3) of corners (4, 2) to the unit square."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
     return np.asarray(H, dtype=np.float64)
 
 
-def mapped(H: Array, points: Array) -> Array:
+def apply_homography(H: Array, points: Array) -> Array:
     """Return the points (..., 2) through a homography."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
@@ -51,14 +51,14 @@ def mapped(H: Array, points: Array) -> Array:
 
 def corner_jacobian(H: Array) -> Array:
     """Return the change (8, 8) of the corners that H (3, 3) makes of the unit square with the terms
-    of an increment P of `incremented`."""
+    of an increment P of `increment_homography`."""
     q = _UNIT1.dot(H.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
     return np.asarray((A @ _INCREMENTS).reshape(8, 8))
 
 
-def incremented(H: Array, p: Array) -> Array:
+def increment_homography(H: Array, p: Array) -> Array:
     """Return H (1 + P), scaled to 1 in its last term; p (8,) are the rows of P, but for its last
     0."""
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
@@ -95,14 +95,14 @@ def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -
     """Return the corners (4, 2) of a square `ratio` times as large with the same centre and plane;
     without a camera, as if no lens bent it."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
-    found = mapped(from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
+    found = apply_homography(homography_from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
     return found if camera is None else distort(found, camera)
 
 
 def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Return both markers, one perhaps where the other puts it."""
+    """Return both markers' corners; a missing marker is derived from the other one."""
     both = dict(expected)
     if "small" not in both and "large" in both:
         both["small"] = nested(both["large"], ratio, camera)
@@ -136,7 +136,7 @@ class RefinedCorners:
     least_blur_px: float = math.inf
 
 
-def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
+def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
     """Return the corners (4, 2) by `cv2.cornerSubPix`, or the raw ones."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))

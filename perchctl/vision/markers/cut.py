@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort, undistort
-from perchctl.vision.markers.corners import UNIT, RefinedCorners, mapped, within
+from perchctl.vision.markers.corners import UNIT, RefinedCorners, apply_homography, within
 from perchctl.vision.markers.detector import Covered, Picture, hides, make_aruco_detector
-from perchctl.vision.markers.edge_fit import MIDDLES, sample
-from perchctl.vision.markers.pattern import Drawing, Pattern, drawn
+from perchctl.vision.markers.edge_fit import MIDDLES, sample_profiles
+from perchctl.vision.markers.pattern import Drawing, Pattern, render_cells
 from perchctl.vision.markers.photometric_fit import likeness, make_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
@@ -45,11 +45,11 @@ _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its 
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Make what `cut_markers` keeps, before it is in a hurry."""
-    _outline(patterns), texture_of(patterns["large"].drawing), lattice_of(camera)
+    """Fill the caches of `fit_cut_markers` before the flight, so that its first call is fast."""
+    _outline(patterns), make_texture(patterns["large"].drawing), make_lattice(camera)
 
 
-def is_cut(
+def is_target_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
     """Return True if none of the expected markers (4, 2) px is surely in the picture and free of
@@ -63,10 +63,11 @@ def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -
     return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
 
 
-def cut_markers(
+def fit_cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker that what is in view stands for; `expected` are corners (4, 2) px."""
+    """Fit the target's visible part and return the corners of a marker that follow from it.
+    `expected` are the predicted corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -76,14 +77,14 @@ def cut_markers(
     if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_CELL_PX:
         return {}
     covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
-    view, texture = overview_of(image, camera, covered), texture_of(drawing)
+    view, texture = make_overview(image, camera, covered), make_texture(drawing)
     near = _moved_near(start, texture, view)
     if near is None:
         return {}
-    found = fitted(image, near, _outline(patterns), camera, covered)
+    found = fit_pose(image, near, _outline(patterns), camera, covered)
     if found is None or not _trusted(found):
         return {}
-    like, gain = looks_like(found.pose.H, texture, view)
+    like, gain = drawing_likeness(found.pose.H, texture, view)
     if like < _MIN_LIKENESS or gain < _MIN_GAIN:
         return {}
     name = _stands_for(found)
@@ -98,7 +99,7 @@ def shows_enough_of_target(
     marker's axes (3, 3) and centre (3,) so in the camera."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
-    found = foreseen(pose, _outline(patterns), camera)
+    found = predict_fit(pose, _outline(patterns), camera)
     if found is None or not _trusted(found):
         return False
     half = patterns["large"].drawing.ratio if _stands_for(found) == "small" else 1.0
@@ -114,10 +115,10 @@ def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
 def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
     """Return the outline of both markers, as they are printed."""
     large, small = patterns["large"], patterns["small"]
-    return outline_of(large.drawing, large.rim.tolerance, small.rim.tolerance)
+    return make_outline(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
 
-def _stands_for(found: Visible) -> MarkerName:
+def _stands_for(found: PoseFit) -> MarkerName:
     """Return the marker that was seen: the small one, if enough of it was."""
     return "small" if found.small >= _SMALL_PLACES else "large"
 
@@ -146,7 +147,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
     best, pose, lattice = _MIN_GLANCE, None, view.lattice
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
-        wide = drawn_over(RigidPose(start.R, t).H, texture, lattice, _SEARCHED)
+        wide = render_drawing(RigidPose(start.R, t).H, texture, lattice, _SEARCHED)
         mask = view.seen.astype(np.float32)
         score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
@@ -160,7 +161,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
     return pose
 
 
-def _trusted(found: Visible) -> bool:
+def _trusted(found: PoseFit) -> bool:
     """Return True if nearly all edges are there, and tell enough of the place."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
@@ -170,7 +171,7 @@ def _trusted(found: Visible) -> bool:
     )
 
 
-def _corners(found: Visible, half: float, camera: CameraModel) -> RefinedCorners | None:
+def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners | None:
     """Return the corners of the marker of that half side, if the lens reaches."""
     r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
     X = r + found.pose.t
@@ -221,7 +222,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """Grey values at a lattice's nodes (rows, columns), and which are seen."""
+    """A reduced picture: grey values at a lattice's nodes (rows, columns), and which are seen."""
 
     lattice: Lattice
     grey: Grey
@@ -229,7 +230,7 @@ class Overview:
 
 
 @lru_cache(maxsize=8)
-def lattice_of(camera: CameraModel) -> Lattice:
+def make_lattice(camera: CameraModel) -> Lattice:
     """Return the lattice over a camera's picture."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _RIM_POINTS)
@@ -264,11 +265,11 @@ def lattice_of(camera: CameraModel) -> Lattice:
     )
 
 
-def overview_of(
+def make_overview(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """Return a picture at a glance, where `mask` (its shape) is 0."""
-    lattice = lattice_of(camera)
+    """Return the reduced picture at the lattice's nodes, seen where `mask` (image shape) is 0."""
+    lattice = make_lattice(camera)
     seen = lattice.inside
     if mask is not None:
         covered = (mask != 0).astype(np.float32)
@@ -289,7 +290,7 @@ def _coarse(fine: Grey) -> Grey:
     return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
+def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
     """Return the whiteness of the drawing through H (3, 3) at the nodes and `margin` more
     around."""
     step = lattice.step / _FINE
@@ -312,16 +313,16 @@ def drawn_over(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) ->
     return _coarse(np.asarray(fine, np.float32))
 
 
-def looks_like(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
+def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
     """Return the likeness of the picture with the drawing through H in its best light, and that
     light's gain, grey levels from black to white."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
-    on = np.abs(mapped(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1) < PAPER
+    on = np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1) < PAPER
     if np.count_nonzero(on) < _LEAST_NODES:
         return 0.0, 0.0
-    white = drawn_over(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
+    white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
     grey = view.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
@@ -358,7 +359,7 @@ Texture = tuple[NDArray[np.float32], Array]
 
 
 @lru_cache(maxsize=8)
-def outline_of(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
+def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
     """Return the outline of both markers; tolerances are in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
@@ -385,10 +386,10 @@ def outline_of(drawing: Drawing, large_tolerance: float, small_tolerance: float)
 
 
 @lru_cache(maxsize=8)
-def texture_of(drawing: Drawing) -> Texture:
+def make_texture(drawing: Drawing) -> Texture:
     """Return a picture of the drawing up to `PAPER`, beyond which it is white."""
     axis = make_grid(_TEXELS, PAPER).axis
-    wide = drawn(drawing, axis, PAPER / _TEXELS)
+    wide = render_cells(drawing, axis, PAPER / _TEXELS)
     more = (len(wide) - _TEXELS) // 2
     scale = _TEXELS / (2.0 * PAPER)
     first = PAPER * scale - 0.5 + more
@@ -450,7 +451,7 @@ class RigidPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Visible:
+class PoseFit:
     """A pose with its covariance (6, 6) of turn and move; how many places were in view, how many
     showed their edge, how many of these are the small marker's; and the spread of one."""
 
@@ -480,13 +481,13 @@ _Round = tuple[Array, Array, Array, float]
 the variance of one place, px^2."""
 
 
-def fitted(
+def fit_pose(
     image: NDArray[np.uint8],
     start: RigidPose,
     outline: Outline,
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
-) -> Visible | None:
+) -> PoseFit | None:
     """Fit the pose in which the outline's edges are the picture's."""
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
@@ -512,8 +513,8 @@ def fitted(
     return _visible(pose, found, places, outline)
 
 
-def foreseen(pose: RigidPose, outline: Outline, camera: CameraModel) -> Visible | None:
-    """Return what `fitted` would make of a flawless picture in that pose."""
+def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
+    """Return what `fit_pose` would make of a flawless picture in that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -535,7 +536,7 @@ def _in_view(
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
     x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
-    near = np.flatnonzero(ahead & (np.hypot(*x.T) < lattice_of(camera).reach))
+    near = np.flatnonzero(ahead & (np.hypot(*x.T) < make_lattice(camera).reach))
     at = distort(x[near], camera)
     room = reach_px + 1.0
     inside = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
@@ -579,7 +580,7 @@ def _offsets(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return how far along its normal each place's edge is (n,) px, if it is."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
-    grey = sample(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
+    grey = sample_profiles(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
     u = half_px[:, None] * MIDDLES.astype(np.float64)
     mass = gradient * np.exp(-0.5 * (u / (0.5 * half_px[:, None])) ** 2)
@@ -612,7 +613,7 @@ def _solved(
     return step, inverse, weight, variance
 
 
-def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> Visible:
+def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> PoseFit:
     """Return the pose with its covariance."""
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
@@ -622,7 +623,7 @@ def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) 
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
     cov = inverse @ (middle / variance**2 + np.diag(_PRIOR)) @ inverse
     shown = w > 0.0
-    return Visible(
+    return PoseFit(
         pose=pose,
         cov=cov[:6, :6],
         in_view=len(shown),

@@ -1,6 +1,6 @@
 """Finding the two markers of the target in a picture: the steps of a frame, in order.
 
-1. where they are expected, by verification instead of search (`follow`);
+1. where they are expected, by verification instead of search (`follow_markers`);
 2. where the picture cuts them, by what is left of the drawing (`cut`);
 3. by a search in a window around that place, then in the whole picture (`search`);
 4. where blur may hide them (`blurred`).
@@ -19,21 +19,21 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig
 from perchctl.values import replace
-from perchctl.vision.fields import halves, interpolated_sigma_px
-from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in_blur
+from perchctl.vision.fields import field_frames, interpolated_sigma_px
+from perchctl.vision.markers.blurred import align_marker, find_blurred, find_expected_blurred
 from perchctl.vision.markers.corners import (
     NESTED_SIGMA_PX,
     RefinedCorners,
     mean_side_px,
-    refine_each,
+    refine_subpix,
     side_lengths_px,
     with_missing_marker,
     within,
 )
-from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
-from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_in, hides
+from perchctl.vision.markers.cut import MOST_AGE_S, fit_cut_markers, is_target_cut, may_be_whole
+from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_area, hides
 from perchctl.vision.markers.edge_fit import refine_lines
-from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen
+from perchctl.vision.markers.partial import ROOM_PX, KnownBy, fit_partly_seen, is_wholly_seen
 from perchctl.vision.markers.pattern import (
     LEAST_SIDE_PX,
     Pattern,
@@ -41,7 +41,7 @@ from perchctl.vision.markers.pattern import (
     cells_mostly_agree,
     resembles,
 )
-from perchctl.vision.markers.search import Found, Look, search, search_halved
+from perchctl.vision.markers.search import FoundMarkers, Look, search, search_halved
 from perchctl.vision.target_selection import AsideOf
 from perchctl.vision.types import (
     MARKERS,
@@ -91,14 +91,14 @@ def detect_markers(
 
     def detected(frame: Frame) -> Detections:
         """Return what is in a frame of one moment."""
-        hidden = hidden_in(frame, setup.mask)
+        hidden = hidden_area(frame, setup.mask)
         image = frame.image if hidden is None else filled(frame.image, hidden)
-        picture, found = Picture(image, hidden, setup, camera), Found()
+        picture, found = Picture(image, hidden, setup, camera), FoundMarkers()
         seen: _Seen = {}
         if look != "fits" and both and setup.by_lines:
             seen, found = _followed(picture, both, shift)
-        if not seen and lately and is_cut(both, image.shape, hidden):
-            seen = cut_markers(picture, expected)
+        if not seen and lately and is_target_cut(both, image.shape, hidden):
+            seen = fit_cut_markers(picture, expected)
         findable = not was_cut or may_be_whole(both, image.shape)
         if look not in ("blurred", "fits") and (
             (not seen and findable) or _missing(picture, seen, expected)
@@ -108,8 +108,8 @@ def detect_markers(
                 seen = _refined(picture, found)
         if not seen and look not in ("sharp", "window") and setup.by_lines:
             bare = replace(picture, hidden=None)
-            seen = expected_in_blur(bare, expected, turn) if expected else hidden_in_blur(bare)
-            seen = improved(bare, seen)
+            seen = find_expected_blurred(bare, expected, turn) if expected else find_blurred(bare)
+            seen = improve_corners(bare, seen)
         shifts = (r.edge_shift for r in seen.values())
         return Detections(
             frame_index=frame.index,
@@ -122,8 +122,8 @@ def detect_markers(
         )
 
     if frame.fields == "woven":
-        return with_motion(between(*map(detected, halves(frame))), previous)
-    return with_motion(detected(frame), previous)
+        return with_flow(between(*map(detected, field_frames(frame))), previous)
+    return with_flow(detected(frame), previous)
 
 
 def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
@@ -143,10 +143,10 @@ def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
 
 def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
-) -> tuple[_Seen, Found]:
+) -> tuple[_Seen, FoundMarkers]:
     """Return what is where both are expected, or nearby: where no side was met, a near target has
     most often moved on further than a side is looked for."""
-    seen = follow(picture, expected, shift)
+    seen = follow_markers(picture, expected, shift)
     if not seen:
         found = search_halved(picture, expected)
         again = {} if found is None else _refined(picture, found)
@@ -154,8 +154,8 @@ def _followed(
             return again, found
     seen = follow_partly(picture, expected, seen, shift)
     if any(lines_suffice(r, picture.setup.patterns[name]) for name, r in seen.items()):
-        return seen, Found()
-    return improved(picture, seen), Found()
+        return seen, FoundMarkers()
+    return improve_corners(picture, seen), FoundMarkers()
 
 
 def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
@@ -169,27 +169,27 @@ def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]
     )
 
 
-def _refined(picture: Picture, found: Found) -> _Seen:
+def _refined(picture: Picture, found: FoundMarkers) -> _Seen:
     """Return what the search found with better corners. Those without four lines for sides are
     measured by what of these is seen: a search takes the picture's edge for a side."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(picture, raw) if setup.by_lines else {}
     seen = {
-        name: lines.get(name) or refine_each(image, corners, setup.patterns[name].rim.cells)
+        name: lines.get(name) or refine_subpix(image, corners, setup.patterns[name].rim.cells)
         for name, corners in raw.items()
     }
     if not setup.by_lines:
         return seen
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
-        if r.refined and wholly_seen(picture, r):
+        if r.refined and is_wholly_seen(picture, r):
             continue
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
             starts.insert(0, picture.nested(small.corners_px, "large"))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        tried = (seen_partly(picture, name, start, known_by) for start in starts)
+        tried = (fit_partly_seen(picture, name, start, known_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
@@ -197,7 +197,7 @@ def _refined(picture: Picture, found: Found) -> _Seen:
             picture.hidden, r.corners_px, 1.0
         ):
             del fitted[name]
-    return improved(picture, fitted, searched=True)
+    return improve_corners(picture, fitted, searched=True)
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
@@ -238,7 +238,7 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
     return corners
 
 
-def with_motion(now: Detections, previous: Detections | None) -> Detections:
+def with_flow(now: Detections, previous: Detections | None) -> Detections:
     """Return `now` with the flow of its markers since a short time before."""
     if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
@@ -268,12 +268,12 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """Return True if no drawing could give better corners."""
+    """Return True if the line fit is good enough that a photometric fit would not improve it."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
-def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
+def improve_corners(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
     """Return the markers that were seen, with better corners and with the other marker if it shows.
     What a search found stays only where lines suffice, the drawing confirms it, or the other marker
     was seen with it."""
@@ -289,7 +289,7 @@ def improved(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
         blur_px = _blur_px(better.get(name))
-        exact = aligned(picture, name, start, _REACH, blur_px, max_sigma, alone)
+        exact = align_marker(picture, name, start, _REACH, blur_px, max_sigma, alone)
         if exact is not None:
             better[name] = exact
         elif alone and searched:
@@ -340,7 +340,7 @@ def fit_lines(
     return {name: found for name, found in zip(places, fitted, strict=True) if found is not None}
 
 
-def follow(
+def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
     """Return the expected markers that are verified by all sides and cells."""
@@ -355,7 +355,7 @@ def follow(
     return {
         name: found
         for name, found in fit_lines(picture, places, shift).items()
-        if wholly_seen(picture, found) and cells_agree(image, found.corners_px, patterns[name])
+        if is_wholly_seen(picture, found) and cells_agree(image, found.corners_px, patterns[name])
     }
 
 
@@ -365,14 +365,14 @@ def follow_partly(
     seen: _Seen,
     shift: EdgeShift | None = None,
 ) -> _Seen:
-    """Return the markers of `follow` with the others by what is seen of them. Where the small
-    marker was met, the large one is looked for around it."""
+    """Return the markers of `follow_markers` with the others by what is seen of them. Where the
+    small marker was met, the large one is looked for around it."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
         places["large"] = picture.nested(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = seen_partly(picture, name, places[name], "track", shift)
+            partly = fit_partly_seen(picture, name, places[name], "track", shift)
             if partly is not None:
                 seen[name] = partly
     if "large" in seen and "small" not in seen:
@@ -406,10 +406,10 @@ def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
             found = fit_lines(picture, {"large": found.corners_px}).get("large")
         if found is not None:
             start = found.corners_px
-            good = wholly_seen(picture, found) and is_centred(found)
+            good = is_wholly_seen(picture, found) and is_centred(found)
             if good and cells_mostly_agree(image, start, pattern):
                 return found
-    partly = seen_partly(picture, "large", start, "other")
+    partly = fit_partly_seen(picture, "large", start, "other")
     return partly if partly and is_centred(partly) else None
 
 

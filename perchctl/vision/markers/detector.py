@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision.markers.corners import nested
-from perchctl.vision.markers.pattern import Pattern, drawing_of, pattern_of, rim_of_bits
+from perchctl.vision.markers.pattern import Pattern, make_drawing, make_pattern, make_rim
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
@@ -59,13 +59,13 @@ def make_aruco_detector(
             _dictionary(small_bits, config.correction_bits_small),
         ),
         patterns={
-            "large": pattern_of(
-                rim_of_bits(large_bits, _PRINT_M * (len(large_bits) + 2) / target.large.side_m),
-                drawing_of(large_bits, small_bits, ratio),
+            "large": make_pattern(
+                make_rim(large_bits, _PRINT_M * (len(large_bits) + 2) / target.large.side_m),
+                make_drawing(large_bits, small_bits, ratio),
             ),
-            "small": pattern_of(
-                rim_of_bits(small_bits, _PRINT_M * (len(small_bits) + 2) / target.small.side_m),
-                drawing_of(small_bits),
+            "small": make_pattern(
+                make_rim(small_bits, _PRINT_M * (len(small_bits) + 2) / target.small.side_m),
+                make_drawing(small_bits),
             ),
         },
         ratio=ratio,
@@ -88,7 +88,7 @@ def make_marker_decoder(
 
 
 def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
-    """Return OpenCV's detector, set to take nearly any quadrilateral."""
+    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -131,7 +131,7 @@ _REDUCED, _SPREAD = 8, 2.0  # times smaller, and there the spread of what fills
 _TINY = 1e-4
 
 
-def hidden_in(frame: Frame, mask: Covered | None) -> Covered | None:
+def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
     """Return where a frame shows the vehicle, which covers `mask` (h, w) of a whole picture: in a
     single field, whose missing rows are interpolated, beside it too."""
     if mask is None or frame.fields not in ("top", "bottom"):

@@ -26,11 +26,11 @@ from perchctl.vision.markers.corners import (
     OUT,
     UNIT,
     RefinedCorners,
+    apply_homography,
     doubled_area,
-    from_unit,
-    mapped,
+    homography_from_unit,
+    homography_to_unit,
     side_lengths_px,
-    to_unit,
 )
 from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
@@ -85,7 +85,9 @@ def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> 
     return origin, normal.view(np.float64)
 
 
-def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array) -> Floats:
+def sample_profiles(
+    image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array
+) -> Floats:
     """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
     repeated outside.
 
@@ -176,10 +178,10 @@ def _refined_once(
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides near to the raw corners, once."""
     found: list[RefinedCorners | None] = [None] * len(raw_px)
-    markers = markers_of(raw_px, rims, camera)
+    markers = prepare_markers(raw_px, rims, camera)
     if markers is None:
         return found
-    sides, inner = measure(image, markers, camera, with_inner=known is None)
+    sides, inner = measure_edges(image, markers, camera, with_inner=known is None)
     glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
     clipped = glaring.reshape(-1, 4) @ _QUARTERS > CLIPPED_SHARE
     if known is not None and clipped.any():
@@ -279,7 +281,7 @@ def _measured_shift(
     k, prior_px = markers.widest, shift_prior_px(float(sides.grey[:, :, -1].mean()))
     rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
     r = 1.0 - 2.0 / rim.cells
-    own = mapped(to_unit(corners[k]), inner.points)
+    own = apply_homography(homography_to_unit(corners[k]), inner.points)
     far = np.matmul(own, OUT[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
     w = inner.weight * (inner.blur_px < _MAX_BLUR_CELLS * depth_px)[:, None]
@@ -410,7 +412,7 @@ class Samples:
     blur_px: Array
 
 
-def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
+def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
     """Return what is to be measured of markers; None where one is no square."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
@@ -436,7 +438,7 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
     )
 
 
-def measure(
+def measure_edges(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
     """Return the edges' places on profiles across all sides and, on request, across the inner edges
@@ -448,7 +450,7 @@ def measure(
     with_inner = with_inner and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
     if with_inner:
         r = 1.0 - 2.0 / rim.cells
-        inner = mapped(from_unit(markers.corners[widest]), r * UNIT)[None]
+        inner = apply_homography(homography_from_unit(markers.corners[widest]), r * UNIT)[None]
         starts = np.concatenate([starts, inner])
         lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
         depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
@@ -461,10 +463,10 @@ def measure(
     ends = starts.take(NEXT, axis=1).reshape(-1, 2)
     origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
-    near_px, half_px = (each[of] for each in reaches_px(markers.cell_px))
-    grey = sample(image, origin, normal, half_px)
-    around = surroundings(s, markers.rims, rim, depth_px.ravel())
-    offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
+    near_px, half_px = (each[of] for each in profile_reaches_px(markers.cell_px))
+    grey = sample_profiles(image, origin, normal, half_px)
+    around = neighbour_edges(s, markers.rims, rim, depth_px.ravel())
+    offset_px, weight, blur_px = locate_edges(grey, half_px, near_px, around)
     points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES, 2)
     points = points if finite(points) else np.nan_to_num(points)
@@ -476,14 +478,14 @@ def measure(
     return sides, inner_edges if with_inner else None
 
 
-def reaches_px(cell_px: Array) -> tuple[Array, Array]:
+def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
     """Return how far the windows around edges and the profiles across reach."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
-def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> Surroundings:
-    """Return the `Surroundings` of profiles at places `s` (rows, n): four rows a rim, and then
+def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> NeighbourEdges:
+    """Return the `NeighbourEdges` of profiles at places `s` (rows, n): four rows a rim, and then
     perhaps the inner edges of one border."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
@@ -497,7 +499,7 @@ def surroundings(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> 
         free = free * inner.open[_SIDES, (at + 0.3).astype(np.intp)]
         possible[-4:] = free > 0.0
         outside[-4:] = 1.0
-    return Surroundings(depth_px, inside, outside, possible)
+    return NeighbourEdges(depth_px, inside, outside, possible)
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
@@ -527,7 +529,7 @@ _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.flo
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class NeighbourEdges:
     """The neighbouring edges that blur into the one that is measured.
 
     depth_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 where another
@@ -541,8 +543,8 @@ class Surroundings:
     possible: NDArray[np.bool_]
 
 
-def locate(
-    grey: Floats, half_px: Array, near_px: Array, around: Surroundings
+def locate_edges(
+    grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
 ) -> tuple[Array, Array, Array]:
     """Return where on each profile the edge is that rises along it.
 
@@ -572,7 +574,9 @@ def locate(
 class _Profiles:
     """The gradients along all profiles, and what every window over them needs."""
 
-    def __init__(self, grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> None:
+    def __init__(
+        self, grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
+    ) -> None:
         self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
         self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # where, (rows, steps)
         self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)

@@ -23,11 +23,11 @@ from perchctl.vision.markers.corners import (
     OUT,
     UNIT,
     RefinedCorners,
+    apply_homography,
     corner_jacobian,
     doubled_area,
-    from_unit,
-    incremented,
-    mapped,
+    homography_from_unit,
+    increment_homography,
     mean_side_px,
     side_lengths_px,
     within,
@@ -38,14 +38,14 @@ from perchctl.vision.markers.edge_fit import (
     PROFILES,
     STEPS,
     Floats,
-    Surroundings,
-    locate,
+    NeighbourEdges,
+    locate_edges,
+    neighbour_edges,
     places,
-    reaches_px,
-    sample,
+    profile_reaches_px,
+    sample_profiles,
     shift_prior_px,
     side_profiles,
-    surroundings,
 )
 from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELLS, Pattern
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
@@ -61,7 +61,7 @@ _MAX_STEP = 0.5
 _MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
 
 
-def seen_partly(
+def fit_partly_seen(
     picture: Picture,
     name: MarkerName,
     start_px: Array,
@@ -83,7 +83,7 @@ def seen_partly(
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
-    H = from_unit(start)
+    H = homography_from_unit(start)
     for k in range(_ROUNDS):
         seen = seen_edges(picture, H, pattern)
         if seen is None:
@@ -93,7 +93,7 @@ def seen_partly(
         p = step[:8]
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
-        H = incremented(H, p)
+        H = increment_homography(H, p)
         if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _STILL_PX:
             break
     assert seen is not None
@@ -104,7 +104,7 @@ def seen_partly(
     return found
 
 
-def wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
+def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
     """Return True if nothing of the marker is hidden or beyond the edge."""
     room_px = ROOM_PX + found.blur_px
     return within(found.corners_px, picture.image.shape, room_px) and not hides(
@@ -155,8 +155,8 @@ def _corners(
     chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
     freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
     noise2 = max(_TAILS * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
-    pinhole = mapped(H, UNIT)
-    corners_px = distort(mapped(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
+    pinhole = apply_homography(H, UNIT)
+    corners_px = distort(apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.rim.cells
     # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
@@ -227,7 +227,7 @@ def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)
-    spots = mapped(from_unit(rays), pattern.spots)
+    spots = apply_homography(homography_from_unit(rays), pattern.spots)
     at = distort(spots, camera)
     near = np.abs(undistort(at, camera) - spots).max(axis=1) * camera.K[0, 0] < _INVERTED_PX
     return np.where(near[:, None], at, np.nan)
@@ -290,7 +290,7 @@ class SeenEdges:
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
     """Return the edges near to where the square H has them, if enough are seen."""
-    camera, cells, corners = picture.camera, pattern.rim.cells, mapped(H, UNIT)
+    camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
@@ -300,7 +300,7 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
     to_rays: Array = np.linalg.inv(camera.K) @ H
-    starts = np.stack([mapped(to_rays, r * UNIT) for r in rings])
+    starts = np.stack([apply_homography(to_rays, r * UNIT) for r in rings])
     scale_px = (0.25 * (sides_px[BEFORE] + sides_px[NEXT]))[side]
     s = places(sides_px[side] * at)
     ends = starts[:, NEXT].reshape(-1, 2)
@@ -310,9 +310,9 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     # White is outside of the marker, and inside of its border.
     turn = float(np.sign(doubled_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
-    near_px, half_px = reaches_px(np.full(len(at), cell_px))
+    near_px, half_px = profile_reaches_px(np.full(len(at), cell_px))
     depth_px = 2.0 * scale_px / cells
-    around = surroundings(s, [pattern.rim], pattern.rim, depth_px)
+    around = neighbour_edges(s, [pattern.rim], pattern.rim, depth_px)
     free = around.possible & _in_view(picture, origin, normal, near_px)
     kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
     if len(kept) < _LEAST_EDGES:
@@ -320,17 +320,19 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
     origin, normal, free = origin[kept], normal[kept], free[kept]
     near_px, half_px = near_px[kept], half_px[kept]
-    grey = sample(picture.image, origin, normal, half_px)
+    grey = sample_profiles(picture.image, origin, normal, half_px)
     lit = _unspoilt(grey, free, near_px, half_px)
     if lit is None:
         return None
     good, white = lit
-    around = Surroundings(depth_px[kept], around.inside[kept], around.outside[kept], good)
-    offset_px, weight, blur_px = locate(grey, half_px, near_px, around)
+    around = NeighbourEdges(depth_px[kept], around.inside[kept], around.outside[kept], good)
+    offset_px, weight, blur_px = locate_edges(grey, half_px, near_px, around)
     weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_WEIGHT] = 0.0
     found = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
-    own = mapped(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(origin.shape)
+    own = apply_homography(np.asarray(np.linalg.inv(H)), pinhole_px(found, camera)).reshape(
+        origin.shape
+    )
     if not np.isfinite(own).all():
         return None
     far = np.einsum("rni,ri->rn", own, OUT[side]) - at[:, None]

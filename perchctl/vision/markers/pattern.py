@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import from_unit, mapped, within
+from perchctl.vision.markers.corners import apply_homography, homography_from_unit, within
 
 LEAST_SIDE_PX = 7.0  # below it a marker is a spot
 MIN_CONTRAST = 10.0  # grey levels
@@ -64,7 +64,7 @@ class Pattern:
     inner: NDArray[np.bool_]
 
 
-def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
+def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
     """Return the rim of a marker with the inner bits (n, n), 1 = white, whose blur may reach the
     edge."""
     n = len(bits)
@@ -82,7 +82,7 @@ def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
     return Rim(white, white * second, tolerance)
 
 
-def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
+def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
     """Return how a marker looks, with spots in all cells that are uncovered."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
@@ -166,7 +166,7 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
     """Return the grey values (k,) at the spots; None outside of the picture."""
-    at = mapped(from_unit(corners_px), pattern.spots)
+    at = apply_homography(homography_from_unit(corners_px), pattern.spots)
     # Spots are inside of the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
         return None
@@ -204,11 +204,11 @@ class Drawing:
 
     @property
     def reach(self) -> float:
-        """Half side of the part that is compared."""
+        """Half the side of the compared square, in the marker's own coordinates."""
         return 1.0 + _REACH_CELLS * 2.0 / len(self.cells)
 
 
-def drawing_of(
+def make_drawing(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
     """Return the drawing of inner bits, 1 = white; with a centre, the large marker's."""
@@ -237,7 +237,7 @@ def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
     """Return the drawing at n by n nodes, and perhaps what is beyond its sheet."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
-    paper = drawn(drawing, axis, half_node)
+    paper = render_cells(drawing, axis, half_node)
     if drawing.sheet is None:
         return (paper,)
     on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
@@ -250,7 +250,7 @@ def square(cells: int, n: int) -> NDArray[np.float32]:
     return sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
-def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
+def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
     """Return the whiteness of each node and of `EDGE` nodes all around."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
@@ -270,7 +270,7 @@ def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) ->
     return np.asarray(soft[EDGE : EDGE + len(axis)], dtype=np.float64)
 
 
-def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Return the nodes, those all around among them, blurred by so many."""
+def blur_nodes(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Return the nodes, with the margin around them, after a Gaussian blur of `sigma` nodes."""
     soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

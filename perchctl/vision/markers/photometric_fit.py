@@ -20,8 +20,14 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.lens import distort, undistort_px
-from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, incremented, mapped
-from perchctl.vision.markers.pattern import EDGE, Drawing, sheets, soft_cells, softened, square
+from perchctl.vision.markers.corners import (
+    UNIT,
+    apply_homography,
+    corner_jacobian,
+    homography_from_unit,
+    increment_homography,
+)
+from perchctl.vision.markers.pattern import EDGE, Drawing, blur_nodes, sheets, soft_cells, square
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
@@ -110,15 +116,15 @@ def align(
         return None
     n = int(np.clip(math.ceil(reach * side_px / _GRID_PX), _MIN_GRID, _MAX_GRID))
     node_px, cell_px = reach * side_px / n, side_px / len(drawing.cells)
-    grid, H = make_grid(n, reach), from_unit(start)
+    grid, H = make_grid(n, reach), homography_from_unit(start)
     lens_px = lens_shift_px(grid, H, camera)
     patch = _patch_around(image, grid, H, lens_px)
     if patch is None:
         return None
     around, first = patch
 
-    def drawn(blur_px: float) -> Rendered:
-        return rendered(drawing, n, round(math.log(blur_px / node_px) / _STEP))
+    def drawn(blur_px: float) -> RenderedDrawing:
+        return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _STEP))
 
     def possible_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
@@ -138,7 +144,7 @@ def align(
         p = step[_SHAPE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
             return None
-        H, total = incremented(H, p), total + p
+        H, total = increment_homography(H, p), total + p
         moved_px = 0.5 * side_px * float(np.abs(p[:6]).max())
         since_lens_px += moved_px
         sigma2 = seen.sigma**2
@@ -153,7 +159,7 @@ def align(
     assert equations is not None
     # What the last round left over, its step being next to nothing.
     gain, error = equations.gain, equations.error
-    corners_px = through_lens(mapped(H, UNIT).T, camera).T
+    corners_px = distort_px(apply_homography(H, UNIT).T, camera).T
     pattern, strength = _pattern_seen(seen, grey, gain)
     many = _repeated(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
@@ -174,7 +180,7 @@ def align(
     )
 
 
-def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
+def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
     """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
     the increments so far."""
     rows, products = seen.light
@@ -187,7 +193,7 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
     error = grey - np.einsum("kn,k->n", rows, light)
     J = np.concatenate([_lit_jacobian(seen, light), rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
-    products = gram(J) / noise
+    products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width a round
@@ -203,14 +209,14 @@ def _equations(grey: Array, seen: Rendered, total: Array) -> _Equations | None:
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """Return the correlation with the fit that leaves `error` over."""
+    """Return the correlation of `grey` with a fit whose residual is `error`."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
 
 
 def _cells_seen(
-    seen: Rendered, equations: _Equations, inverse: Array, many: float
+    seen: RenderedDrawing, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
     """Return `flip` and `flip_sigma` of an `Alignment`, by the inverse of N. A wrong bit is looked
     for as it would look: blurred, and without what the unknowns of the fit explain of it."""
@@ -226,7 +232,7 @@ def _cells_seen(
     return float(flips.max()), math.sqrt(many * noise / float(own.min()))
 
 
-def _pattern_seen(drawing: Rendered, grey: Array, gain: float) -> tuple[float, float]:
+def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
     """Return the correlation and height of the inner pattern in grey (n * n,)."""
     rows, products = drawing.plain
     A = products + 1e-9 * np.eye(len(products))
@@ -273,7 +279,7 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 # Offset, gain, their slopes, the tone curve's bend, the grey beyond the sheet: all shift edges.
 
 
-def _lit_jacobian(drawing: Rendered, light: Array) -> Array:
+def _lit_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
     """Return the changes (9, n * n) of grey with increment and the blur's square."""
     gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
@@ -314,13 +320,13 @@ def _crossings(axis: Array) -> Array:
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
-def projected(H: Array, uv1: Array) -> Array:
+def project_nodes(H: Array, uv1: Array) -> Array:
     """Map own coordinates (3, n) to pinhole pixels, x and y (2, n)."""
     q = H.dot(uv1)
     return np.asarray(q[:2] / q[2])
 
 
-def through_lens(pin_px: Array, camera: CameraModel) -> Array:
+def distort_px(pin_px: Array, camera: CameraModel) -> Array:
     """Convert pinhole pixels (2, n) to pixels of the real lens."""
     K = camera.K
     rays = np.empty((pin_px.shape[1], 2))
@@ -333,8 +339,8 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
     """Return how far the lens moves each node that is seen through H, (2, n * n): computed for a
     few nodes, and for the rest by the polynomial through these."""
     uv1, between = _few(grid)
-    pin = projected(H, uv1)
-    shift = (through_lens(pin, camera) - pin).reshape(2, _FEW, _FEW)
+    pin = project_nodes(H, uv1)
+    shift = (distort_px(pin, camera) - pin).reshape(2, _FEW, _FEW)
     return np.asarray((between @ shift @ between.T).reshape(2, -1))
 
 
@@ -354,7 +360,7 @@ def _patch_around(
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the part of the picture that is needed, and its first pixel (2, 1)."""
     h, w = image.shape
-    x, y = projected(H, grid.uv1) + lens_px
+    x, y = project_nodes(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     if not (least.min() >= -1.0 and (most <= (w, h)).all()):
         return None
@@ -368,7 +374,7 @@ def _patch_around(
 def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
     """Return the grey values at the nodes, (n * n,), of a patch moved by the lens's shift (2, n *
     n)."""
-    at = (projected(H, grid.uv1) + offset_px).astype(np.float32)
+    at = (project_nodes(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
@@ -381,8 +387,8 @@ def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) ->
 _BLOCK = 256  # values of a row
 
 
-def gram(rows: Array) -> Array:
-    """Return the products (k, k) of rows (k, n) with each other."""
+def gram_matrix(rows: Array) -> Array:
+    """Return the Gram matrix (k, k), ``rows @ rows.T``, of rows (k, n)."""
     k, n = rows.shape
     whole = n - n % _BLOCK
     blocks = rows[:, :whole].reshape(k, -1, _BLOCK).transpose(1, 0, 2)
@@ -400,7 +406,7 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedDrawing:
     """The drawing's sheets, blurred by `sigma` nodes."""
 
     drawing: Drawing
@@ -422,17 +428,17 @@ class Rendered:
         (white, _), *others = self.sheets
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
         stacked = np.stack(rows + [beyond for beyond, _ in others])
-        return stacked, gram(stacked)
+        return stacked, gram_matrix(stacked)
 
     @cached_property
     def plain(self) -> tuple[Array, Array]:
         """What light makes of a black square of the drawing's size, without its slopes and
         bend: rows (4 or 5, n * n), and their products."""
-        soft = softened(square(len(self.drawing.cells), self.grid.n), self.sigma)
+        soft = blur_nodes(square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
         lit, _ = self.light
         rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
-        return rows, gram(rows)
+        return rows, gram_matrix(rows)
 
     @cached_property
     def soft_cells(self) -> Array:
@@ -442,16 +448,16 @@ class Rendered:
 
 
 @lru_cache(maxsize=16)
-def rendered(drawing: Drawing, n: int, step: int) -> Rendered:
+def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
     """Return the drawing at n by n nodes over its reach, blurred by that step."""
-    return Rendered(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
+    return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 
 def _blurred_with_slope(
     sharp: NDArray[np.float32], sigma: float, axis: Array
 ) -> tuple[Array, Array]:
     """Return a sheet blurred by sigma nodes, and its changes."""
-    soft = softened(sharp, sigma)
+    soft = blur_nodes(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)
     middle = slice(e, e + n)

@@ -40,7 +40,7 @@ Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundMarkers:
     """Raw corners (4, 2) px of at most one of each marker, whether the mirror image of one is
     there, and how many whole targets there were to choose from."""
 
@@ -54,7 +54,7 @@ def search(
     expected: Mapping[MarkerName, Array],
     look: Look = "all",
     own: AsideOf | None = None,
-) -> Found:
+) -> FoundMarkers:
     """Search the window, if there is one, and the whole picture where that gave too little; only
     one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several where
     none is expected."""
@@ -65,7 +65,7 @@ def search(
         if quickly is not None:
             return quickly
         window = search_window(expected, setup.ratio, shape) or whole
-        found = Found()
+        found = FoundMarkers()
         if len(expected) == 2:
             found = _pass(picture, window, expected, QUICK_THRESHOLDS, own)
         if len(found.corners_px) < 2 and window != whole:
@@ -79,7 +79,7 @@ def search(
 
 def search_halved(
     picture: Picture, expected: Mapping[MarkerName, Array], own: AsideOf | None = None
-) -> Found | None:
+) -> FoundMarkers | None:
     """Search the window at half the size: a millisecond. None where that did not show all that
     should be whole in the picture."""
     shape = picture.image.shape
@@ -123,7 +123,7 @@ def _pass(
     thresholds: Thresholds,
     own: AsideOf | None,
     halved: bool = False,
-) -> Found:
+) -> FoundMarkers:
     """Return what one pass of OpenCV's detector over the window gives."""
     setup, part = picture.setup, picture.image[window]
     if halved:
@@ -131,7 +131,7 @@ def _pass(
     detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
-        return Found()
+        return FoundMarkers()
     rows, columns = window
     first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
@@ -146,7 +146,7 @@ def _pass(
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_wholes(candidates, setup.ratio))
     chosen = choose(candidates, expected, setup.ratio, own)
-    return Found(chosen, mirrored, targets)
+    return FoundMarkers(chosen, mirrored, targets)
 
 
 def choose(

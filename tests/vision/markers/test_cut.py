@@ -26,10 +26,10 @@ from perchctl.vision.markers.corners import within
 from perchctl.vision.markers.cut import (
     MOST_AGE_S,
     RigidPose,
-    cut_markers,
-    fitted,
-    is_cut,
-    outline_of,
+    fit_cut_markers,
+    fit_pose,
+    is_target_cut,
+    make_outline,
 )
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
@@ -163,12 +163,12 @@ def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> Non
 def test_what_leaves_a_direction_open_is_refused() -> None:
     """With a lens through which its corners could be told."""
     plain = replace(CAMERA, dist=np.zeros(5))
-    outline = outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
+    outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     image = render(*LINE, plain, noise=4.0, blur_px=1.0)
-    found = fitted(image, _pose("line"), outline, plain)
+    found = fit_pose(image, _pose("line"), outline, plain)
     assert found.shown == found.in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
-    assert cut_markers(Picture(image, None, SETUP, plain), expected) == {}
+    assert fit_cut_markers(Picture(image, None, SETUP, plain), expected) == {}
     assert nothing(look("width", waved(picture("width")))), "nor do edges that fit badly"
 
 
@@ -194,12 +194,12 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     image, mask = gear(picture("height"))
     true = corners("small", BESIDE_HEIGHT)
     expected = both(BESIDE_HEIGHT, 10.0)
-    assert cut_markers(Picture(image, None, SETUP, CAMERA), expected) == {}
-    outline = outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
+    assert fit_cut_markers(Picture(image, None, SETUP, CAMERA), expected) == {}
+    outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
-    fit = fitted(image, _pose("height"), outline, CAMERA, own)
+    fit = fit_pose(image, _pose("height"), outline, CAMERA, own)
     assert fit.shown == fit.in_view
-    found = cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
+    found = fit_cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
 
@@ -210,11 +210,11 @@ def test_markers_behind_the_gear_are_cut() -> None:
     free, hidden = np.zeros(SHAPE, dtype=bool), np.zeros(SHAPE, dtype=bool)
     x, y = at["small"][0].astype(int)
     hidden[: y + 30, : x + 30] = True
-    assert not is_cut(at, SHAPE)
-    assert not is_cut(at, SHAPE, free)
-    assert is_cut(at, SHAPE, hidden)
-    assert is_cut({"small": corners("small", BESIDE_HEIGHT)}, SHAPE, free)
-    assert not is_cut({}, SHAPE)
+    assert not is_target_cut(at, SHAPE)
+    assert not is_target_cut(at, SHAPE, free)
+    assert is_target_cut(at, SHAPE, hidden)
+    assert is_target_cut({"small": corners("small", BESIDE_HEIGHT)}, SHAPE, free)
+    assert not is_target_cut({}, SHAPE)
 
 
 def _pose(name: str) -> RigidPose:
@@ -227,19 +227,19 @@ def _pose(name: str) -> RigidPose:
 def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     """Of the large marker alone in view, and its far corners where the lens model has no
     inverse."""
-    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing, 0.0, 0.0)
+    image, outline = picture("corner"), make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
-    found = fitted(image, _pose("corner"), outline, CAMERA)
+    found = fit_pose(image, _pose("corner"), outline, CAMERA)
     assert found.small == 0
-    assert cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
+    assert fit_cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
 
 
 def test_a_prediction_may_be_off_in_range() -> None:
     rvec, tvec = BESIDE_HEIGHT
     for growth in (0.93, 1.07):
         expected = both((rvec, tvec * (1.0, 1.0, growth)))
-        assert "small" in cut_markers(Picture(picture("height"), None, SETUP, CAMERA), expected)
+        assert "small" in fit_cut_markers(Picture(picture("height"), None, SETUP, CAMERA), expected)
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])

@@ -8,7 +8,7 @@ import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.detect import around, between, detect_markers, follow
+from perchctl.vision.markers.detect import around, between, detect_markers, follow_markers
 from perchctl.vision.markers.detector import Picture, make_aruco_detector
 from perchctl.vision.markers.search import misfit
 from perchctl.vision.types import Detection, Detections
@@ -119,7 +119,7 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.small is not None
     assert found.large is None
-    seen = follow(Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)})
+    seen = follow_markers(Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)})
     assert around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine_each
+from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine_subpix
 from perchctl.vision.markers.edge_fit import refine_lines
-from perchctl.vision.markers.pattern import cells_agree, rim_of_bits
+from perchctl.vision.markers.pattern import cells_agree, make_rim
 from tests.helpers.markers import POSE, SETUP, corners, waved
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
@@ -20,7 +20,7 @@ from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 
 RIMS = {6: bits_of("DICT_4X4_1000", 997), 7: bits_of("DICT_ARUCO_ORIGINAL", 5)}
-RIMS = {cells: rim_of_bits(bits) for cells, bits in RIMS.items()}
+RIMS = {cells: make_rim(bits) for cells, bits in RIMS.items()}
 POSES = [
     (0.0, 0.0, 0.24, 0.0, 0.0, 0.0),
     (0.02, -0.01, 0.24, 0.5, 0.05, -0.08),
@@ -136,7 +136,7 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
     raw = np.array([[200.0, 200.0], [260.0, 205.0], [255.0, 262.0], [198.0, 258.0]])
     for image, most_px in ((noise, 6.5), (np.full_like(noise, 128), 1e-5)):
         assert refine_lines(image, raw[None], [RIMS[6]], CAMERA) == [None]
-        result = refine_each(image, raw, 6)
+        result = refine_subpix(image, raw, 6)
         assert not result.refined
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
         assert result.sigma_px in (RAW_SIGMA_PX, SUBPIX_SIGMA_PX)

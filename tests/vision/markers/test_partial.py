@@ -17,10 +17,10 @@ from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig
 from perchctl.vision import Frame, make_pipeline
 from perchctl.vision.fields import field_picture
 from perchctl.vision.lens import undistort_px
-from perchctl.vision.markers.corners import RefinedCorners, from_unit, mapped
+from perchctl.vision.markers.corners import RefinedCorners, apply_homography, homography_from_unit
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import Picture, hidden_in, hides, make_aruco_detector
-from perchctl.vision.markers.partial import KnownBy, seen_edges, seen_partly
+from perchctl.vision.markers.detector import Picture, hidden_area, hides, make_aruco_detector
+from perchctl.vision.markers.partial import KnownBy, fit_partly_seen, seen_edges
 from perchctl.vision.markers.search import search
 from perchctl.vision.types import Detections, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame, waved
@@ -35,7 +35,7 @@ def partly(
     image: Grey, start_px: Array, known_by: KnownBy, hidden: NDArray[np.bool_] | None = None
 ) -> RefinedCorners | None:
     """The large marker by what is seen of it."""
-    return seen_partly(Picture(image, hidden, SETUP, CAMERA), "large", start_px, known_by)
+    return fit_partly_seen(Picture(image, hidden, SETUP, CAMERA), "large", start_px, known_by)
 
 
 def beyond(pose: tuple[Array, Array], name: MarkerName = "large") -> float:
@@ -157,7 +157,7 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
 def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.inner & ~LARGE.white)[0]
-    spots = mapped(from_unit(true), LARGE.spots[LARGE.owner == black])
+    spots = apply_homography(homography_from_unit(true), LARGE.spots[LARGE.owner == black])
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
     found = partly(bright, true, "track")
@@ -222,7 +222,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
     assert hides(covered, TRUE)
-    bare, at = render(*POSE, noise=2.0), from_unit(undistort_px(TRUE, CAMERA))
+    bare, at = render(*POSE, noise=2.0), homography_from_unit(undistort_px(TRUE, CAMERA))
     seen = [seen_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE) for gear in (None, covered)]
     whole, rest = (edges.weight.sum() for edges in seen)
     assert (rest < 0.95 * whole) == (name != "corner"), "no side that is hidden counts"
@@ -244,10 +244,10 @@ def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
     image = np.where(covered, 0, 200).astype(np.uint8)
     for first_row, name in ((0, "top"), (1, "bottom")):
         field = field_picture(image, first_row)
-        hidden = hidden_in(Frame(0, 0.0, field, fields=name), covered)
+        hidden = hidden_area(Frame(0, 0.0, field, fields=name), covered)
         assert hidden is not None
         assert (field[~hidden] == 200).all()
-    whole = hidden_in(Frame(0, 0.0, image, fields="whole"), covered)
+    whole = hidden_area(Frame(0, 0.0, image, fields="whole"), covered)
     assert whole is not None
     assert np.array_equal(whole, covered)
 
