@@ -34,6 +34,10 @@ AsideOf = Callable[[MarkerName, Array], float]
 """How far a marker with corners (4, 2) px is from the own target's place, or inf."""
 
 
+_NO_POSE_M = 1e9
+"""A marker whose corners give no pose yet, as beside a highlight: looked at last, but not refused."""
+
+
 def marker_offset_m(
     place: OwnTargetPlace,
     t_s: float,
@@ -45,8 +49,9 @@ def marker_offset_m(
     """Return what `AsideOf` does, in a picture taken at `attitude`."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
-    away_m = math.inf if pose is None else target_offset_m(pose, attitude, place, setup)
-    return away_m if attitude is None or away_m <= place.within_m else math.inf
+    away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
+    is_bounded = attitude is not None and math.isfinite(place.within_m)
+    return away_m if not is_bounded or away_m <= place.within_m else math.inf
 
 
 def target_offset_m(

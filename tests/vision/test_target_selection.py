@@ -25,6 +25,8 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
+from perchctl.vision.target_selection import OwnTargetPlace, marker_offset_m
+from tests.helpers.markers import box
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = CameraModel((640, 480), K, np.zeros(5))
@@ -182,3 +184,15 @@ def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
     if not taken:  # an estimate that jumped would have it elsewhere: not for ever
         later = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(30)]
         assert any("taken up anew" in note for note in later)
+
+
+def test_a_marker_without_a_pose_yet_is_refused_only_by_a_known_place() -> None:
+    """A highlight on a corner spoils what the search finds; the edges still give it."""
+    spoilt, setup = box(320, 240, 120), make_pipeline(profile(), CAMERA).pose
+    spoilt[0] += 60.0, 0.0
+    level = Attitude(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
+    anywhere, known = OwnTargetPlace(), OwnTargetPlace((0.0, 0.0), 0.3)
+    for place, attitude in ((anywhere, None), (known, None), (anywhere, level)):
+        offset_m = marker_offset_m(place, 0.0, attitude, setup, "large", spoilt)
+        assert 1e3 < offset_m < math.inf  # behind all that have a pose
+    assert marker_offset_m(known, 0.0, level, setup, "large", spoilt) == math.inf
