@@ -35,7 +35,7 @@ AsideOf = Callable[[MarkerName, Array], float]
 
 
 _NO_POSE_M = 1e9
-"""A marker whose corners give no pose yet, as beside a highlight: looked at last, but not refused."""
+"""Of corners that give no pose yet, as beside a highlight: looked at last, but not refused."""
 
 
 def marker_offset_m(

@@ -65,9 +65,9 @@ def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:
         assert with_positioning(profile, "target").positioning == own
     back = with_positioning(with_positioning(deck, "target"), "mocap").positioning
     assert back == PositioningConfig.model_validate({"by": "mocap"})
-    named = Profile.model_validate({"positioning": {"host": "lab"}})  # a capture, for the option
-    for profile in (mocap, named):
-        assert with_positioning(profile, "mocap").positioning == mocap.positioning
+    assert with_positioning(mocap, "mocap").positioning == mocap.positioning
+    named = Profile.model_validate({"positioning": {"by": "deck", "body": "cf2"}})  # for the option
+    assert with_positioning(named, "mocap").positioning.body == "cf2"
 
 
 @pytest.mark.parametrize(("words", "complaints"), [

@@ -183,8 +183,8 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
 class GyroRotation:
     """The integrated rotation R_world_body (n, 3, 3) at t_s (n,), with its rates (n, 3).
 
-    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the body's rotation, in world axes,
-    by the gyroscope's bias (rad/s) and by its scale error.
+    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the body's rotation, in world
+    axes, by the gyroscope's bias (rad/s) and by its scale error.
     """
 
     t_s: Array
