@@ -38,7 +38,7 @@ WORKERS_S = 20.0
 """The first worker must register within this time."""
 _CLOSE_S = 1.0
 _QUIET = ("distributed", "tornado", "asyncio")
-_LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
+_LIBRARIES = ("numpy", "mujoco-core", "filterpy", "distributed")
 """Compute a flight's figures or carry them; OpenCV, of several names, is compared apart."""
 
 

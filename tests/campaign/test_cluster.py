@@ -94,7 +94,7 @@ def test_a_worker_like_this_computer_flies(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize(
-    "name", ["perchctl", "python", "opencv", "numpy", "mujoco", "filterpy", "distributed"]
+    "name", ["perchctl", "python", "opencv", "numpy", "mujoco-core", "filterpy", "distributed"]
 )
 def test_another_program_or_library_is_named_with_both_versions(
     name: str, monkeypatch: pytest.MonkeyPatch
