@@ -134,8 +134,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint one tick later. Without a sight of the target it sinks: from lower down it
-    is soonest seen again."""
+    """The held setpoint a tick later; unsighted, lower, from where the target is soonest seen."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
@@ -255,8 +254,7 @@ def motors_are_still(c: Context) -> bool:
 
 
 def stop_motors(c: Context) -> Acted:
-    """Stop and notify, `STOPS` times: one lost notify locks what hangs. Again while there is
-    thrust."""
+    """Stop and notify, `STOPS` times: one lost notify locks what hangs. Again under thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()

@@ -173,7 +173,6 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
 
 
 def _knows_its_place(c: Context) -> bool:
-    """True if a position and a heading are left to come down by."""
     if c.state.astray or c.state.blind_s is not None or (c.by_sight and not _is_sighted(c)):
         return False
     # Without a vertical speed raw thrust would be blind, and the vehicle's own landing is left.
@@ -331,7 +330,6 @@ def give_up_position(c: Context) -> Context:
 
 
 def _reckon(c: Context) -> PlannerState:
-    """The state with its dead reckoning one tick later."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     astray = state.astray and not c.by_sight
@@ -703,8 +701,7 @@ def _is_overdue(c: Context) -> bool:
 
 
 def _braking(c: Context) -> tuple[float, float]:
-    """Roll and pitch against the sideways speed, and against the attitude's error as pictures
-    measured it; level without a heading."""
+    """Tilt against sideways speed and the attitude error of pictures; level without a heading."""
     if c.state.heading_lost or is_in_magnet_reach(c):
         return 0.0, 0.0
     yaw_rad = c.telemetry.yaw_rad

@@ -125,8 +125,7 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 
 
 def _mount_watched(c: Context) -> MountingMonitor:
-    """The mounting's watch with this tick's frame, if that measured the target over fresh
-    telemetry."""
+    """The mounting's watch with this tick's frame, if measured over fresh telemetry."""
     state = c.state
     measured = c.obs.new_frame and state.confirmed > 0 and c.proves and not state.hold
     if state.target_m is None or not measured or state.phase not in IN_THE_OPEN:

@@ -192,7 +192,6 @@ def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    """Return the dot product of two short sequences, without arrays."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -56,8 +56,7 @@ class CaptureFailure:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return what the child connects to: Vicon and VRPN take a port with the name, the others want
-    it apart."""
+    """Return what the child connects to: Vicon and VRPN take name and port joined, others apart."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -106,8 +105,7 @@ class MotionCapture:
             raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """Return the newest frame since the last call that shows the body; without one, the
-        newest."""
+        """Return the newest frame since the last call, if possible one that shows the body."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
             frames[-1] if frames else None

@@ -67,15 +67,13 @@ def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:
 
 
 def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
-    """Return the file of a vehicle's comparison. `vehicle`: as `perchctl.link.vehicle_uri` has
-    it."""
+    """Return a vehicle's comparison file; `vehicle` is as `perchctl.link.vehicle_uri` has it."""
     of = repr(_set_up(config, vehicle)).encode()
     return user_folder("state") / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """Return what is known of this vehicle in this set-up. A file that cannot be read counts as
-    none."""
+    """Return what is known of this vehicle in this set-up; an unreadable file counts as none."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())

@@ -51,8 +51,7 @@ def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Plac
 
 
 def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
-    """Return the body's place under a target that stands still. Of `attitude` roll and pitch count
-    alone."""
+    """Return the body's place under a still target; of `attitude` only roll and pitch count."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
@@ -112,8 +111,7 @@ class TargetFeed:
     def add_pose(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
-        """Take a pose that this turn's picture gave; `then`: the vehicle's attitude and estimated
-        position at its exposure."""
+        """Take a pose of this turn's picture; `then`: attitude and position at its exposure."""
         if pose.t_s <= self._seen_s:
             return
         # A known place may be newer than a picture that is still on its way.
@@ -138,8 +136,7 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the state; it has a problem also while the target has not been seen from the
-        ground."""
+        """Return the state; a target not yet seen from the ground is a problem, too."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None

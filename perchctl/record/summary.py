@@ -15,8 +15,7 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 class RecordingEnd(NamedTuple):
-    """What became of a recording, by its keys for programs: the file's name, how many pictures are
-    in it, how many are not, and the first reason why."""
+    """A recording's end: file, how many pictures it has and lacks, and the first reason why."""
 
     recording: str
     pictures: int

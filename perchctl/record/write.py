@@ -109,8 +109,7 @@ class LogWatcher:
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
-        """Open the log of a simulated flight: the same seed gives the same bytes. Errors:
-        InvalidValue."""
+        """Open a simulated flight's log: one seed gives the same bytes. Errors: InvalidValue."""
         header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
         return cls._opened(path, header, profile, record, live=False)
 
@@ -302,8 +301,7 @@ def sent_line(sent: SentCommand) -> bytes:
 
 
 def turn_line(turn: Turn) -> bytes:
-    """Return a turn as one line of the log, whole and exact, by the fields of
-    `perchctl.mission.Turn`."""
+    """Return a turn as one exact line of the log, by the fields of `perchctl.mission.Turn`."""
     record = {"kind": "turn", **to_exact_json(turn)}
     obs, samples = turn.observation, turn.taken.late or turn.taken.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:

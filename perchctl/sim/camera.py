@@ -26,8 +26,7 @@ PoseAt = Callable[[float], Array]
 
 @dataclass(frozen=True, eq=False)
 class DeliveredFrame:
-    """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
-    two fields of an interlaced one."""
+    """An arrived frame; `t_exposure_s`: middle of its exposure, or between interlaced fields."""
 
     t_arrival_s: float
     t_exposure_s: float

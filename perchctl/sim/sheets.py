@@ -130,8 +130,7 @@ class Ceiling:
 
 
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
-    """Return the same smooth surface with more cells; left and right, top and bottom fit
-    together."""
+    """Return the same smooth surface with more cells, whose opposite rims fit together."""
     padded = np.pad(tile, 2, mode="wrap")
     # One axis after the other, without what lies around the tile: at the coarsest a third.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
@@ -227,6 +226,5 @@ def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
 
 @lru_cache(maxsize=4)
 def printed_sheet(target_json: str) -> Sheet:
-    """Return the sheet of a target; its textures cost more than a second, and flights share
-    them."""
+    """Return a target's sheet; flights share its textures, which cost more than a second."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))

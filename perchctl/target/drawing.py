@@ -65,8 +65,7 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Return the exact share of black in the windows of size_px x size_px pixels around the
-        centre, 0..1."""
+        """Return the exact share of black, 0..1, in size_px x size_px windows around the centre."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)

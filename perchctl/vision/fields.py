@@ -42,8 +42,7 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
 def is_combed(image: Grey) -> bool:
-    """Return True if a picture, (h, w) grey, holds two fields of different times: its rows differ
-    much more from the other field's than from their own."""
+    """Return True if a picture's (h, w) rows differ far more between its fields than within one."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False
@@ -66,8 +65,7 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """Return the top and the bottom field, each (h, w), of a picture that holds two of different
-    times, else the picture itself."""
+    """Return the top and bottom field, each (h, w), of a combed picture, else the picture."""
     if not is_combed(image):
         return (image,)
     return field_picture(image, 0), field_picture(image, 1)

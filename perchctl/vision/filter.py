@@ -184,7 +184,6 @@ def step_track(
         track: the track so far, None before the first sight.
         measured: None where nothing was seen. A measurement that is not finite counts as
             nothing seen.
-        t_s: the frame's time.
 
     Returns None when there is nothing (left) to track: never seen, or unseen for more
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the

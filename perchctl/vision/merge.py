@@ -34,8 +34,7 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) of
-    place."""
+    """Target in the tracks' frame: (x, y, z, yaw), velocity, covariances; bias (3, 4) of place."""
 
     vector: Array
     velocity_mps: Array

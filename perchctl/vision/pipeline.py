@@ -122,8 +122,7 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
-    """Return the new memory and what a stream's frame holds, each for a `step` of its own: one
-    picture, or the two fields of an interlaced camera in their order of time."""
+    """Return memory and a frame's pictures, each for its own `step`: one, or two fields by time."""
     fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 

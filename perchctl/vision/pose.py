@@ -32,9 +32,8 @@ _Source = Literal["large", "small", "joint"]
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """The constants of pose estimation. `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
-    (3,) the gear's tip, and `readout_s` the time from a picture's first row to its last; None: not
-    known."""
+    """The constants of pose estimation: `T_body_cam` (4, 4), the camera's mounting, `gear_body_m`
+    (3,), the gear's tip, and `readout_s` from a picture's first row to its last, if known."""
 
     config: PoseConfig
     target: TargetConfig
@@ -45,8 +44,7 @@ class PoseSetup:
 
     @cached_property
     def corners_m(self) -> dict[_Source, Array]:
-        """The corners of each marker (4, 3) in its own axes, in the order of a detection's, and
-        ``joint`` (8, 3) those of both, the large one's first."""
+        """Corners (4, 3) of each marker in its own axes; ``joint`` (8, 3): both, large first."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
@@ -180,8 +178,7 @@ def normal_cam(pose: MarkerPose) -> Array:
 
 
 def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
-    """Return the change (3,) of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9); the
-    target's x axis is the marker's."""
+    """Return the change (3,) of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9)."""
     dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(heading[0, 0]), float(heading[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
@@ -231,8 +228,7 @@ class TiltPrior:
     spread_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
-        """Return True if the normal is known and the candidate's is further away than the
-        spread."""
+        """Return True if the known normal and the candidate's differ by more than the spread."""
         return (
             self.normal_cam is not None
             and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
@@ -253,8 +249,7 @@ def solve(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
 
 
 def gauss_newton(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine a pose with each corner's own spread, from a start that is near; None where that
-    fails."""
+    """Refine a pose with each corner's own spread, from a near start; None where that fails."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -374,8 +369,7 @@ def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
 
 
 def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
-    """Return the best candidate near the other tilt, whose normal is mirrored at the line of sight;
-    none where both agree."""
+    """Return the best candidate near the normal mirrored at the line of sight, if it is another."""
     R = rotation_matrix(scored.rvec)
     normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
     other = 2.0 * float(normal @ sight) * sight - normal
@@ -408,17 +402,15 @@ def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPri
 
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
-    """Return how far corners (n, 3) are out of the sheet's plane at one standard deviation of each
-    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners to
-    either."""
+    """Return how far corners (n, 3) leave the sheet's plane at one sigma of each curl, (2n, 2) m,
+    for x and y of each: the whole rim to one side, or two corners to either."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def curl_weight(curl: Array) -> Array:
-    """Return the weight matrix (2n, 2n) of the corner errors: the inverse of the covariance
-    ``I + curl curl^T``, for `curl` (2n, k)."""
+    """Return the corner errors' weights (2n, 2n), inverse of ``I + curl curl^T``; curl (2n, k)."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight

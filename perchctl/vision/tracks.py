@@ -39,8 +39,7 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in either frame, whether there is a gate, and the own target's
-    place."""
+    """The filters' constants in either frame, whether poses are gated, and the own place."""
 
     level: FilterSetup
     world: FilterSetup
@@ -55,8 +54,7 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks one frame on; `measured` feeds nothing where the verdict has not taken its
-    pose."""
+    """The tracks one frame on; `measured` feeds nothing if the verdict has not taken its pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -145,8 +143,7 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose, as a measurement; `whole` if it rests on both markers; `looks_there` if the
-    lock's place is in the picture."""
+    """A measured pose; `whole`: of both markers; `looks_there`: the lock's place is in view."""
 
     t_s: float
     pose: MarkerPose
@@ -249,7 +246,6 @@ class _Fit:
 
     @property
     def away_m(self) -> float:
-        """How far away the pose is."""
         return float(np.linalg.norm(self.off[1:]))
 
 
@@ -277,7 +273,6 @@ def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> b
 
 
 def _range_m(sight: FramePose) -> float:
-    """Return the target's distance from the camera."""
     return math.hypot(*sight.pose.tvec_m.tolist())
 
 
@@ -288,8 +283,7 @@ def _unclaimed(range_m: float) -> Array:
 
 
 def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
-    """Return True if the pose goes on from the last one as seen from the vehicle, much better than
-    in the world."""
+    """Return True if the pose goes on as the vehicle saw it last, much better than in the world."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False

@@ -1,4 +1,4 @@
-"""The values that walk down the vision hallway, one frozen dataclass a room."""
+"""The values that vision's steps exchange, frozen dataclasses."""
 
 from __future__ import annotations
 

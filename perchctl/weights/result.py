@@ -39,8 +39,7 @@ _HEAD = """\
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """All that a fit found out. `chosen` names the method whose weights are offered; `other` is
-    the evidence from other data, named `other_name`."""
+    """A fit's findings; `chosen` names the method offered, `other_name` the data behind `other`."""
 
     errors: Errors
     fits: dict[str, FittedWeights]
@@ -61,8 +60,7 @@ class Result:
 
     @property
     def recommended(self) -> Array:
-        """The weights to fly with: the fitted ones where they are proven to beat the
-        better single marker, elsewhere that marker alone, (4,)."""
+        """The fitted weights where proven better than the better marker, else that one's, (4,)."""
         alone = np.where(self.evidence.better == 0, 1.0, 0.0)
         return np.where(self.proven, self.fits[self.chosen].weights, alone)
 
@@ -128,8 +126,7 @@ def weights_record(result: Result) -> dict[str, Any]:
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
-    """Return the RMS error (x, y, z, yaw) of each set of weights with the half width of its
-    interval."""
+    """Return each set of weights' RMS error (x, y, z, yaw) and its interval's half width."""
     record = {}
     for name in found.squares:
         rms, half = found.rms(name)

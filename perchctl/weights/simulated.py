@@ -29,8 +29,7 @@ _STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class CameraPlace:
-    """A place of the camera, and `actual`, the target relative to the gear in the level frame
-    there, (4,)."""
+    """A camera place, and `actual`, the target relative to the gear in the level frame, (4,)."""
 
     T_world_cam: Array
     actual: Array

@@ -103,8 +103,7 @@ class Estimator:
         flying: bool = False,
         pressed: bool = False,
     ) -> None:
-        """Estimate one control period later. Motors that are `spinning` shake the accelerometer;
-        `flying` is what the supervisor says."""
+        """Estimate one control period later. `spinning` motors shake the accelerometer."""
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:

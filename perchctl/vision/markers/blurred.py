@@ -78,8 +78,7 @@ def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
 def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in their turn;
-    the most alike first, and each place once."""
+    """Return quads (m, 4, 2) that resemble a marker, rolled to it, best first, each place once."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []

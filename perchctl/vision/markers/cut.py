@@ -52,8 +52,7 @@ def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraMo
 def is_target_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """Return True if none of the expected markers (4, 2) px is surely in the picture and free of
-    the vehicle's gear."""
+    """Return True if no expected marker (4, 2) px is surely in the picture and free of the gear."""
     whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(hides(hidden, c) for c in whole)
 
@@ -66,8 +65,7 @@ def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -
 def fit_cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the target's visible part and return the corners of a marker that follow from it.
-    `expected` are the predicted corners (4, 2) px."""
+    """Return a marker's corners, fitted to the target's visible part near `expected` (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -95,8 +93,7 @@ def fit_cut_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """Return True if what a picture shows of the target is enough to measure it, with the large
-    marker's axes (3, 3) and centre (3,) so in the camera."""
+    """Return True if a picture of the large marker at this pose (3, 3), (3,) can be measured."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
     found = predict_fit(pose, _outline(patterns), camera)
@@ -108,12 +105,10 @@ def shows_enough_of_target(
 
 @lru_cache(maxsize=4)
 def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
-    """Return how the target's markers look."""
     return make_aruco_detector(DetectorConfig(), target).patterns
 
 
 def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
-    """Return the outline of both markers, as they are printed."""
     large, small = patterns["large"], patterns["small"]
     return make_outline(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
@@ -278,7 +273,6 @@ def make_overview(
 
 
 def _looked_up(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
-    """Return the picture's values at the lattice's nodes."""
     small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
     fine = cv2.remap(small, lattice.x, lattice.y, cv2.INTER_LINEAR)
     return _coarse(np.asarray(fine, np.float32))
@@ -291,8 +285,7 @@ def _coarse(fine: Grey) -> Grey:
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the whiteness of the drawing through H (3, 3) at the nodes and `margin` more
-    around."""
+    """Return the drawing's whiteness through H (3, 3) at the nodes and `margin` more around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -314,8 +307,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
 
 
 def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Return the likeness of the picture with the drawing through H in its best light, and that
-    light's gain, grey levels from black to white."""
+    """Return the likeness to the drawing through H in its best light, and its gain, grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)

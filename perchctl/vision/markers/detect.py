@@ -90,7 +90,6 @@ def detect_markers(
         shift = replace(shift, age=age) if age < _SHIFT_PICTURES else None
 
     def detected(frame: Frame) -> Detections:
-        """Return what is in a frame of one moment."""
         hidden = hidden_area(frame, setup.mask)
         image = frame.image if hidden is None else filled(frame.image, hidden)
         picture, found = Picture(image, hidden, setup, camera), FoundMarkers()
@@ -201,7 +200,6 @@ def _refined(picture: Picture, found: FoundMarkers) -> _Seen:
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
-    """Return the marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -386,15 +384,13 @@ def follow_partly(
 
 
 def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """Return the large marker around a small one that was found, of which a part may be covered or
-    cut off."""
+    """Return the large marker around a found small one; a part may be covered or cut off."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        """Return True if the small marker is where the large one has it."""
         centre = picture.nested(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)

@@ -57,8 +57,7 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """Return where along sides of these lengths (rows,) profiles are, as shares of the side (rows,
-    n): not near the corners, where the next side blurs."""
+    """Return profile places along sides (rows,) as shares (rows, n), away from blurred corners."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -152,9 +151,8 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2); None where these are not a marker's sides. The
-    shift of all edges is measured unless it is known. Wide edges, and those near to the profiles'
-    ends, are looked at twice, the second time with the profiles centred on them."""
+    """Fit lines to the sides of m markers (m, 4, 2), None where they are no marker's; measure the
+    edges' shift unless `known`. Wide or off-centre edges are fitted again on centred profiles."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -176,7 +174,6 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides near to the raw corners, once."""
     found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = prepare_markers(raw_px, rims, camera)
     if markers is None:
@@ -227,8 +224,7 @@ def _refined_once(
 
 
 def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
-    """Return the lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
-    RMS distance of the points from these, px (4m,)."""
+    """Return lines (4m, 3): nx, ny, c, n.x = c, |n| = 1; and weighted RMS residuals, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -313,8 +309,7 @@ def _measured_shift(
 
 
 def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides lie further out than their middles, as
-    far as noise does not explain it."""
+    """Return how much farther out the widest marker's side ends lie than middles, beyond noise."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -441,8 +436,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 def measure_edges(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
-    """Return the edges' places on profiles across all sides and, on request, across the inner edges
-    of the border with the widest cells, if these are wide enough."""
+    """Return samples of all sides and, if asked and wide enough, of a border's inner edges."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -485,8 +479,7 @@ def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
 
 
 def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> NeighbourEdges:
-    """Return the `NeighbourEdges` of profiles at places `s` (rows, n): four rows a rim, and then
-    perhaps the inner edges of one border."""
+    """Return neighbours at `s` (rows, n): four rows a rim, then maybe one border's inner edges."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -631,8 +624,7 @@ class _Profiles:
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return straight lines (rows, n) through the middles of the halves of each row, whatever a
-    quarter of either shows."""
+    """Return lines (rows, n) through each row's half middles, robust to a bad quarter of either."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2

@@ -113,9 +113,8 @@ def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the changes (9, rows * n) of the edges with the terms of `corner_jacobian` and the
-    shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
-    spread."""
+    """Return the edges' changes (9, rows * n) with the terms of `corner_jacobian` and the shift of
+    all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's spread."""
     u, v = seen.own[..., 0], seen.own[..., 1]
     nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
@@ -189,8 +188,7 @@ _INVERTED_PX = 0.5  # the lens model holds where its inverse is one
 
 
 def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
-    """Return True if the cells have their colour that are in the picture, not hidden, and not in
-    light that glares; how many, depends on what else says which marker it is."""
+    """Return True if visible, unglared cells have their colour; how many, `known_by` decides."""
     image, hidden = picture.image, picture.hidden
     h, w = image.shape
     at = _spots_px(corners_px, pattern, picture.camera)
@@ -295,7 +293,6 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
     cell_px = float(sides_px.mean()) / cells
-    # The marker's sides, and perhaps the inner edges of its border.
     rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _INNER_CELL_PX else (1.0,)
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4

@@ -65,8 +65,7 @@ class Pattern:
 
 
 def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """Return the rim of a marker with the inner bits (n, n), 1 = white, whose blur may reach the
-    edge."""
+    """Return the rim of inner bits (n, n), 1 = white, whose blur may reach the marker's edge."""
     n = len(bits)
 
     def ring(depth: int) -> Array:

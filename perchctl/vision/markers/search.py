@@ -55,9 +55,8 @@ def search(
     look: Look = "all",
     own: AsideOf | None = None,
 ) -> FoundMarkers:
-    """Search the window, if there is one, and the whole picture where that gave too little; only
-    one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several where
-    none is expected."""
+    """Search the window, if any, and the whole picture where that gave too little; only one of them
+    if `look` is "near", "window" or "sharp". `own` chooses among several where none is expected."""
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.by_lines and expected and look != "sharp":
@@ -80,8 +79,7 @@ def search(
 def search_halved(
     picture: Picture, expected: Mapping[MarkerName, Array], own: AsideOf | None = None
 ) -> FoundMarkers | None:
-    """Search the window at half the size: a millisecond. None where that did not show all that
-    should be whole in the picture."""
+    """Search the window at half size, a millisecond; None where it misses what should be whole."""
     shape = picture.image.shape
     in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
