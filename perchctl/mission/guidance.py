@@ -104,9 +104,8 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
 
 
 def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
-    """The setpoint that brings the vehicle to the reference: with the learned trim, a stiffer
-    position loop near the target, and, with `lift`, a multiple of the error in height, since the
-    onboard integrator carries it past a setpoint that stops."""
+    """The setpoint to the reference: with learned trim, stiffer near the target; with `lift` a
+    multiple of the height error, as the onboard integrator carries it past a stopped setpoint."""
     tel = c.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0

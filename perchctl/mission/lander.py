@@ -114,9 +114,8 @@ AT_REST_S = 0.3
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
-    down begins with the first. `state` is None if the planner has none yet. Returns the new state,
-    and the command to send."""
+    """Fly one tick of the way down, begun by the first, without the mission's table, for watchdog
+    and rescue. `state` is None if the planner has none. Returns the new state and command."""
     c = Context(state or PlannerState.on_ground(obs), obs, profile)
     c = remember_observation(begin_landing(c))
     state, command = act(c.evolve(since=update_conditions(c)))

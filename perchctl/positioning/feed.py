@@ -279,7 +279,7 @@ class VehiclePose:
 
 
 class PoseValidator:
-    """Checks each frame's pose for plausibility; keeps the last accepted and last rejected one."""
+    """Checks each frame's pose for plausibility; keeps the last accepted and rejected one."""
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
@@ -322,7 +322,7 @@ class PoseValidator:
         )
 
     def _followed(self, placed: VehiclePose, now_s: float) -> VehiclePose | None:
-        """Return the pose, or None and a `problem` if no vehicle gets there so soon.
+        """The pose, or None and a `problem` if no vehicle gets there so soon.
 
         Time does not make a jump true: poses near a refused one are refused too, until the body is
         seen again where it was last believed. Meanwhile the age of the position grows, and ends

@@ -1,10 +1,10 @@
-"""The printed target as the vehicle's positioning system: each measured pose of it becomes the
-body's place in a world that is fixed to the target, carried on to the present by what the
-vehicle's estimate has moved since, and is handed to its estimator.
+"""The printed target as the vehicle's positioning system: each measured pose becomes the body's
+place in a world fixed to the target, carried on by what the vehicle's estimate has moved since,
+and is handed to its estimator.
 
-The world is that of the vehicle at rest on the ground, where its estimate is reset: there it
-stands at the origin, which is sent until the target has been seen often enough from there, and
-where the target is seen then it stays. So ground, fence and heights keep their meaning.
+The world is that of the vehicle at rest on the ground, where its estimate is reset: its origin is
+sent until the target was seen often enough from there, and where it is seen then it stays. So
+ground, fence and heights keep their meaning.
 
 No exposure is sent twice, none out of order and none that is older than `OLDEST_S`; and
 what lies farther from the estimate than both can explain is not believed. The age grows, and the
@@ -96,9 +96,8 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
-        """Return what is seen, with the place where the target stands: it stands still, and the
-        body is beside its estimate now as it was of late (`off`). Until its place is known, as
-        seen."""
+        """Return what is seen, with the still target's place once that is known: the body is beside
+        its estimate now as it was of late (`off`)."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m

@@ -157,7 +157,7 @@ def _keys_of(part: Any, keys: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
-    """Return the part of that kind; None where the record does not have it."""
+    """The part of that kind; None where the record does not have it."""
     known = {name: end[key] for key, name in keys.items() if end.get(key) is not None}
     if next(iter(keys.values())) not in known:
         return None

@@ -195,8 +195,7 @@ class LogWatcher:
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
-        """Write the summary and close; without a report (the flight raised) only close. Return the
-        summary.
+        """Write, return the summary and close; without a report (the flight raised) only close.
 
         The log comes first: a recording's disk that hangs holds up its own end only."""
         if report is None:
@@ -238,8 +237,7 @@ class LogWatcher:
         return None if self.recorder is None else self.recorder.close()
 
     def end(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Append the summary, if there is one, and close. Never raises; a second call does
-        nothing.
+        """Append the summary, if any, and close. Never raises; a second call does nothing.
 
         Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most."""
         if self._closed:

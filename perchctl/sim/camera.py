@@ -136,8 +136,8 @@ class SimCamera:
 
 
 # --- When each row of a frame is exposed and in what light ------------
-# A rolling shutter exposes its rows one after the other within the read-out time; an interlaced
-# camera takes two pictures a frame, half the frame's period apart, each with its own rows.
+# A rolling shutter exposes its rows one by one within the read-out time; an interlaced camera takes
+# two pictures a frame, half its period apart, each with its own rows.
 
 
 POSES_PER_EXPOSURE = 3

@@ -95,7 +95,7 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
 
 
 def _raw(data: bytes) -> Setpoint:
-    """Return the setpoint of a packet on port 3, whose yaw rate is clockwise."""
+    """The setpoint of a packet on port 3, whose yaw rate is clockwise."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
     return Setpoint(
         MODE_RAW, roll_deg=roll, pitch_deg=pitch, yaw_rate_dps=-yaw_rate, thrust=float(thrust)

@@ -175,7 +175,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
 
 
 def _cells_apart(a: MarkerConfig, b: MarkerConfig, turns: Sequence[int] = (0, 1, 2, 3)) -> int:
-    """Return the fewest cells that differ over the quarter turns; all, if sizes differ."""
+    """The fewest cells that differ over the quarter turns; all, if sizes differ."""
     first = marker_cells(a)
     second = marker_cells(b)
     if first.shape != second.shape:

@@ -200,7 +200,7 @@ def _ruler_half(half: float) -> float:
 
 
 def _caption_room(texts: Sequence[str], width: float) -> tuple[list[str], float]:
-    """Return the caption's lines, and the room for rulers and caption below the sheet, mm."""
+    """The caption's lines, and the room for rulers and caption below the sheet, mm."""
     lines = wrap_texts(texts, _TEXT, width - 2 * (UNPRINTABLE + _RULER_DEPTH))
     return lines, _RULER_DEPTH + 2.0 + _LINE * len(lines)
 

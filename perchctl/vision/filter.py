@@ -245,7 +245,7 @@ def predict_track(
 
 
 def _drifting(x: Array, setup: FilterSetup) -> Array:
-    """Return the state with its speed limited to the frame's drift."""
+    """The state with its speed limited to the frame's drift."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.drift_mps:
         return x
@@ -257,7 +257,7 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
 def _moved(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """Return the track at `t_s`, its state being x, without a measurement."""
+    """The track at `t_s`, its state being x, without a measurement."""
     x = _drifting(x, setup)
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))

@@ -84,7 +84,7 @@ _YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 def to_world(
     e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Convert place (3,) and heading from gear and level frame to the state estimate's world."""
+    """Convert place (3,) and heading from gear and level frame to the estimate's world."""
     way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -93,7 +93,7 @@ def to_world(
 def to_level(
     position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Convert place (3,) and heading from the state estimate's world to gear and level frame."""
+    """Convert place (3,) and heading from the estimate's world to gear and level frame."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)

@@ -3,8 +3,8 @@
 Columns, in this order where perchctl writes them, by name where it reads them: ``position`` (a
 whole number: the place where the row was taken), ``t_s``, then x, y, z in metres and yaw in
 radians of ``large_``, ``small_`` and ``actual_``. Cells of a marker that was not seen are empty.
-Other columns are ignored. What matters is that the three poses are in one frame: perchctl's own
-are the target relative to the gear's tip in the level frame.
+Other columns are ignored. The three poses are in one frame: perchctl's own are the target relative
+to the gear's tip in the level frame.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _check_cells(
 
 
 def _check_positions(data: Measurements) -> None:
-    """Raises InvalidValue for a marker that was never seen, a single position, or wrong units."""
+    """Raises InvalidValue for a never seen marker, a single position, or wrong units."""
     for source in ("large", "small"):
         if np.isnan(getattr(data, source)).all():
             raise InvalidValue(f"{data.name}: the {source} marker is never seen")

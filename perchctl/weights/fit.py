@@ -2,15 +2,13 @@
 it approaches; and whether they help.
 
 With a = large - actual and b = small - actual the merged error of equation 8 is
-``w a + (1 - w) b``. What is constant in a and b is the markers' bias: no weight can mend
-it, so it is estimated and reported apart, and the weights are fitted to the rest. All
-differences of yaw are wrapped about the errors' own mean direction, so that neither the
-seam at +-180 deg nor a constant turn of the data changes a weight.
+``w a + (1 - w) b``. What is constant in a and b, the markers' bias, no weight can mend:
+it is reported apart, and the weights are fitted to the rest. Differences of yaw are wrapped
+about their mean direction, so that no seam and no constant turn changes a weight.
 
-Frames of one position share its errors, so whole positions are held out: the weights are
-fitted to the others and tested on the one that was left out, bias included, as it acts in
-a flight. Intervals are Student's t over positions (for a root mean square by the delta
-method), 95 %.
+Frames of one position share its errors, so whole positions are held out in turn to test
+the weights, bias included, as it acts in a flight. Intervals are Student's t over positions
+(for a root mean square by the delta method), 95 %.
 """
 
 from __future__ import annotations
@@ -245,7 +243,7 @@ class Evidence:
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """Return True where the gain over the better marker is above 0 in its interval, (4,)."""
+        """Return where the gain over the better marker is above 0 in its interval, (4,)."""
         gain, half = self.gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)
 
@@ -264,7 +262,7 @@ def evidence(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
 
 
 def _root(square: Array) -> tuple[Array, Array]:
-    """Return the root of the mean over positions (4,), and each position's influence (g, 4)."""
+    """The root of the mean over positions (4,), and each position's influence (g, 4)."""
     mean = square.mean(axis=0)
     rms = np.sqrt(mean)
     return rms, (square - mean) / (2.0 * np.maximum(rms, 1e-300))

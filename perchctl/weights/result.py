@@ -39,7 +39,7 @@ _HEAD = """\
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A fit's findings; `chosen` names the method offered, `other_name` the data behind `other`."""
+    """A fit's findings; `chosen` names the offered method, `other_name` the data of `other`."""
 
     errors: Errors
     fits: dict[str, FittedWeights]
@@ -60,7 +60,7 @@ class Result:
 
     @property
     def recommended(self) -> Array:
-        """The fitted weights where proven better than the better marker, else that one's, (4,)."""
+        """The fitted weights where proven, else the better single marker's, (4,)."""
         alone = np.where(self.evidence.better == 0, 1.0, 0.0)
         return np.where(self.proven, self.fits[self.chosen].weights, alone)
 
@@ -96,7 +96,7 @@ def fit_weights(path: Path, chosen: str, test: Path | None = None) -> Result:
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
-    """Return the values by axis, to six figures, as a person may read them."""
+    """The values by axis, to six figures."""
     return {
         axis: float(f"{value:.6g}") if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
@@ -135,9 +135,8 @@ def _errors_record(found: Evidence) -> dict[str, Any]:
 
 
 def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> None:
-    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted; and
-    the record of the fit behind them. Errors: InvalidValue when it cannot be written; the old one
-    then stays."""
+    """Write the weights file: the recommended ones, or, `anyway`, all fitted ones; and the record
+    of the fit. Errors: InvalidValue when it cannot be written; the old one then stays."""
     flown = result.fits[result.chosen].weights if anyway else result.recommended
     content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
@@ -184,7 +183,7 @@ def report_text(result: Result) -> str:
 
 
 def _verdict(result: Result) -> str:
-    """Return the weights to fly with, and why, in a line for each axis."""
+    """The weights to fly with, and why, in a line for each axis."""
     if not any(result.proven):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "

@@ -29,7 +29,7 @@ _STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class CameraPlace:
-    """A camera place, and `actual`, the target relative to the gear in the level frame, (4,)."""
+    """A camera place; `actual` (4,): the target relative to the gear in the level frame."""
 
     T_world_cam: Array
     actual: Array

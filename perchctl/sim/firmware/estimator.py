@@ -148,7 +148,7 @@ class Estimator:
         )
 
     def _integrate(self, world: World) -> tuple[float, float, float, float]:
-        """Return the attitude after one more control period of turning."""
+        """The attitude after one more control period of turning."""
         truth = world.quaternion
         if self.gyro is None:
             return truth

@@ -82,7 +82,7 @@ def doubled_area(corners: Array) -> Array:
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Return True if all corners (4, 2) are `room_px` or more inside a picture."""
+    """True if all corners (4, 2) are `room_px` or more inside a picture."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
     # False for NaN.

@@ -3,9 +3,9 @@
 A blur that is equal on both flanks of a side does not move it. So each side's edge points are
 undistorted, a line is fitted to them by total least squares, and neighbours are intersected.
 
-White that is clipped, glares or went through a gamma curve does move edges: all of them, from white
-towards black, by the same number of pixels. The inner edge of a marker's border moves the opposite
-way, so the border's width, known to be one cell, gives the shift, and it is taken out.
+White that is clipped, glares or went through a gamma curve does move all edges, towards black, by
+the same number of pixels. A border's inner edge moves the opposite way, so the border's width,
+known to be one cell, gives the shift, and it is taken out.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """Return profile places along sides (rows,) as shares (rows, n), away from blurred corners."""
+    """Return profile places along sides (rows,) as shares (rows, n), not near blurred corners."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -309,7 +309,7 @@ def _measured_shift(
 
 
 def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """Return how much farther out the widest marker's side ends lie than middles, beyond noise."""
+    """How much farther out the widest marker's side ends lie than middles, beyond noise."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -357,7 +357,7 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Return the spread of corners by what shakes rows: it moves upright sides only."""
+    """The spread of corners by what shakes rows: it moves upright sides only."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -408,7 +408,7 @@ class Samples:
 
 
 def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """Return what is to be measured of markers; None where one is no square."""
+    """Return what is to be measured; None where a marker is no square."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -436,7 +436,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 def measure_edges(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
-    """Return samples of all sides and, if asked and wide enough, of a border's inner edges."""
+    """Return samples of all sides and, if asked and wide enough, of inner edges."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -473,7 +473,7 @@ def measure_edges(
 
 
 def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return how far the windows around edges and the profiles across reach."""
+    """Return the reach of the windows around edges, and of the profiles."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
@@ -496,8 +496,8 @@ def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) 
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
-# The edge in each profile is the gradient's windowed centroid, at first by a wide window, then by
-# one that is centred on the side's own line. Of a side is (rows,), of a profile (rows, n).
+# An edge is the gradient's windowed centroid, first by a wide window, then by one centred on the
+# side's own line. Of a side is (rows,), of a profile (rows, n).
 
 
 _ALONG32 = ALONG.astype(np.float32)
@@ -624,7 +624,7 @@ class _Profiles:
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return lines (rows, n) through each row's half middles, robust to a bad quarter of either."""
+    """Lines (rows, n) through each row's half middles, robust to a bad quarter of either."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2
