@@ -85,7 +85,7 @@ def check_writable(path: Path, force: bool) -> None:
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Return True if both exist and are one and the same."""
+    """True if both exist and are one and the same."""
     return one.exists() and other.exists() and one.samefile(other)
 
 

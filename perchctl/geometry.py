@@ -32,7 +32,7 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 
 
 def finite(values: Array) -> bool:
-    """Return True if all values are finite (and none so great that their squares' sum is not)."""
+    """True if all values are finite (and none so great that their squares' sum is not)."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))
 

@@ -17,7 +17,7 @@ SENTENCE = "Ctrl-C"
 
 
 def is_program() -> bool:
-    """Return True if this process is the command line: no program that imports perchctl, and none
+    """True if this process is the command line: no program that imports perchctl, and none
     of its child processes, which have its arguments."""
     script = "" if "multiprocessing" in sys.modules else os.path.basename(sys.argv[0])
     if script == "-m":

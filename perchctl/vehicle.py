@@ -59,25 +59,25 @@ FRESH_S = 0.3
 
 
 def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
-    """Return True if there is telemetry, and it is fresh."""
+    """True if there is telemetry, and it is fresh."""
     return newest is not None and now_s - newest.t_s <= FRESH_S
 
 
 def has_fresh_position(newest: Telemetry | None, now_s: float) -> bool:
-    """Return True if position and velocity are known too: they come by a packet of their own."""
+    """True if position and velocity are known too: they come by a packet of their own."""
     if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
         return False
     return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
 
 
 def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
-    """Return True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives
+    """True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives
     the motors by 2 s (docs/firmware.md, "When setpoints stop")."""
     return newest is None or not is_fresh(newest, now_s) or newest.has_bit(FLYING)
 
 
 def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
-    """Return True if an emergency stop has come to be: locked, with the motors off."""
+    """True if an emergency stop has come to be: locked, with the motors off."""
     if newest is None or not is_fresh(newest, now_s):
         return False
     return newest.has_bit(LOCKED) and newest.thrust < 1
@@ -149,5 +149,5 @@ Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencySto
 
 
 def is_battery_reading(volts: float) -> bool:
-    """Return True if a cell can have that voltage; NaN is none."""
+    """True if a cell can have that voltage; NaN is none."""
     return NO_BATTERY_READING_V <= volts <= MOST_CELL_V

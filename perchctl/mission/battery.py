@@ -164,8 +164,7 @@ def battery_outlook(c: Context) -> BatteryOutlook:
 
 
 def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
-    """Seconds for which hovering on a share of the full thrust keeps the voltage above that at
-    which `battery-low` fires; None if that is unknown."""
+    """Seconds of hovering on a share of full thrust before `battery-low` fires, None if unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     safety, perch = profile.safety, profile.planner.perch
@@ -182,8 +181,7 @@ def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
 
 
 def required_times_s(c: Context) -> tuple[float, float, float]:
-    """The seconds that the attempt at hand, each further one and the landing take, by the height of
-    a target that was seen."""
+    """Seconds for this attempt, each further one and the landing, by a seen target's height."""
     planner = c.planner
     up_m = max(0.0, c.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S

@@ -104,9 +104,8 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
 
 
 def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
-    """The setpoint that brings the vehicle to the reference: with the learned trim, a stiffer
-    position loop near the target, and, with `lift`, a multiple of the error in height, since the
-    onboard integrator carries it past a setpoint that stops."""
+    """The setpoint to the reference: with learned trim, stiffer near the target; with `lift` a
+    multiple of the height error, as the onboard integrator carries it past a stopped setpoint."""
     tel = c.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
@@ -134,8 +133,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint one tick later. Without a sight of the target it sinks: from lower down it
-    is soonest seen again."""
+    """The held setpoint a tick later; unsighted, lower, from where the target is soonest seen."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
@@ -255,8 +253,7 @@ def motors_are_still(c: Context) -> bool:
 
 
 def stop_motors(c: Context) -> Acted:
-    """Stop and notify, `STOPS` times: one lost notify locks what hangs. Again while there is
-    thrust."""
+    """Stop and notify, `STOPS` times: one lost notify locks what hangs. Again under thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()

@@ -93,8 +93,7 @@ class Impact:
 
 @dataclass(frozen=True)
 class ImuMotion:
-    """The vehicle's motion by its accelerometer and attitude alone. Times are on the loop's clock,
-    `-inf` for what never happened."""
+    """Motion by accelerometer and attitude alone; loop times, `-inf` for what never happened."""
 
     t_s: float = -math.inf  # of the newest sample
     velocity_mps: Vector = ZERO  # since the first sample, world axes
@@ -133,8 +132,7 @@ class ImuMotion:
 
     @property
     def place_age_s(self) -> float:
-        """Seconds for which position and velocity have read the same while the accelerometer
-        changed."""
+        """Seconds of the same position and velocity readings while the accelerometer changed."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -217,8 +215,7 @@ class ImuMotion:
     def acceleration_mps2(
         sample: Telemetry, offset_g: Vector, misled_rad: tuple[float, float] = (0.0, 0.0)
     ) -> Vector:
-        """Acceleration in world axes by force and attitude of a sample, without the offset and
-        what corrections have turned roll and pitch by wrongly."""
+        """World acceleration of a sample, less the offset and wrong corrections of its tilt."""
         roll_rad, pitch_rad = sample.roll_rad - misled_rad[0], sample.pitch_rad - misled_rad[1]
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)

@@ -114,9 +114,8 @@ AT_REST_S = 0.3
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the way down without the mission's table, for watchdog and rescue; the way
-    down begins with the first. `state` is None if the planner has none yet. Returns the new state,
-    and the command to send."""
+    """Fly one tick of the way down, begun by the first, without the mission's table, for watchdog
+    and rescue. `state` is None if the planner has none. Returns the new state and command."""
     c = Context(state or PlannerState.on_ground(obs), obs, profile)
     c = remember_observation(begin_landing(c))
     state, command = act(c.evolve(since=update_conditions(c)))
@@ -173,7 +172,6 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
 
 
 def _knows_its_place(c: Context) -> bool:
-    """True if a position and a heading are left to come down by."""
     if c.state.astray or c.state.blind_s is not None or (c.by_sight and not _is_sighted(c)):
         return False
     # Without a vertical speed raw thrust would be blind, and the vehicle's own landing is left.
@@ -331,7 +329,6 @@ def give_up_position(c: Context) -> Context:
 
 
 def _reckon(c: Context) -> PlannerState:
-    """The state with its dead reckoning one tick later."""
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     astray = state.astray and not c.by_sight
@@ -703,8 +700,7 @@ def _is_overdue(c: Context) -> bool:
 
 
 def _braking(c: Context) -> tuple[float, float]:
-    """Roll and pitch against the sideways speed, and against the attitude's error as pictures
-    measured it; level without a heading."""
+    """Tilt against sideways speed and the attitude error of pictures; level without a heading."""
     if c.state.heading_lost or is_in_magnet_reach(c):
         return 0.0, 0.0
     yaw_rad = c.telemetry.yaw_rad

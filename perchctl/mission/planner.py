@@ -106,7 +106,7 @@ def _remember(c: Context) -> Context:
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
-    """The state with how many frames in a row measured the target, and how far they differ."""
+    """The state with how many frames in a row measured the target, and their spread."""
     target = obs.target
     if not obs.new_frame:
         return state
@@ -125,8 +125,7 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 
 
 def _mount_watched(c: Context) -> MountingMonitor:
-    """The mounting's watch with this tick's frame, if that measured the target over fresh
-    telemetry."""
+    """The mounting's watch with this tick's frame, if measured over fresh telemetry."""
     state = c.state
     measured = c.obs.new_frame and state.confirmed > 0 and c.proves and not state.hold
     if state.target_m is None or not measured or state.phase not in IN_THE_OPEN:
@@ -254,7 +253,7 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
 
 
 def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
-    """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
+    """Walk under the target at `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
     trim = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = c.evolve(integral_m=trim)

@@ -43,7 +43,7 @@ class Event:
 
     @classmethod
     def of_rescue(cls, t_s: float, error: BaseException, rest: str) -> Event:
-        """The note on what became of a vehicle after an error; `rest` as in `rest_text`."""
+        """The note on a vehicle's fate after an error in flight; `rest`: see `rest_text`."""
         return cls(t_s, EventKind.NOTE, f"{type(error).__name__}{RESCUE}{rest}")
 
     @property

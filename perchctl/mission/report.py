@@ -33,8 +33,7 @@ TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
 
 @dataclass(frozen=True)
 class Touchdown:
-    """The speed, downwards, at which the floor was met, and the largest acceleration that a sample
-    of the telemetry shows, one each 10 ms."""
+    """The downward speed on meeting the floor, and the largest acceleration of 10 ms samples."""
 
     speed_mps: float
     peak_g: float

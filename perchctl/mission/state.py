@@ -110,8 +110,7 @@ class Condition(Enum):
 
 @dataclass(frozen=True)
 class ContactError:
-    """Horizontal distance of the gear from the target's axis as contact was proven, and its
-    standard deviation, infinite where that is not known."""
+    """Gear's distance from the target's axis at proven contact; its sigma, infinite if unknown."""
 
     aside_m: float
     sigma_m: float
@@ -209,8 +208,7 @@ class BatteryOutlook:
 
 @dataclass(frozen=True, eq=False)
 class PlannerState:
-    """The planner's whole memory; `since` holds the time at which each named
-    condition became true and has been so without a break."""
+    """The planner's whole memory; `since`: from when each named condition held without a break."""
 
     phase: Phase = Phase.APPROACH
     entered_s: float = 0.0

@@ -85,9 +85,8 @@ UNCORRECTED = "the estimate's variance only grows; is the positioning system gon
 
 
 def is_astray(c: Context) -> bool:
-    """True if position control leads away from its setpoint, by external positions in other axes
-    than the vehicle's, which a vehicle at rest does not show (fault 11): farther than any draught
-    carries it, or in swings."""
+    """True if position control leads away from its setpoint, farther than any draught or in swings:
+    external positions are in other axes, which no vehicle at rest shows (fault 11)."""
     setpoint, phase = c.state.setpoint, c.state.phase
     if c.profile.positioning.by == "deck" or not c.placed:
         return False

@@ -25,9 +25,8 @@ FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it. `battery_changed_s`:
-    when the last reading differed from the one before; without any, when the first sample came.
-    `imu`: the motion by the accelerometer over the whole flight."""
+    """Telemetry of the last `KEEP_S`, oldest first. `battery_changed_s`: when the last reading came
+    that differed, or the first; `imu`: motion by accelerometer in the whole flight."""
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False

@@ -53,9 +53,8 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture in its sums, and once a second with their solution.
-    `t_s` is its arrival less the profile's latency. Nothing is learned of a pose that is no number
-    or too near, or without the attitude of its time."""
+    """Return the estimate with one more picture in its sums, solved once a second. `t_s`: arrival
+    less the profile's latency. Poses not finite, too near or without attitude teach nothing."""
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
@@ -176,12 +175,12 @@ def consistency_rows(
 
 
 def _above(size: float, noise: float) -> float:
-    """Return the part of a motion that counts: none of what noise can be."""
+    """The part of a motion that counts: none of what noise can be."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
 def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
-    """Return the first two rows of ``R_world_body``, without arrays."""
+    """The first two rows of ``R_world_body``, without arrays."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -192,7 +191,6 @@ def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
 
 
 def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    """Return the dot product of two short sequences, without arrays."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -65,9 +65,8 @@ class Perception:
     _mirrored: int = 0  # frames with the target's mirror image since one showed the target
 
     def look(self, frame: Frame, later_s: float = 0.0) -> Iterator[tuple[Frame, PipelineOutput]]:
-        """Yield each picture of the frame with what the pipeline finds in it: one picture, or the
-        two fields of an interlaced one, in their order of time. `later_s` is the latency, measured
-        by `calibration`, by which the frame's time was set back."""
+        """Yield each picture of the frame, one or two fields in order of time, with what the
+        pipeline finds. `later_s`: the measured latency by which the frame's time was set back."""
         if self.stills:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()

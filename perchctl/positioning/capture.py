@@ -56,8 +56,7 @@ class CaptureFailure:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return what the child connects to: Vicon and VRPN take a port with the name, the others want
-    it apart."""
+    """Return what the child connects to: Vicon and VRPN take the port with the name."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -106,8 +105,7 @@ class MotionCapture:
             raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """Return the newest frame since the last call that shows the body; without one, the
-        newest."""
+        """Return the newest frame since the last call, if possible one that shows the body."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
             frames[-1] if frames else None
@@ -187,7 +185,7 @@ class MotionCapture:
         return f"{'no ' if self._framed_s is None else ''}{self._who}"
 
     def _read_output(self) -> None:
-        """Read all output, so that the child never waits; keep its last line for a message."""
+        """Read all output, so that the child never waits; keep its last line."""
         output = self._child.stdout
         assert output is not None
         for raw in iter(lambda: output.readline(LONGEST_LINE), b""):

@@ -1,9 +1,8 @@
 """What a comparison by hand found of a motion capture (`perchctl check --lift`), kept for `fly`.
 
-Axes that are swapped do not show on a vehicle at rest that stands as it stood when its body was
-defined: all numbers look right. Only a hand that lifts and turns it tells. So each comparison is
-written down, for exactly the vehicle and set-up that it is true of, and a flight asks for one that
-passed, at most `VALID_S` old.
+Swapped axes do not show on a vehicle that stands as when its body was defined; only a hand that
+lifts and turns it tells. So each comparison is written down for its very vehicle and set-up, and a
+flight asks for one that passed, at most `VALID_S` old.
 """
 
 from __future__ import annotations
@@ -67,15 +66,13 @@ def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:
 
 
 def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
-    """Return the file of a vehicle's comparison. `vehicle`: as `perchctl.link.vehicle_uri` has
-    it."""
+    """Return a vehicle's comparison file; `vehicle` is as `perchctl.link.vehicle_uri` has it."""
     of = repr(_set_up(config, vehicle)).encode()
     return user_folder("state") / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """Return what is known of this vehicle in this set-up. A file that cannot be read counts as
-    none."""
+    """Return what is known of this vehicle in this set-up; an unreadable file counts as none."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())
@@ -87,9 +84,8 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureCompariso
 def save_comparison(
     config: PositioningConfig, vehicle: str, at: datetime, passed: bool, found: str
 ) -> str | None:
-    """Write a comparison down; what was there of this vehicle in this set-up is gone. `at` has a
-    time zone. Returns None, or why it could not be written: one that passed must not stand, then,
-    where the newest did not, and is taken away if it can be."""
+    """Write a comparison over this set-up's last; `at` has a time zone. Returns None, or why that
+    failed: an old one that passed must not stand then, and is deleted if it can be."""
     path = comparison_path(config, vehicle)
     record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)
     try:

@@ -191,8 +191,7 @@ class PositionFeed:
             self._turned_s, self._problem = now_s, problem
 
     def place(self) -> VehiclePose | None:
-        """Return the newest that was handed to the link, with its attitude also where only the
-        position was sent."""
+        """Return the newest handed to the link, with attitude even if only position was sent."""
         return self._placed
 
     def status(self, now_s: float) -> FeedStatus:
@@ -280,8 +279,7 @@ class VehiclePose:
 
 
 class PoseValidator:
-    """Checks each frame's pose for plausibility; keeps the last accepted and the last rejected
-    pose."""
+    """Checks each frame's pose for plausibility; keeps the last accepted and rejected one."""
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
@@ -324,7 +322,7 @@ class PoseValidator:
         )
 
     def _followed(self, placed: VehiclePose, now_s: float) -> VehiclePose | None:
-        """Return the pose, or None and a `problem` if no vehicle gets there so soon.
+        """The pose, or None and a `problem` if no vehicle gets there so soon.
 
         Time does not make a jump true: poses near a refused one are refused too, until the body is
         seen again where it was last believed. Meanwhile the age of the position grows, and ends

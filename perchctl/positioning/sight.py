@@ -1,10 +1,10 @@
-"""The printed target as the vehicle's positioning system: each measured pose of it becomes the
-body's place in a world that is fixed to the target, carried on to the present by what the
-vehicle's estimate has moved since, and is handed to its estimator.
+"""The printed target as the vehicle's positioning system: each measured pose becomes the body's
+place in a world fixed to the target, carried on by what the vehicle's estimate has moved since,
+and is handed to its estimator.
 
-The world is that of the vehicle at rest on the ground, where its estimate is reset: there it
-stands at the origin, which is sent until the target has been seen often enough from there, and
-where the target is seen then it stays. So ground, fence and heights keep their meaning.
+The world is that of the vehicle at rest on the ground, where its estimate is reset: its origin is
+sent until the target was seen often enough from there, and where it is seen then it stays. So
+ground, fence and heights keep their meaning.
 
 No exposure is sent twice, none out of order and none that is older than `OLDEST_S`; and
 what lies farther from the estimate than both can explain is not believed. The age grows, and the
@@ -51,8 +51,7 @@ def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Plac
 
 
 def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
-    """Return the body's place under a target that stands still. Of `attitude` roll and pitch count
-    alone."""
+    """Return the body's place under a still target; of `attitude` only roll and pitch count."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
@@ -97,9 +96,8 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
-        """Return what is seen, with the place where the target stands: it stands still, and the
-        body is beside its estimate now as it was of late (`off`). Until its place is known, as
-        seen."""
+        """Return what is seen, with the still target's place once that is known: the body is beside
+        its estimate now as it was of late (`off`)."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
@@ -112,8 +110,7 @@ class TargetFeed:
     def add_pose(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
-        """Take a pose that this turn's picture gave; `then`: the vehicle's attitude and estimated
-        position at its exposure."""
+        """Take a pose of this turn's picture; `then`: attitude and position at its exposure."""
         if pose.t_s <= self._seen_s:
             return
         # A known place may be newer than a picture that is still on its way.
@@ -138,8 +135,7 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the state; it has a problem also while the target has not been seen from the
-        ground."""
+        """Return the state; a target not yet seen from the ground is a problem, too."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None

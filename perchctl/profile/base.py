@@ -21,7 +21,7 @@ def key(default: Any, meaning: str, **constraints: Any) -> Any:
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    """Return the pair. Raises ValueError where the lowest is not first."""
+    """The pair. Raises ValueError where the lowest is not first."""
     if pair[0] > pair[1]:
         raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
     return pair

@@ -57,7 +57,7 @@ class Limit:
 
 
 def _read(found: re.Match[str]) -> str:
-    """Return the key of a profile as an expression; of a latency that is measured its beginning."""
+    """The key of a profile as an expression; of a latency that is measured its beginning."""
     key = found[0]
     return f"profile.{'camera.start_latency_s' if key == 'camera.latency_s' else key}"
 

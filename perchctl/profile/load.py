@@ -69,14 +69,14 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
 
 
 def check_profile(path: Path, text: str) -> None:
-    """Raise NotFound or InvalidValue if the profile at `path` would not load with another text."""
+    """Raise NotFound or InvalidValue if the profile would not load with another text."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProfileNote)  # said when it was loaded
         _checked(path, _values_of(text, path))
 
 
 def _checked(path: Path, own: dict[str, Any]) -> Profile:
-    """Return the profile of what its own file holds."""
+    """The profile of what its own file holds."""
     values = _resolved(path, own, seen=())
     values.setdefault("name", path.stem)
     try:
@@ -93,7 +93,7 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
 
 
 def _read_weights(name: str) -> WeightsConfig:
-    """Return the weights of the file that a loaded profile names: a whole path, or a name in the
+    """The weights of the file that a loaded profile names: a whole path, or a name in the
     user's folder. Raises NotFound, InvalidValue."""
     given = Path(name)
     path = given if given.is_file() else data_file("weights", name)

@@ -74,8 +74,7 @@ class Profile(Section):
 
     @classmethod
     def lost_values(cls, values: dict[str, Any]) -> list[str]:
-        """Return a sentence for each key of the values that is a constant now, and had another
-        value."""
+        """Return a sentence for each key of another value than the constant that it is now."""
         return drop_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")

@@ -93,8 +93,7 @@ class Mounting(Section):
 
 
 def _eighths(angle: float) -> int:
-    """Return the number of eighths of a circle that the angle is in radians, rounded to two
-    decimals or more; 0 where it is no such angle."""
+    """The eighths of a circle the angle is, in radians to two decimals or more; or 0."""
     return next(
         (k for k in range(1, 9) for d in range(2, 17) if angle == round(k * math.pi / 4, d)), 0
     )

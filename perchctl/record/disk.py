@@ -61,8 +61,7 @@ class DiskFile:
 
 
 def create_file(path: Path, sync: bool, begun: Callable[[DiskFile], T]) -> T:
-    """Create a file and return what `begun` makes of it; an error of that leaves no file. Raises
-    OSError as `DiskFile` does."""
+    """Create a file, return what `begun` makes of it; its error leaves no file. Raises OSError."""
     file = DiskFile(path, sync)
     try:
         return begun(file)
@@ -94,8 +93,7 @@ class BackgroundWriter:
             self._thread.start()
 
     def put(self, job: Job, weight: int = 1) -> bool:
-        """Hand over a job, from any thread; False where the queue is full, and the job is not
-        done."""
+        """Hand over a job from any thread; False where the full queue does not take it."""
         if self._thread is None:
             _do(job)
             return True

@@ -76,7 +76,7 @@ def _fields_of(kind: type) -> list[tuple[str, Any, tuple[Any, ...]]]:
 
 @cache
 def _members(hint: Any) -> tuple[Any, ...]:
-    """Return the members of a union, but None; of any other type itself."""
+    """The members of a union, but None; of any other type itself."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return tuple(part for part in typing.get_args(hint) if part is not types.NoneType)
     return (hint,)

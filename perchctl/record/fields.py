@@ -132,8 +132,7 @@ def tick_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """Return a tick as a flat record with all keys of `FIELDS`, in their order; with the truth of a
-    simulation, where there is one."""
+    """Return a tick as a flat record of all `FIELDS` in order, with a simulation's truth if any."""
     seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
         "t_s": tick.t_s,

@@ -38,9 +38,8 @@ def make_header(
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Return a log's first record. Without `started` it depends on nothing but its arguments and
-    the files that the profile names. `t0_s` is the loop's clock when the log began, or at
-    `started`."""
+    """Return a log's first record; without `started` it depends only on its arguments and the files
+    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
     return {
         "kind": "header",
         "format": FORMAT,

@@ -84,8 +84,7 @@ def stamp(ns: int) -> Timestamp:
 
 
 def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
-    """Return the markers' outlines in the frame of a tick's record; a frame without the target has
-    none, so that no old one stays in the picture."""
+    """Return a tick's marker outlines; none without the target, so that no old one stays."""
     return ImageAnnotations(
         timestamp=stamp(ns),
         points=[

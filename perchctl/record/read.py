@@ -223,8 +223,7 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """Return the flown mask, (height, width), True where the gear covers; None without one.
-        Errors: InvalidValue."""
+        """Return the mask (height, width), True on the gear, or None. Errors: InvalidValue."""
         text = self.header.get("mask")
         if text is None:
             return None
@@ -238,8 +237,7 @@ class FlightLog:
 
     @property
     def computer_differences(self) -> str:
-        """In what the flight's computer differed from this one, in words; empty where it did not,
-        or where the log does not say."""
+        """In what the flight's computer differed from this, in words; empty if none is known."""
         was, here = self.header.get("computer"), computer_record()["computer"]
         if not isinstance(was, dict):
             return ""

@@ -29,8 +29,7 @@ _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 
 
 class Picture(NamedTuple):
-    """One frame: its number and time of exposure on the loop's clock, as the source gave
-    them, and the grey picture (height, width) that the pipeline saw."""
+    """One frame: number, exposure on the loop's clock, and the pipeline's grey (height, width)."""
 
     number: int
     t_s: float

@@ -15,8 +15,7 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 class RecordingEnd(NamedTuple):
-    """What became of a recording, by its keys for programs: the file's name, how many pictures are
-    in it, how many are not, and the first reason why."""
+    """A recording's end: file, how many pictures it has and lacks, and the first reason why."""
 
     recording: str
     pictures: int
@@ -158,7 +157,7 @@ def _keys_of(part: Any, keys: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
-    """Return the part of that kind; None where the record does not have it."""
+    """The part of that kind; None where the record does not have it."""
     known = {name: end[key] for key, name in keys.items() if end.get(key) is not None}
     if next(iter(keys.values())) not in known:
         return None

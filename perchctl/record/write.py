@@ -109,8 +109,7 @@ class LogWatcher:
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
-        """Open the log of a simulated flight: the same seed gives the same bytes. Errors:
-        InvalidValue."""
+        """Open a simulated flight's log: one seed gives the same bytes. Errors: InvalidValue."""
         header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
         return cls._opened(path, header, profile, record, live=False)
 
@@ -196,8 +195,7 @@ class LogWatcher:
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
-        """Write the summary and close; without a report (the flight raised) only close. Return the
-        summary.
+        """Write, return the summary and close; without a report (the flight raised) only close.
 
         The log comes first: a recording's disk that hangs holds up its own end only."""
         if report is None:
@@ -239,8 +237,7 @@ class LogWatcher:
         return None if self.recorder is None else self.recorder.close()
 
     def end(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Append the summary, if there is one, and close. Never raises; a second call does
-        nothing.
+        """Append the summary, if any, and close. Never raises; a second call does nothing.
 
         Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most."""
         if self._closed:
@@ -302,8 +299,7 @@ def sent_line(sent: SentCommand) -> bytes:
 
 
 def turn_line(turn: Turn) -> bytes:
-    """Return a turn as one line of the log, whole and exact, by the fields of
-    `perchctl.mission.Turn`."""
+    """Return a turn as one exact line of the log, by the fields of `perchctl.mission.Turn`."""
     record = {"kind": "turn", **to_exact_json(turn)}
     obs, samples = turn.observation, turn.taken.late or turn.taken.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:

@@ -26,8 +26,7 @@ PoseAt = Callable[[float], Array]
 
 @dataclass(frozen=True, eq=False)
 class DeliveredFrame:
-    """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
-    two fields of an interlaced one."""
+    """An arrived frame; `t_exposure_s`: middle of its exposure, or between interlaced fields."""
 
     t_arrival_s: float
     t_exposure_s: float
@@ -137,8 +136,8 @@ class SimCamera:
 
 
 # --- When each row of a frame is exposed and in what light ------------
-# A rolling shutter exposes its rows one after the other within the read-out time; an interlaced
-# camera takes two pictures a frame, half the frame's period apart, each with its own rows.
+# A rolling shutter exposes its rows one by one within the read-out time; an interlaced camera takes
+# two pictures a frame, half its period apart, each with its own rows.
 
 
 POSES_PER_EXPOSURE = 3

@@ -95,7 +95,7 @@ def execute(firmware: Firmware, packet: Packet) -> bytes | None:
 
 
 def _raw(data: bytes) -> Setpoint:
-    """Return the setpoint of a packet on port 3, whose yaw rate is clockwise."""
+    """The setpoint of a packet on port 3, whose yaw rate is clockwise."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
     return Setpoint(
         MODE_RAW, roll_deg=roll, pitch_deg=pitch, yaw_rate_dps=-yaw_rate, thrust=float(thrust)
@@ -147,8 +147,7 @@ class CNumber:
         return struct.calcsize("<" + self.letter)
 
     def pack(self, value: float) -> bytes:
-        """Return the bytes as C stores the value: integers truncated and wrapped, floats
-        rounded."""
+        """Return the bytes as C stores them: integers truncated and wrapped, floats rounded."""
         if self.letter in "ef":
             try:
                 return struct.pack("<" + self.letter, value)
@@ -292,8 +291,7 @@ class CrtpServer:
         self._blocks.clear()
 
     def replace_firmware(self, firmware: Firmware) -> None:
-        """Serve another firmware from now on, with the same log blocks (a test's short cut for a
-        new vehicle)."""
+        """Serve another firmware, same log blocks (a test's short cut for a new vehicle)."""
         self._firmware = firmware
         for block in self._blocks.values():
             if block.due_s is not None:

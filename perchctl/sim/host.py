@@ -136,8 +136,7 @@ class VehicleHost:
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
     def truth(self) -> dict[str, Any]:
-        """Return the true state, SI and radians, and the firmware's outputs: no Crazyflie reports
-        it."""
+        """Return the true state, SI and radians, and firmware outputs: no Crazyflie reports it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
         ceiling_n, floor = world.contact_state()
         return {

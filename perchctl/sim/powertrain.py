@@ -210,8 +210,7 @@ class Powertrain:
 
 
 def max_thrust_n(rest_v: float) -> float:
-    """Return four motors' steady thrust at the full duty cycle, from a cell of that resting
-    voltage."""
+    """Return four motors' steady thrust at full duty from a cell of that resting voltage."""
     battery_v = rest_v
     for _ in range(30):
         forces_n = 4.0 * thrust_n(battery_v)

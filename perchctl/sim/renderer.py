@@ -180,7 +180,7 @@ class Renderer:
     def _projected(
         self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
     ) -> Picture:
-        """Return the picture at poses T_target_cam, of each row (n, 4, 4)."""
+        """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = blur_sample_count(length_px)
         by_row = [ray_to_plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
@@ -209,7 +209,7 @@ class Renderer:
         motion_px: Array,
         length_px: float,
     ) -> Picture:
-        """Return the bare ceiling, several pixels drawn as one: it carries no measurement."""
+        """The bare ceiling, several pixels drawn as one: it carries no measurement."""
         rows, cols = nodes.shape[:2]
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
@@ -248,7 +248,7 @@ class Renderer:
     # -- motion -------------------------------------------------------------
 
     def _paths_px(self, poses: Array) -> Array:
-        """Return the ceiling's path in the image during the exposure at five places, (5, n, 2) px,
+        """The ceiling's path in the image during the exposure at five places, (5, n, 2) px,
         of poses (n, 4, 4)."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))

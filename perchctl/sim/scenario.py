@@ -149,9 +149,8 @@ _LEAST_GAP_S = 1.0
 
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
-    """Return the scenario of that seed. Every value is drawn in a fixed order, so adding a
-    range at the end leaves the earlier ones of a seed as they were; the groups of harder
-    worlds come from other streams."""
+    """Return the seed's scenario. Values are drawn in a fixed order, so a range added at the end
+    leaves a seed's earlier ones; the groups of harder worlds come from other streams."""
     sim = profile.simulation
     rng = np.random.default_rng([seed, _STREAM])
 
@@ -204,8 +203,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
 
 
 def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
-    """Return a turn and a shift that the profile lacks: up to `mount_error_deg` and
-    `mount_error_m`."""
+    """Return a turn and shift the profile lacks, up to `mount_error_deg` and `mount_error_m`."""
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
@@ -215,7 +213,7 @@ def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
 
 
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """Return the biases of gyroscope and accelerometer; the latter has none along z, where the
+    """The biases of gyroscope and accelerometer; the latter has none along z, where the
     firmware's scale would take it out."""
     rng = np.random.default_rng([seed, _IMU_STREAM])
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
@@ -242,7 +240,7 @@ def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 
 
 def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float]:
-    """Return the target's turns about the world's x and y."""
+    """The target's turns about the world's x and y."""
     tilt_rad = math.radians(float(rng.uniform(*sim.target_tilt_deg)))
     towards_rad = math.radians(float(rng.uniform(-180.0, 180.0)))
     if not tilt_rad:

@@ -130,8 +130,7 @@ class Ceiling:
 
 
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
-    """Return the same smooth surface with more cells; left and right, top and bottom fit
-    together."""
+    """The same smooth surface with more cells, whose opposite rims fit together."""
     padded = np.pad(tile, 2, mode="wrap")
     # One axis after the other, without what lies around the tile: at the coarsest a third.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
@@ -164,9 +163,8 @@ class PlacedSheet:
     plane: Array | None = None  # the own
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
-        """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
-        target's axes; None where it is out of view. `length_px` is the longest way of the picture
-        within the exposure."""
+        """Return where the sheet is at the coarse nodes (rows, columns, 2), own target's axes; None
+        if out of view. `length_px`: the picture's longest way within the exposure."""
         if self.plane is not None:
             turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
@@ -227,6 +225,5 @@ def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
 
 @lru_cache(maxsize=4)
 def printed_sheet(target_json: str) -> Sheet:
-    """Return the sheet of a target; its textures cost more than a second, and flights share
-    them."""
+    """Return a target's sheet; flights share its textures, which cost more than a second."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))

@@ -151,8 +151,7 @@ class Board:
 
 
 def _check_markers(board: Board, text: str) -> None:
-    """Raises InvalidValue where a ChArUco board's markers are too large, or too many for their
-    dictionary."""
+    """Raises InvalidValue for ChArUco markers too large, or too many for their dictionary."""
     largest_m = 0.95 * board.square_m
     needed = board.columns * board.rows // 2
     if board.marker_m is not None and board.marker_m > largest_m:
@@ -198,7 +197,6 @@ def board_rectangles(board: Board) -> list[Rectangle]:
 
 
 def black_squares(board: Board) -> NDArray[np.bool_]:
-    """Return which squares are black, (rows, columns), row 0 at the top; a charuco board's
-    markers fill the others, row by row."""
+    """Return black squares (rows, columns), row 0 on top; markers fill the others row by row."""
     columns, rows = board.squares
     return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)

@@ -150,8 +150,7 @@ def make_design(
     ceiling_m: float | None = None,
 ) -> TargetDesign:
     """Return the ranges, by trial through the detector (far) and by geometry (near), and what is
-    wrong with them for a flight by that profile under a ceiling of that height over the floor
-    (None: unknown)."""
+    wrong for a flight of that profile under a ceiling of that height (None: unknown)."""
     f = focal_px(camera)
     view = FieldOfView(camera)
     ahead = (np.eye(3), np.zeros(3))

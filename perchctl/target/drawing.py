@@ -4,9 +4,8 @@ Drawing axes: origin in the target's centre, x right and y up *as printed and
 read from the printed side*, metres. They are OpenCV's marker axes. The sheet
 hangs face down on the ceiling; the upward camera reads it un-mirrored.
 
-Everything that is drawn (a bitmap for the simulator, rectangles for a PDF)
-comes from one raster on a non-uniform grid, whose lines are the edges of the
-cells of both markers and of the white ring around the small one.
+Bitmap and PDF come from one raster on a non-uniform grid, whose lines are the
+edges of both markers' cells and of the white ring around the small one.
 """
 
 from __future__ import annotations
@@ -65,8 +64,7 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Return the exact share of black in the windows of size_px x size_px pixels around the
-        centre, 0..1."""
+        """Return the exact share of black, 0..1, in size_px x size_px windows around the centre."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
@@ -145,7 +143,7 @@ def _nested(
 def _white_in_black_cells(
     large: NDArray[np.bool_], large_side_m: float, edges_m: Array, black: NDArray[np.bool_]
 ) -> float:
-    """Return the largest share of white in the sampled part of a black cell, 0..1."""
+    """The largest share of white in the sampled part of a black cell, 0..1."""
     n = len(large)
     w = pixel_overlap(edges_m, n / large_side_m, n, 1.0 - 2.0 * SAMPLED_MARGIN)
     ink = w @ black.astype(np.float64) @ w.T

@@ -113,8 +113,7 @@ class PrintCheck:
         return len(self._ratios) >= MIN_FRAMES
 
     def verdict(self) -> tuple[bool, str]:
-        """Return whether there is an error of the print beyond noise and bias, by the median frame,
-        and a sentence."""
+        """Return whether the median frame errs beyond noise and bias, and a sentence."""
         if not self.judged:
             return False, (
                 f"print not judged: both markers were seen in {len(self._ratios)} frames, "

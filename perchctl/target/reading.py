@@ -22,8 +22,7 @@ from perchctl.vision import MARKERS
 
 
 class ArucoReader:
-    """cv2.aruco with its default parameters, and for each marker a dictionary of just
-    its id (the other ids of a nested dictionary are not searched)."""
+    """cv2.aruco by default parameters, with a dictionary of just its id for each marker."""
 
     def __init__(self, target: TargetConfig) -> None:
         dictionaries = [_single_marker_dictionary(m) for m in (target.large, target.small)]
@@ -110,8 +109,7 @@ def smallest_side_px(
 def sample_pictures(
     drawing: TargetDrawing, px_per_m: float, side_px: float, blur_px: float
 ) -> Iterator[NDArray[np.uint8]]:
-    """Yield `TRIALS` pictures around the target's centre, 3 times `side_px` wide, at any turn and
-    any place between the pixels."""
+    """Yield `TRIALS` pictures around the centre, 3 times `side_px` wide, at any turn and offset."""
     fine = 2 if blur_px >= 1.0 else 4
     size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
     n = size * fine
@@ -177,8 +175,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> None:
 
 
 def _cells_apart(a: MarkerConfig, b: MarkerConfig, turns: Sequence[int] = (0, 1, 2, 3)) -> int:
-    """Return the fewest cells in which one, in any of the quarter turns, differs from the other;
-    patterns of another size differ in all."""
+    """The fewest cells that differ over the quarter turns; all, if sizes differ."""
     first = marker_cells(a)
     second = marker_cells(b)
     if first.shape != second.shape:

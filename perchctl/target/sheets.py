@@ -173,8 +173,7 @@ def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> t
 def _layout_on(
     target: TargetConfig, page: tuple[float, float], texts: Sequence[str]
 ) -> tuple[float, list[str]] | None:
-    """Return half the side of the sheet that is cut out of the page, mm, and the caption's lines;
-    None where the target does not fit."""
+    """Return half the cut sheet's side, mm, and caption lines; None if the target does not fit."""
     side, cell = _side_and_cell(target)
     width, height = page
     # Narrower than its rulers, a page may have no room for a word of the caption.
@@ -201,7 +200,7 @@ def _ruler_half(half: float) -> float:
 
 
 def _caption_room(texts: Sequence[str], width: float) -> tuple[list[str], float]:
-    """Return the caption's lines, and the room for rulers and caption below the sheet, mm."""
+    """The caption's lines, and the room for rulers and caption below the sheet, mm."""
     lines = wrap_texts(texts, _TEXT, width - 2 * (UNPRINTABLE + _RULER_DEPTH))
     return lines, _RULER_DEPTH + 2.0 + _LINE * len(lines)
 
@@ -246,8 +245,7 @@ class _Paper(FPDF):
         self.add_page(orientation="portrait", format=self._format)
 
     def fill(self, rectangles: Sequence[Rectangle]) -> None:
-        """Draw rectangles (metres, y up, about the page's centre) black, as one path: where two of
-        them touch, no viewer draws a hair line between them."""
+        """Draw black rectangles (m, y up, from the page's centre) as one path: no hair lines."""
         with self.new_path(paint_rule=PathPaintRule.FILL_NONZERO) as path:
             path.style.fill_color = "#000000"
             path.style.stroke_color = None

@@ -38,7 +38,7 @@ class FieldOfView:
         self._reach = np.hypot(*rays.T)[order]
 
     def contains(self, points_cam_m: Array) -> bool:
-        """Return true if all points (n, 3) of the camera frame are in the picture."""
+        """True if all points (n, 3) of the camera frame are in the picture."""
         x, y, z = points_cam_m.T
         if (z <= 0.0).any():
             return False
@@ -101,8 +101,7 @@ def min_side_px(plain_px: float | None = None) -> float:
 
 
 def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) -> str:
-    """Return in words from where on the ground the large marker is surely found: how far above the
-    camera at most, and how far aside of its axis at some heights."""
+    """Return in words where the large marker is surely found from the ground, up and aside."""
     side_m = target.large.side_m
     view = mount.T_body_cam[:3, 2]
     highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / min_side_px()
@@ -123,9 +122,8 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
 def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
-    """Return how far from the camera's axis the centre of a marker of that side may be at that
-    height above the camera, so that it is wholly in the picture at any turn; None where it is not
-    even on the axis, or the camera does not look up."""
+    """Return how far off the camera's axis a marker of that side, that high above it, is wholly in
+    the picture at any turn; None if not even on the axis, or the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -177,8 +175,7 @@ def view_from(
     camera: CameraModel,
     mount: Mounting,
 ) -> TargetView:
-    """Return how a level vehicle sees a level target. Positions (3,) and headings are in one world,
-    z up."""
+    """Return how a level vehicle sees a level target; positions (3,) in one world, z up."""
     T = mount.T_body_cam
     field = FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]
@@ -221,9 +218,8 @@ _STEP_M = 0.0005
 
 @dataclass(frozen=True)
 class BlindRange:
-    """Ranges from the gear's tip to the target from which on nothing is measured any more, m: by
-    whole markers, and by what is left of their drawing. 0: down to contact; None: all of the
-    last 10 cm."""
+    """Ranges from the gear's tip within which nothing of the target is measured, m: by whole
+    markers, and by what is left of them. 0: down to contact; None: all of the last 10 cm."""
 
     whole_m: float | None
     left_m: float | None
@@ -242,8 +238,7 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
-    """Return from where on the profile's `camera.mount` and `vehicle.gear_body_m` see too
-    little."""
+    """Return from where on the profile's camera mount and gear see too little."""
     R, offset = gear_in_camera(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
@@ -269,8 +264,7 @@ def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
 
 
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
-    """Return true if the whole small marker is in the picture with the gear's tip so far under
-    it."""
+    """True if the small marker is wholly in view from a gear's tip so far under it."""
     R, gear = gear_in_camera(profile)
     outline = outline_at_height(square_outline(profile.target.small.side_m), range_m)
     return FieldOfView(camera).contains(outline @ R.T + gear)

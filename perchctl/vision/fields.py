@@ -42,8 +42,7 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
 def is_combed(image: Grey) -> bool:
-    """Return True if a picture, (h, w) grey, holds two fields of different times: its rows differ
-    much more from the other field's than from their own."""
+    """True if a picture's (h, w) rows differ far more between its fields than within one."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False
@@ -66,8 +65,7 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """Return the top and the bottom field, each (h, w), of a picture that holds two of different
-    times, else the picture itself."""
+    """Return the top and bottom field, each (h, w), of a combed picture, else the picture."""
     if not is_combed(image):
         return (image,)
     return field_picture(image, 0), field_picture(image, 1)
@@ -135,7 +133,7 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
 
 
 def _period_s(periods_s: tuple[float, ...]) -> float:
-    """Return the frames' period, perhaps television's."""
+    """The frames' period, perhaps television's."""
     if not periods_s:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
@@ -147,7 +145,7 @@ def _period_s(periods_s: tuple[float, ...]) -> float:
 
 
 def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
-    """Return the frames' periods, with the time since the last frame."""
+    """The frames' periods, with the time since the last frame."""
     if state.last_s is not None:
         gap_s = frame.t_s - state.last_s
         if _ANY_PERIOD_S[0] < gap_s < _ANY_PERIOD_S[1]:
@@ -156,7 +154,7 @@ def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
 
 
 def _voted(state: FieldState, frame: Frame) -> FieldState:
-    """Return the state with this evidence about the order."""
+    """The state with this evidence about the order."""
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:

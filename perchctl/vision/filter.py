@@ -184,7 +184,6 @@ def step_track(
         track: the track so far, None before the first sight.
         measured: None where nothing was seen. A measurement that is not finite counts as
             nothing seen.
-        t_s: the frame's time.
 
     Returns None when there is nothing (left) to track: never seen, or unseen for more
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
@@ -246,7 +245,7 @@ def predict_track(
 
 
 def _drifting(x: Array, setup: FilterSetup) -> Array:
-    """Return the state with its speed limited to the frame's drift."""
+    """The state with its speed limited to the frame's drift."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.drift_mps:
         return x
@@ -258,7 +257,7 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
 def _moved(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """Return the track at `t_s`, its state being x, without a measurement."""
+    """The track at `t_s`, its state being x, without a measurement."""
     x = _drifting(x, setup)
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))

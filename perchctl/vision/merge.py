@@ -34,8 +34,7 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) of
-    place."""
+    """Target in the tracks' frame: (x, y, z, yaw), velocity, covariances; bias (3, 4) of place."""
 
     vector: Array
     velocity_mps: Array
@@ -136,8 +135,8 @@ def merge_tracks(
 
 
 # --- Corners of a rolling shutter at one moment -----------------------
-# Its rows are exposed one after the other within the read-out time: each corner is moved back
-# along its own motion to the middle row's moment, the frame's time.
+# Rows are exposed one by one within the read-out time: each corner is moved along its own motion
+# to the middle row's moment, the frame's time.
 
 
 UNKNOWN_READOUT_S = 0.012
@@ -147,10 +146,9 @@ FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 
 
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the markers with the rolling shutter taken out: corners as at the frame's time.
-    `setup.readout_s` is the time from a picture's first row to its last. If it is None the corners
-    are not moved, and `common_px` holds the shift by a likely read-out; otherwise it holds the
-    error that the motion's uncertainty leaves."""
+    """Return the markers with corners as at the frame's time. `setup.readout_s` is from a picture's
+    first row to its last; if None the corners are not moved, and `common_px` holds the shift by a
+    likely read-out, otherwise the error that the motion's uncertainty leaves."""
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
@@ -210,7 +208,7 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 
 def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
-    """Return True if the markers are farther apart than the limit and than four standard
+    """True if the markers are farther apart than the limit and than four standard
     deviations, in any axis. What is wrong with the print moves both alike, and excuses no gap."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
@@ -219,6 +217,6 @@ def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bo
 
 
 def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """Return the better-conditioned of the two poses, by the spread of its position."""
+    """Return the pose whose position has the smaller spread."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

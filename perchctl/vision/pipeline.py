@@ -55,7 +55,7 @@ SEVERAL = "more than one target in view: the one that was tracked is followed"
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What does not change from frame to frame, made once by `make_pipeline`."""
+    """What no frame changes, made once by `make_pipeline`."""
 
     detector: DetectorSetup
     pose: PoseSetup
@@ -122,8 +122,7 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
-    """Return the new memory and what a stream's frame holds, each for a `step` of its own: one
-    picture, or the two fields of an interlaced camera in their order of time."""
+    """Return memory and a frame's pictures, each for its own `step`: one, or two fields by time."""
     fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
@@ -256,7 +255,7 @@ def _at_frame(
     in_world: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """Return the target at the newest frame's time; None without a track."""
+    """The target at the newest frame's time; None without a track."""
     fed, tracks = followed.measured.fed, followed.tracks
     merged = merge_tracks(tracks, fed, pipeline.merge.weights)
     if merged is None:
@@ -283,7 +282,7 @@ def _placed(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> dict[str, Any]:
-    """Return the fields of a `TargetEstimate` for merged tracks, the vehicle at `attitude`."""
+    """The fields of a `TargetEstimate` for merged tracks, the vehicle at `attitude`."""
     place_m, yaw_rad = merged.vector[:3], float(merged.vector[3])
     cov_m2, bias_m = merged.cov_m2, merged.bias_m
     seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}

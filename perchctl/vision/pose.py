@@ -32,9 +32,8 @@ _Source = Literal["large", "small", "joint"]
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """The constants of pose estimation. `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
-    (3,) the gear's tip, and `readout_s` the time from a picture's first row to its last; None: not
-    known."""
+    """The constants of pose estimation: `T_body_cam` (4, 4), the camera's mounting, `gear_body_m`
+    (3,), the gear's tip, and `readout_s` from a picture's first row to its last, if known."""
 
     config: PoseConfig
     target: TargetConfig
@@ -45,8 +44,7 @@ class PoseSetup:
 
     @cached_property
     def corners_m(self) -> dict[_Source, Array]:
-        """The corners of each marker (4, 3) in its own axes, in the order of a detection's, and
-        ``joint`` (8, 3) those of both, the large one's first."""
+        """Corners (4, 3) of each marker in its own axes; ``joint`` (8, 3): both, large first."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
@@ -116,7 +114,7 @@ def estimate_pose(
 def _continued(
     points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> ScoredPose | None:
-    """Return the solution next to a start, if it leaves `most_px` RMS or less."""
+    """The solution next to a start, if it leaves `most_px` RMS or less."""
     solution = None if start is None else gauss_newton(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
@@ -131,7 +129,7 @@ def _level_pose(
     R_level_body: Array,
     setup: PoseSetup,
 ) -> MarkerPose:
-    """Return the solution relative to the gear in the level frame."""
+    """The solution relative to the gear in the level frame."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
@@ -180,8 +178,7 @@ def normal_cam(pose: MarkerPose) -> Array:
 
 
 def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
-    """Return the change (3,) of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9); the
-    target's x axis is the marker's."""
+    """The change (3,) of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9)."""
     dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(heading[0, 0]), float(heading[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
@@ -231,8 +228,7 @@ class TiltPrior:
     spread_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
-        """Return True if the normal is known and the candidate's is further away than the
-        spread."""
+        """True if the known normal and the candidate's differ by more than the spread."""
         return (
             self.normal_cam is not None
             and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
@@ -253,8 +249,7 @@ def solve(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
 
 
 def gauss_newton(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine a pose with each corner's own spread, from a start that is near; None where that
-    fails."""
+    """Refine a pose with each corner's own spread, from a near start; None where that fails."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -337,7 +332,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
 
 
 def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
-    """Return the candidates of OpenCV's SQPNP; none of corners on one line."""
+    """The candidates of OpenCV's SQPNP; none of corners on one line."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
@@ -350,13 +345,13 @@ def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
 
 
 def _usable(candidate: PoseCandidate) -> bool:
-    """Return True if the candidate is finite and in front of the camera."""
+    """True if the candidate is finite and in front of the camera."""
     rvec, tvec = candidate.rvec, candidate.tvec
     return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
 
 
 def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
-    """Return the candidate refined by OpenCV, or as it was."""
+    """The candidate refined by OpenCV, or as it was."""
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
@@ -366,7 +361,7 @@ def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
 
 
 def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
-    """Return the candidate with what it leaves over of the corners."""
+    """The candidate with what it leaves over of the corners."""
     rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
@@ -374,8 +369,7 @@ def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
 
 
 def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
-    """Return the best candidate near the other tilt, whose normal is mirrored at the line of sight;
-    none where both agree."""
+    """The best candidate near the normal mirrored at the line of sight, if it is another."""
     R = rotation_matrix(scored.rvec)
     normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
     other = 2.0 * float(normal @ sight) * sight - normal
@@ -390,7 +384,7 @@ def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]
 
 
 def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPrior) -> ScoredPose:
-    """Return the best candidate by corners and tilt."""
+    """The best candidate by corners and tilt."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -408,17 +402,15 @@ def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPri
 
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
-    """Return how far corners (n, 3) are out of the sheet's plane at one standard deviation of each
-    kind of curl, (2n, 2) m, for x and y of each: the whole rim to one side, or two corners to
-    either."""
+    """Return how far corners (n, 3) leave the sheet's plane at one sigma of each curl, (2n, 2) m,
+    for x and y of each: the whole rim to one side, or two corners to either."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def curl_weight(curl: Array) -> Array:
-    """Return the weight matrix (2n, 2n) of the corner errors: the inverse of the covariance
-    ``I + curl curl^T``, for `curl` (2n, k)."""
+    """Return the corner errors' weights (2n, 2n), inverse of ``I + curl curl^T``; curl (2n, k)."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
@@ -428,8 +420,8 @@ def curl_weight(curl: Array) -> Array:
 # A fitted line is off by an offset and a tilt, and moves the corners at both of its ends. These
 # have errors across it of variance s^2 with a correlation of -1/2, so half the line's offset is
 # known to s/2 and its tilt to s sqrt(3)/2: `whitening` turns corner errors into these independent
-# ones. A shift that all edges share (clipped white, ink) is left out of the fit, where small
-# markers' own faults would feed it, but not out of the covariance.
+# ones. A shift of all edges (clipped white, ink) counts in the covariance only: in the fit small
+# markers' own faults would feed it.
 
 
 _EACH = np.eye(8)
@@ -467,7 +459,7 @@ def weigh_corners(
     K: Array,
     lift: Array,
 ) -> WeightedCorners:
-    """Return the corners of one or both detections with what each is worth."""
+    """Return the detections' corners with what each is worth."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
@@ -503,7 +495,7 @@ def weigh_corners(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Return the unit normals (m, 4, 2) of the sides of m squares."""
+    """The unit normals (m, 4, 2) of the sides of m squares."""
     side = corners.take(_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -515,7 +507,7 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:
-    """Return the spread of the sides, (4,): worse for one along the rows."""
+    """The spread of the sides, (4,): worse for one along the rows."""
     way = corners.take(_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(way[:, 1])
@@ -523,7 +515,7 @@ def _lying_px(d: Detection, corners: Array) -> Array:
 
 
 def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
-    """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
+    """The whitening of corners by the offset and tilt of four lines with normals (4, 2), at
     `_SIDES`; `sigma_px` is of all or of each, (4,)."""
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT

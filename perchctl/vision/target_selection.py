@@ -23,8 +23,7 @@ _SIGMA_PX = 1.0  # of corners as a search finds them
 
 @dataclass(frozen=True)
 class OwnTargetPlace:
-    """Where the own target is, in the world of the state estimate; None: not known. One farther
-    than `within_m` from there is not it."""
+    """The own target's place in the estimate's world, if known; one beyond `within_m` is not it."""
 
     xy_m: tuple[float, float] | None = None
     within_m: float = math.inf
@@ -90,8 +89,7 @@ _YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 def to_world(
     e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Return place (3,) and heading in the world of the state estimate, from those relative to the
-    gear in the level frame."""
+    """Convert place (3,) and heading from gear and level frame to the estimate's world."""
     way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -100,8 +98,7 @@ def to_world(
 def to_level(
     position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Return a place (3,) and a heading of the world as the gear has them, in the level frame; the
-    inverse of `to_world`."""
+    """Convert place (3,) and heading from the estimate's world to gear and level frame."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)

@@ -39,8 +39,7 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in either frame, whether there is a gate, and the own target's
-    place."""
+    """The filters' constants in either frame, whether poses are gated, and the own place."""
 
     level: FilterSetup
     world: FilterSetup
@@ -55,8 +54,7 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks one frame on; `measured` feeds nothing where the verdict has not taken its
-    pose."""
+    """The tracks one frame on; `measured` feeds nothing if the verdict did not take its pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -113,9 +111,8 @@ def update_tracks(
 
 
 # --- Whether a pose is the target's that was locked on ----------------
-# Another target, or a marker of another size, cannot be told from the target in a picture, but the
-# target does not jump. A pose that contradicts the lock by more than noise, motion and drift
-# explain is a stranger's and feeds no filter.
+# A picture does not tell another target or marker size from the target, but the target does not
+# jump: a pose off the lock by more than noise, motion and drift is a stranger's and feeds nothing.
 #
 # The lock goes over to a stranger that rests on both markers: at once if the lock never did, or, if
 # it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
@@ -145,8 +142,7 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose, as a measurement; `whole` if it rests on both markers; `looks_there` if the
-    lock's place is in the picture."""
+    """A measured pose; `whole`: of both markers; `looks_there`: the lock's place is in view."""
 
     t_s: float
     pose: MarkerPose
@@ -158,9 +154,8 @@ class FramePose:
 
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
-    """The gate's decision on a pose. `taken`: it is the target's; `afresh`: the tracks restart
-    there, perhaps for the `same` target. A rejected pose goes to `stranger`; `text` explains
-    what is unusual."""
+    """The gate's decision. `taken`: the pose is the target's; `afresh`: the tracks restart there,
+    maybe for the `same` target; others go to `stranger`; `text` explains the unusual."""
 
     taken: bool
     afresh: bool = False
@@ -249,7 +244,6 @@ class _Fit:
 
     @property
     def away_m(self) -> float:
-        """How far away the pose is."""
         return float(np.linalg.norm(self.off[1:]))
 
 
@@ -268,7 +262,7 @@ def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fi
 
 
 def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
-    """Return True if what no pose claims explains all, as in most frames: a quick look."""
+    """True if what no pose claims explains all, as in most frames: a quick look."""
     wanted = predict_track(track, sight.t_s, constants, spread=False)
     off = sight.measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
@@ -277,19 +271,17 @@ def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> b
 
 
 def _range_m(sight: FramePose) -> float:
-    """Return the target's distance from the camera."""
     return math.hypot(*sight.pose.tvec_m.tolist())
 
 
 def _unclaimed(range_m: float) -> Array:
-    """Return the spread of (yaw, x, y, z) that no pose claims."""
+    """The spread of (yaw, x, y, z) that no pose claims."""
     sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
 def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
-    """Return True if the pose goes on from the last one as seen from the vehicle, much better than
-    in the world."""
+    """True if the pose goes on as the vehicle saw it last, much better than in the world."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
@@ -310,7 +302,7 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
 def _watched(
     before: Stranger | None, sight: FramePose, fit: _Fit, constants: FilterSetup
 ) -> Stranger:
-    """Return the stranger with one more pose, or a new one."""
+    """The stranger with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
@@ -336,7 +328,7 @@ def _watched(
 
 
 def _believed(lock: Lock, stranger: Stranger, sight: FramePose) -> bool:
-    """Return True if the target is where the stranger is now."""
+    """True if the target is where the stranger is now."""
     if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
         return True
     if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
@@ -364,9 +356,8 @@ _FORGOTTEN = 0.1  # of what was learned, with each picture
 def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Return where both markers' corners should be, (4, 2) px each, and the pose that they follow
-    from: the last sighting, moved by the vehicle's own motion since. Without an attitude at both
-    times the pose is unmoved, and there are no corners."""
+    """Return both markers' expected corners, (4, 2) px, and their pose: the last sighting, moved by
+    the vehicle's motion. Without an attitude at both times: unmoved, and no corners."""
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude
@@ -413,7 +404,7 @@ def update_sighting(
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
-    """Return True if a place (3,) in the world lies in the picture."""
+    """True if a place (3,) in the world lies in the picture."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.
@@ -424,7 +415,7 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 
 def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """Return the camera's way (3,) by the estimate's places, and by its speeds."""
+    """The camera's way (3,) by the estimate's places, and by its speeds."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
@@ -434,12 +425,11 @@ def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[
 
 
 def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
-    """Return the camera's rotation in the world of the state estimate, (3, 3)."""
     R_world_cam: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, :3])
     return R_world_cam
 
 
 def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
-    """Return the way from the vehicle to the camera, in the world (3,)."""
+    """The way from the vehicle to the camera, in the world (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -1,4 +1,4 @@
-"""The values that walk down the vision hallway, one frozen dataclass a room."""
+"""The values that vision's steps exchange, frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -54,12 +54,11 @@ class Frame:
     """One picture. `t_s` is the time of exposure on the loop's clock, as far as
     known: time of arrival less the profile's `camera.latency_s`.
 
-    `image` is grey, uint8, shape (height, width). `fields` says whether it is a picture of one
-    moment: ``whole``; ``woven`` of two fields; the ``top`` or ``bottom`` field of such a one
-    at full height; None while nobody has looked (`perchctl.vision.fields`). `repeated`: the
-    source has given out the picture before once more, which is no measurement. `encoded`: the
-    JPEG that came, where `cv2.imdecode(..., IMREAD_GRAYSCALE)` of it is `image` to the bit; who
-    changes the image leaves it out.
+    `image` is grey, uint8, shape (height, width). `fields`: ``whole`` of one moment; ``woven`` of
+    two fields; the ``top`` or ``bottom`` field of such a one at full height; None: not examined
+    (`perchctl.vision.fields`). `repeated`: the picture before once more, no measurement.
+    `encoded`: the JPEG that came, where `cv2.imdecode(..., IMREAD_GRAYSCALE)` of it is `image` to
+    the bit; who changes the image leaves it out.
     """
 
     index: int
@@ -259,8 +258,8 @@ class TargetEstimate:
 class Sighting:
     """A pose of the target and the vehicle's attitude at that time, if it was known.
 
-    `off_rad2` is by how much, seen from the camera, the vehicle's own account of its way was wrong
-    of late: mean squares, of its places' steps and of its speeds times the time.
+    `off_rad2`: recent mean squares, seen from the camera, of what the vehicle's own account of its
+    way was off: of its places' steps and of its speeds times the time.
     """
 
     pose: MarkerPose

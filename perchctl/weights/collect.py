@@ -1,8 +1,8 @@
 """Collecting the data: a person places the camera, checked rows of the session's file come out.
 
-A session is a CSV (`perchctl.weights.data`) to which whole positions are appended, each in one
-write: it can be stopped at any time and continued, and a line that a crash cut in two is taken
-off when it is continued. Shaken and half-seen positions are refused and taken again.
+A session is a CSV (`perchctl.weights.data`) to which positions are appended in one write each: it
+can be stopped and continued at any time, less a line that a crash cut in two. Shaken and half-seen
+positions are refused and taken again.
 
 The actual pose of a position is given by a person or by motion capture. It is what the pipeline
 measures: the target relative to the gear's tip in the level frame, (x, y, z, yaw).
@@ -259,7 +259,7 @@ class MocapTruth:
 def _median(
     frames: list[CaptureFrame], body: str, mounted: PositioningConfig
 ) -> tuple[Array, tuple[float, float, float]]:
-    """Return the position (3,) m, and roll, pitch, yaw in rad of the body's axes in the world."""
+    """The position (3,) m, and roll, pitch, yaw in rad of the body's axes in the world."""
     placed = [VehiclePose.of(frame.bodies[body], mounted) for frame in frames]
     rpy = np.unwrap([rpy_from_rotation(each.R) for each in placed], axis=0)
     roll, pitch, yaw = (float(angle) for angle in np.median(rpy, axis=0))

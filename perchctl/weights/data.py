@@ -3,8 +3,8 @@
 Columns, in this order where perchctl writes them, by name where it reads them: ``position`` (a
 whole number: the place where the row was taken), ``t_s``, then x, y, z in metres and yaw in
 radians of ``large_``, ``small_`` and ``actual_``. Cells of a marker that was not seen are empty.
-Other columns are ignored. What matters is that the three poses are in one frame: perchctl's own
-are the target relative to the gear's tip in the level frame.
+Other columns are ignored. The three poses are in one frame: perchctl's own are the target relative
+to the gear's tip in the level frame.
 """
 
 from __future__ import annotations
@@ -77,8 +77,7 @@ def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
 
 
 def read_data(path: Path) -> Measurements:
-    """Return the rows of a file that can be fitted. Raises NotFound, and InvalidValue that names
-    file, and line or position."""
+    """Return a file's rows for the fit. Raises NotFound, InvalidValue with line or position."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
             lines, table = _read_table(path, csv.reader(text, skipinitialspace=True))
@@ -94,8 +93,7 @@ def read_data(path: Path) -> Measurements:
 
 
 def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
-    """Return each row's line (n,), and the numbers of the needed columns (n, 14), NaN where a cell
-    is empty."""
+    """Return rows' lines (n,) and needed columns (n, 14), NaN where a cell is empty."""
     header = [name.strip() for name in next(reader, [])]
     missing = [name for name in NEEDED if header.count(name) != 1]
     if missing:
@@ -123,8 +121,7 @@ def _read_table(path: Path, reader: Any) -> tuple[NDArray[np.int64], Array]:
 def _check_cells(
     path: Path, lines: NDArray[np.int64], heads: Array, poses: dict[str, Array]
 ) -> None:
-    """Raises InvalidValue for infinite numbers, missing cells, and poses of which a part is
-    missing."""
+    """Raises InvalidValue for infinite numbers, missing cells, and poses that lack a part."""
 
     def refuse(bad: Any, text: str) -> None:
         if bad.any():
@@ -150,7 +147,7 @@ def _check_cells(
 
 
 def _check_positions(data: Measurements) -> None:
-    """Raises InvalidValue for a marker that was never seen, a single position, or wrong units."""
+    """Raises InvalidValue for a never seen marker, a single position, or wrong units."""
     for source in ("large", "small"):
         if np.isnan(getattr(data, source)).all():
             raise InvalidValue(f"{data.name}: the {source} marker is never seen")

@@ -2,15 +2,13 @@
 it approaches; and whether they help.
 
 With a = large - actual and b = small - actual the merged error of equation 8 is
-``w a + (1 - w) b``. What is constant in a and b is the markers' bias: no weight can mend
-it, so it is estimated and reported apart, and the weights are fitted to the rest. All
-differences of yaw are wrapped about the errors' own mean direction, so that neither the
-seam at +-180 deg nor a constant turn of the data changes a weight.
+``w a + (1 - w) b``. What is constant in a and b, the markers' bias, no weight can mend:
+it is reported apart, and the weights are fitted to the rest. Differences of yaw are wrapped
+about their mean direction, so that no seam and no constant turn changes a weight.
 
-Frames of one position share its errors, so whole positions are held out: the weights are
-fitted to the others and tested on the one that was left out, bias included, as it acts in
-a flight. Intervals are Student's t over positions (for a root mean square by the delta
-method), 95 %.
+Frames of one position share its errors, so whole positions are held out in turn to test
+the weights, bias included, as it acts in a flight. Intervals are Student's t over positions
+(for a root mean square by the delta method), 95 %.
 """
 
 from __future__ import annotations
@@ -101,8 +99,7 @@ def marker_errors(data: Measurements) -> Errors:
 
 
 def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return false where the rule of `OUTLIER_SIGMAS` finds an outlier, (n, 4), for errors (n, 4)
-    of positions that begin at the rows `starts`."""
+    """Return False at outliers by `OUTLIER_SIGMAS`, (n, 4); positions begin at rows `starts`."""
     use = np.ones(error.shape, dtype=bool)
     if len(starts) * LEAST_ROWS > len(error):
         return use  # too few rows a position to estimate what is usual
@@ -171,8 +168,7 @@ def lms(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
 
 
 def _recursion(errors: Errors) -> tuple[Array, Array]:
-    """Return p of mean 1 and q of ``w <- w - mu (p w + q)``, (n, 4) each. An outlier's row is zero
-    and moves nothing."""
+    """Return p of mean 1 and q, (n, 4), of ``w <- w - mu (p w + q)``; an outlier's row is zero."""
     use = errors.use
     n = np.maximum(use.sum(axis=0), 1)
     a, b = np.where(use, errors.large, 0.0), np.where(use, errors.small, 0.0)
@@ -198,8 +194,7 @@ class FittedWeights:
 
 
 def fit_all(errors: Errors) -> dict[str, FittedWeights]:
-    """Return the weights of both methods by name. Raises InvalidValue for an axis on which every
-    weight fits alike."""
+    """Return both methods' weights by name. Raises InvalidValue where all weights fit alike."""
     total = errors.sums.sum(axis=1)
     closed = closed_form(total)
     if np.isnan(closed).any():
@@ -222,8 +217,7 @@ def fit_all(errors: Errors) -> dict[str, FittedWeights]:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Mean square errors of each position by the name of each set of weights, (g, 4), on positions
-    that it was not fitted to."""
+    """Mean square errors by weights' name, (g, 4), on positions that these were not fitted to."""
 
     squares: dict[str, Array]
 
@@ -239,20 +233,17 @@ class Evidence:
         return np.where(self.better == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """Return the root mean square error over all positions, (4,), m and rad, and the half width
-        of its 95 % interval."""
+        """Return the RMS error, (4,), m and rad, and the half width of its 95 % interval."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
     def gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """Return by how much the RMS error is below that of `other` (g, 4), and the half width of
-        the difference's interval, (4,)."""
+        """Return the RMS error's drop below `other` (g, 4), and its interval's half width, (4,)."""
         (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """Return true where the gain over the better single marker is above zero with its whole
-        interval, (4,)."""
+        """Return where the gain over the better marker is above 0 in its interval, (4,)."""
         gain, half = self.gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)
 
@@ -271,7 +262,7 @@ def evidence(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
 
 
 def _root(square: Array) -> tuple[Array, Array]:
-    """Return the root of the mean over positions (4,), and each position's influence (g, 4)."""
+    """The root of the mean over positions (4,), and each position's influence (g, 4)."""
     mean = square.mean(axis=0)
     rms = np.sqrt(mean)
     return rms, (square - mean) / (2.0 * np.maximum(rms, 1e-300))

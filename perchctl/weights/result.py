@@ -39,8 +39,7 @@ _HEAD = """\
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """All that a fit found out. `chosen` names the method whose weights are offered; `other` is
-    the evidence from other data, named `other_name`."""
+    """A fit's findings; `chosen` names the offered method, `other_name` the data of `other`."""
 
     errors: Errors
     fits: dict[str, FittedWeights]
@@ -61,8 +60,7 @@ class Result:
 
     @property
     def recommended(self) -> Array:
-        """The weights to fly with: the fitted ones where they are proven to beat the
-        better single marker, elsewhere that marker alone, (4,)."""
+        """The fitted weights where proven, else the better single marker's, (4,)."""
         alone = np.where(self.evidence.better == 0, 1.0, 0.0)
         return np.where(self.proven, self.fits[self.chosen].weights, alone)
 
@@ -98,7 +96,7 @@ def fit_weights(path: Path, chosen: str, test: Path | None = None) -> Result:
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
-    """Return the values by axis, to six figures, as a person may read them."""
+    """The values by axis, to six figures."""
     return {
         axis: float(f"{value:.6g}") if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
@@ -128,8 +126,7 @@ def weights_record(result: Result) -> dict[str, Any]:
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
-    """Return the RMS error (x, y, z, yaw) of each set of weights with the half width of its
-    interval."""
+    """Return each set of weights' RMS error (x, y, z, yaw) and its interval's half width."""
     record = {}
     for name in found.squares:
         rms, half = found.rms(name)
@@ -138,9 +135,8 @@ def _errors_record(found: Evidence) -> dict[str, Any]:
 
 
 def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> None:
-    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted; and
-    the record of the fit behind them. Errors: InvalidValue when it cannot be written; the old one
-    then stays."""
+    """Write the weights file: the recommended ones, or, `anyway`, all fitted ones; and the record
+    of the fit. Errors: InvalidValue when it cannot be written; the old one then stays."""
     flown = result.fits[result.chosen].weights if anyway else result.recommended
     content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
@@ -187,7 +183,7 @@ def report_text(result: Result) -> str:
 
 
 def _verdict(result: Result) -> str:
-    """Return the weights to fly with, and why, in a line for each axis."""
+    """The weights to fly with, and why, in a line for each axis."""
     if not any(result.proven):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "

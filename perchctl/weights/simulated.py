@@ -29,8 +29,7 @@ _STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class CameraPlace:
-    """A place of the camera, and `actual`, the target relative to the gear in the level frame
-    there, (4,)."""
+    """A camera place; `actual` (4,): the target relative to the gear in the level frame."""
 
     T_world_cam: Array
     actual: Array

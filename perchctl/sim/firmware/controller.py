@@ -74,8 +74,7 @@ _THRUST_SCALE = 1000.0
 
 
 class Pid:
-    """One PID loop; the derivative acts on the measurement. `i_limit` bounds the
-    integral, `limit` the output."""
+    """A PID loop, derivative on measurement; `i_limit` bounds the integral, `limit` the output."""
 
     def __init__(
         self,

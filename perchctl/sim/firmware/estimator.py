@@ -103,8 +103,7 @@ class Estimator:
         flying: bool = False,
         pressed: bool = False,
     ) -> None:
-        """Estimate one control period later. Motors that are `spinning` shake the accelerometer;
-        `flying` is what the supervisor says."""
+        """Estimate one control period later. `spinning` motors shake the accelerometer."""
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:
@@ -149,7 +148,7 @@ class Estimator:
         )
 
     def _integrate(self, world: World) -> tuple[float, float, float, float]:
-        """Return the attitude after one more control period of turning."""
+        """The attitude after one more control period of turning."""
         truth = world.quaternion
         if self.gyro is None:
             return truth

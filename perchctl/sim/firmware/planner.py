@@ -68,8 +68,7 @@ class HighLevelPlanner:
         return self.state != IDLE
 
     def finished(self, t_s: float) -> bool:
-        """True if the plan is over: by the clock, not by height (docs/firmware.md, "Setpoint
-        modes")."""
+        """True if the plan is over, by clock, not height (docs/firmware.md, "Setpoint modes")."""
         return self.state == IDLE or t_s - self._begin_s >= self._duration_s
 
     def stop(self, t_s: float = 0.0) -> None:

@@ -78,8 +78,7 @@ def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
 def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return those of the quadrilaterals (m, 4, 2) that resemble one of the markers, in their turn;
-    the most alike first, and each place once."""
+    """Quads (m, 4, 2) that resemble a marker, rolled to it, best first, each place once."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -101,9 +100,8 @@ def _best(
 
 
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the corners moved to where the marker's drawing goes best with the picture."""
+    """The corners moved to where the drawing is most like the picture."""
     side_px = mean_side_px(corners_px)
-    # Large markers are found on a picture reduced to what the search needs.
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_SEARCH_PX, _SEARCH_SIDES * side_px)
     centre = corners_px.mean(axis=0)
@@ -131,7 +129,7 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
 
 
 def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
-    """Return the drawing at own coordinates (n, n, 2), softened."""
+    """The drawing at own coordinates (n, n, 2), softened."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -204,7 +202,7 @@ def align_marker(
 
 
 def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
-    """Return True if the picture looks like the drawing. Without the marker the pattern's
+    """True if the picture looks like the drawing. Without the marker the pattern's
     correlation stays below 0.72 at the right strength; on it, it is above 0.95."""
     return (
         found.pattern > _MIN_PATTERN
@@ -216,6 +214,6 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
 
 
 def is_distinctive(found: Alignment) -> bool:
-    """Return True if another codeword would look different. Of 36 others that `is_verified` took
+    """True if another codeword would look different. Of 36 others that `is_verified` took
     for the marker, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA

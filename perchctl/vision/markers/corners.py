@@ -50,8 +50,7 @@ def apply_homography(H: Array, points: Array) -> Array:
 
 
 def corner_jacobian(H: Array) -> Array:
-    """Return the change (8, 8) of the corners that H (3, 3) makes of the unit square with the terms
-    of an increment P of `increment_homography`."""
+    """Return the change (8, 8) of corners by H (3, 3) with the terms of `increment_homography`."""
     q = _UNIT1.dot(H.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
@@ -59,8 +58,7 @@ def corner_jacobian(H: Array) -> Array:
 
 
 def increment_homography(H: Array, p: Array) -> Array:
-    """Return H (1 + P), scaled to 1 in its last term; p (8,) are the rows of P, but for its last
-    0."""
+    """Return H (1 + P), scaled to 1 in its last term; p (8,) are P's rows but for its last 0."""
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     return np.asarray(H / H[2, 2])
 
@@ -84,7 +82,7 @@ def doubled_area(corners: Array) -> Array:
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Return True if all corners (4, 2) are `room_px` or more inside a picture."""
+    """True if all corners (4, 2) are `room_px` or more inside a picture."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
     # False for NaN.
@@ -92,8 +90,7 @@ def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> b
 
 
 def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """Return the corners (4, 2) of a square `ratio` times as large with the same centre and plane;
-    without a camera, as if no lens bent it."""
+    """Return the concentric coplanar square (4, 2), `ratio` as large, by `camera`'s lens if any."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = apply_homography(homography_from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
     return found if camera is None else distort(found, camera)

@@ -1,9 +1,8 @@
 """The target so near, or so far aside, that no marker is wholly in the picture.
 
 What is left of the drawing is aligned from where the target is expected, and one marker's
-corners follow, with the covariance of what was seen. A part of a drawing looks like many things. So
-it is never a first sight of the target, and it counts only if the picture looks like the drawing
-all over and nearly all edges that should be in view are.
+corners follow, with their covariance. A part of a drawing looks like many things: it is no first
+sight of the target, and counts only if the picture is like it all over, with nearly all edges.
 """
 
 from __future__ import annotations
@@ -45,29 +44,27 @@ _OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its 
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Fill the caches of `fit_cut_markers` before the flight, so that its first call is fast."""
+    """Fill the caches of `fit_cut_markers` before the flight, so that it is fast at once."""
     _outline(patterns), make_texture(patterns["large"].drawing), make_lattice(camera)
 
 
 def is_target_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """Return True if none of the expected markers (4, 2) px is surely in the picture and free of
-    the vehicle's gear."""
+    """True if no expected marker (4, 2) px is surely in the picture and free of the gear."""
     whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(hides(hidden, c) for c in whole)
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
-    """Return True if one of the expected markers (4, 2) px may be wholly in the picture."""
+    """True if an expected marker (4, 2) px may be wholly in the picture."""
     return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
 
 
 def fit_cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the target's visible part and return the corners of a marker that follow from it.
-    `expected` are the predicted corners (4, 2) px."""
+    """Return a marker's corners by the target's visible part near `expected` (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -95,8 +92,7 @@ def fit_cut_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """Return True if what a picture shows of the target is enough to measure it, with the large
-    marker's axes (3, 3) and centre (3,) so in the camera."""
+    """True if a picture of the large marker at pose (3, 3), (3,) can be measured."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
     found = predict_fit(pose, _outline(patterns), camera)
@@ -108,25 +104,23 @@ def shows_enough_of_target(
 
 @lru_cache(maxsize=4)
 def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
-    """Return how the target's markers look."""
     return make_aruco_detector(DetectorConfig(), target).patterns
 
 
 def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
-    """Return the outline of both markers, as they are printed."""
     large, small = patterns["large"], patterns["small"]
     return make_outline(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
 
 def _stands_for(found: PoseFit) -> MarkerName:
-    """Return the marker that was seen: the small one, if enough of it was."""
+    """The marker that was seen: the small one, if enough of it was."""
     return "small" if found.small >= _SMALL_PLACES else "large"
 
 
 def _start(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    """Return the pose that goes with expected corners."""
+    """The pose that goes with expected corners."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
     if not np.isfinite(rays).all():
@@ -143,7 +137,7 @@ def _start(
 
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
-    """Return the prediction moved to where the picture is like it, if it is."""
+    """The prediction moved to where the picture is like it, if it is."""
     best, pose, lattice = _MIN_GLANCE, None, view.lattice
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
@@ -162,7 +156,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
 
 
 def _trusted(found: PoseFit) -> bool:
-    """Return True if nearly all edges are there, and tell enough of the place."""
+    """True if nearly all edges are there, and tell enough of the place."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.shown >= _MIN_SHOWN * found.in_view
@@ -172,7 +166,7 @@ def _trusted(found: PoseFit) -> bool:
 
 
 def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners | None:
-    """Return the corners of the marker of that half side, if the lens reaches."""
+    """The corners of the marker of that half side, if the lens reaches."""
     r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
     X = r + found.pose.t
     if X[:, 2].min() <= 0.0:
@@ -278,21 +272,19 @@ def make_overview(
 
 
 def _looked_up(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
-    """Return the picture's values at the lattice's nodes."""
     small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
     fine = cv2.remap(small, lattice.x, lattice.y, cv2.INTER_LINEAR)
     return _coarse(np.asarray(fine, np.float32))
 
 
 def _coarse(fine: Grey) -> Grey:
-    """Return the mean of the samples of each node."""
+    """The mean of the samples of each node."""
     rows, columns = (n // _FINE for n in fine.shape)
     return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the whiteness of the drawing through H (3, 3) at the nodes and `margin` more
-    around."""
+    """Return the drawing's whiteness through H (3, 3) at the nodes and `margin` more around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -314,8 +306,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
 
 
 def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Return the likeness of the picture with the drawing through H in its best light, and that
-    light's gain, grey levels from black to white."""
+    """Return the likeness to the drawing through H in best light, and its gain, grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -400,7 +391,7 @@ def make_texture(drawing: Drawing) -> Texture:
 def _edges(
     cells: Array, half: float, places: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
-    """Return the sides at which cells differ, as an `Outline` has them."""
+    """The sides at which cells differ, as an `Outline` has them."""
     width = 2.0 * half / len(cells)
     s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
     for across in (0, 1):
@@ -417,10 +408,9 @@ def _edges(
 
 
 # --- The target's pose from the edges that are in view, where its markers are cut by the picture
-# At places along the drawing's edges the edge of the picture is looked for across them, and
-# Gauss-Newton turns and moves the drawing until both agree. Its unknowns are a rigid body's: a part
-# of a drawing does not show the eight of a homography, and what it does not show of the tilt is
-# taken from the prediction. Lengths are in units of the large marker's half side.
+# Gauss-Newton turns and moves the drawing until its edges are the picture's, sought across them.
+# Its unknowns are a rigid body's: a part of a drawing does not show the eight of a homography, and
+# a tilt that it does not show is the prediction's. The unit is the large marker's half side.
 
 
 # Of the profiles, by rounds. An ascent blurs edges near the picture's rim by several pixels.
@@ -514,7 +504,7 @@ def fit_pose(
 
 
 def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """Return what `fit_pose` would make of a flawless picture in that pose."""
+    """Return what `fit_pose` would make of a flawless picture."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -531,7 +521,7 @@ def _in_view(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None,
 ) -> _Places:
-    """Return the places at which a whole profile is in view."""
+    """The places at which a whole profile is in view."""
     h, w = shape[:2]
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
@@ -614,7 +604,7 @@ def _solved(
 
 
 def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> PoseFit:
-    """Return the pose with its covariance."""
+    """The pose with its covariance."""
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
     common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)

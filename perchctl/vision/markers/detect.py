@@ -68,11 +68,10 @@ def detect_markers(
     empty_frames: int | None = None,
     own: AsideOf | None = None,
 ) -> Detections:
-    """Find and refine the target's markers in one frame. `previous` is what the last frame that saw
-    something gave: it gives the place to look at first, where no corners (4, 2) px are `expected`
-    by the vehicle's motion. `empty_frames` is how many frames in a row have shown nothing: in a
-    stream the searches take turns by it; None searches by all. `own` chooses among several targets
-    where none is expected. Of a frame of two fields the result is the mean."""
+    """Find and refine the target's markers in one frame, first at `expected`, corners (4, 2) px by
+    the vehicle's motion, else where `previous` leads, of the last frame that saw something.
+    `empty_frames` is how many in a row saw nothing: in a stream the searches take turns by it; None
+    searches by all. `own` chooses among targets if none is expected. Two fields give their mean."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     both = with_missing_marker(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup.by_lines)
@@ -90,7 +89,6 @@ def detect_markers(
         shift = replace(shift, age=age) if age < _SHIFT_PICTURES else None
 
     def detected(frame: Frame) -> Detections:
-        """Return what is in a frame of one moment."""
         hidden = hidden_area(frame, setup.mask)
         image = frame.image if hidden is None else filled(frame.image, hidden)
         picture, found = Picture(image, hidden, setup, camera), FoundMarkers()
@@ -159,7 +157,7 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
-    """Return True if a marker that should be found was not verified."""
+    """True if a marker that should be found was not verified."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -201,7 +199,6 @@ def _refined(picture: Picture, found: FoundMarkers) -> _Seen:
 
 
 def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
-    """Return the marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -268,15 +265,14 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """Return True if the line fit is good enough that a photometric fit would not improve it."""
+    """True if a photometric fit would not improve on the lines."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improve_corners(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
-    """Return the markers that were seen, with better corners and with the other marker if it shows.
-    What a search found stays only where lines suffice, the drawing confirms it, or the other marker
-    was seen with it."""
+    """Return the seen markers with better corners, and the other marker if it shows. What a search
+    found stays only where lines suffice, the drawing confirms it, or both were seen."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = around(picture, better["small"])
@@ -300,14 +296,14 @@ def improve_corners(picture: Picture, seen: _Seen, searched: bool = False) -> _S
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """Return the blur to start with: of the sides, where lines were fitted."""
+    """The blur to start with: of the sides, where lines were fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
-    """Return the corners (4, 2) px from which to align the drawing, if any."""
+    """The corners (4, 2) px from which to align the drawing, if any."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -343,7 +339,7 @@ def fit_lines(
 def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Seen:
-    """Return the expected markers that are verified by all sides and cells."""
+    """Return the expected markers that all sides and cells verify."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]
@@ -386,15 +382,13 @@ def follow_partly(
 
 
 def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """Return the large marker around a small one that was found, of which a part may be covered or
-    cut off."""
+    """Return the large marker around a small one; a part may be covered or cut off."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.nested(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        """Return True if the small marker is where the large one has it."""
         centre = picture.nested(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
@@ -437,7 +431,7 @@ def between(a: Detections, b: Detections) -> Detections:
 
 
 def _middle(a: Detection, b: Detection) -> Detection:
-    """Return the mean of two fields' detections, each with its own noise."""
+    """The mean of two fields' detections, each with its own noise."""
 
     def half(one: float, other: float) -> float:
         return float(((one**2 + other**2) / 4.0) ** 0.5)

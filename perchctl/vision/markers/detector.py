@@ -50,7 +50,7 @@ class DetectorSetup:
 def make_aruco_detector(
     config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
 ) -> DetectorSetup:
-    """Return dictionaries of just the target's ids, and how its markers look."""
+    """Return dictionaries of the target's ids alone, and its markers' looks."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -88,7 +88,7 @@ def make_marker_decoder(
 
 
 def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
-    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral."""
+    """Return OpenCV's marker detector, accepting nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -100,7 +100,7 @@ def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
 
 
 def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
-    """Return the inner bits (n, n) of the profile's marker, 1 = white."""
+    """The inner bits (n, n) of the profile's marker, 1 = white."""
     source = aruco_dictionary(marker.dictionary)
     rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
@@ -140,7 +140,7 @@ def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
 
 
 def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """Return the picture with what is hidden replaced by what is around it."""
+    """Return the picture with what is hidden filled from around it."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
@@ -156,7 +156,7 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
 
 
 def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """Return True if a part of the marker is hidden, up to `reach` half sides."""
+    """True if a part of the marker up to `reach` half sides is hidden."""
     if hidden is None:
         return False
     h, w = hidden.shape

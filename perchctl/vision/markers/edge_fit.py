@@ -3,9 +3,9 @@
 A blur that is equal on both flanks of a side does not move it. So each side's edge points are
 undistorted, a line is fitted to them by total least squares, and neighbours are intersected.
 
-White that is clipped, glares or went through a gamma curve does move edges: all of them, from white
-towards black, by the same number of pixels. The inner edge of a marker's border moves the opposite
-way, so the border's width, known to be one cell, gives the shift, and it is taken out.
+White that is clipped, glares or went through a gamma curve does move all edges, towards black, by
+the same number of pixels. A border's inner edge moves the opposite way, so the border's width,
+known to be one cell, gives the shift, and it is taken out.
 """
 
 from __future__ import annotations
@@ -57,8 +57,7 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
-    """Return where along sides of these lengths (rows,) profiles are, as shares of the side (rows,
-    n): not near the corners, where the next side blurs."""
+    """Return profile places along sides (rows,) as shares (rows, n), not near blurred corners."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -152,9 +151,8 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2); None where these are not a marker's sides. The
-    shift of all edges is measured unless it is known. Wide edges, and those near to the profiles'
-    ends, are looked at twice, the second time with the profiles centred on them."""
+    """Fit lines to the sides of m markers (m, 4, 2), None where they are no marker's; measure the
+    edges' shift unless `known`. Wide or off-centre edges are fitted again on centred profiles."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -176,7 +174,6 @@ def _refined_once(
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides near to the raw corners, once."""
     found: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = prepare_markers(raw_px, rims, camera)
     if markers is None:
@@ -227,8 +224,7 @@ def _refined_once(
 
 
 def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
-    """Return the lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
-    RMS distance of the points from these, px (4m,)."""
+    """Return lines (4m, 3): nx, ny, c, n.x = c, |n| = 1; and weighted RMS residuals, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -313,8 +309,7 @@ def _measured_shift(
 
 
 def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides lie further out than their middles, as
-    far as noise does not explain it."""
+    """How much farther out the widest marker's side ends lie than middles, beyond noise."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -362,7 +357,7 @@ def _sigma_px(
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """Return the spread of corners by what shakes rows: it moves upright sides only."""
+    """The spread of corners by what shakes rows: it moves upright sides only."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -413,7 +408,7 @@ class Samples:
 
 
 def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """Return what is to be measured of markers; None where one is no square."""
+    """Return what is to be measured; None where a marker is no square."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -441,8 +436,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 def measure_edges(
     image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
 ) -> tuple[Samples, Samples | None]:
-    """Return the edges' places on profiles across all sides and, on request, across the inner edges
-    of the border with the widest cells, if these are wide enough."""
+    """Return samples of all sides and, if asked and wide enough, of inner edges."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -479,14 +473,13 @@ def measure_edges(
 
 
 def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return how far the windows around edges and the profiles across reach."""
+    """Return the reach of the windows around edges, and of the profiles."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> NeighbourEdges:
-    """Return the `NeighbourEdges` of profiles at places `s` (rows, n): four rows a rim, and then
-    perhaps the inner edges of one border."""
+    """Return neighbours at `s` (rows, n): four rows a rim, then maybe one border's inner edges."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -503,8 +496,8 @@ def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) 
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
-# The edge in each profile is the gradient's windowed centroid, at first by a wide window, then by
-# one that is centred on the side's own line. Of a side is (rows,), of a profile (rows, n).
+# An edge is the gradient's windowed centroid, first by a wide window, then by one centred on the
+# side's own line. Of a side is (rows,), of a profile (rows, n).
 
 
 _ALONG32 = ALONG.astype(np.float32)
@@ -631,8 +624,7 @@ class _Profiles:
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return straight lines (rows, n) through the middles of the halves of each row, whatever a
-    quarter of either shows."""
+    """Lines (rows, n) through each row's half middles, robust to a bad quarter of either."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2

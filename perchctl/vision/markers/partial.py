@@ -105,7 +105,7 @@ def fit_partly_seen(
 
 
 def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
-    """Return True if nothing of the marker is hidden or beyond the edge."""
+    """True if nothing of the marker is hidden or beyond the edge."""
     room_px = ROOM_PX + found.blur_px
     return within(found.corners_px, picture.image.shape, room_px) and not hides(
         picture.hidden, found.corners_px
@@ -113,9 +113,8 @@ def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the changes (9, rows * n) of the edges with the terms of `corner_jacobian` and the
-    shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
-    spread."""
+    """The edges' changes (9, rows * n) with the terms of `corner_jacobian` and the shift of
+    all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's spread."""
     u, v = seen.own[..., 0], seen.own[..., 1]
     nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
@@ -141,7 +140,7 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 def _corners(
     H: Array, seen: SeenEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners of the square H (3, 3) with their covariance by what is left over of the
+    """The corners of the square H (3, 3) with their covariance by what is left over of the
     edges, px (rows, n), and the normal matrix (9, 9); None where these are vague."""
     w = seen.weight
     mass = w.sum(axis=1)
@@ -189,8 +188,7 @@ _INVERTED_PX = 0.5  # the lens model holds where its inverse is one
 
 
 def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
-    """Return True if the cells have their colour that are in the picture, not hidden, and not in
-    light that glares; how many, depends on what else says which marker it is."""
+    """True if visible, unglared cells have their colour; how many, `known_by` decides."""
     image, hidden = picture.image, picture.hidden
     h, w = image.shape
     at = _spots_px(corners_px, pattern, picture.camera)
@@ -222,7 +220,7 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
 
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
-    """Return the spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
+    """The spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
     does not reach. A marker that fills the picture is no square in it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
@@ -249,7 +247,7 @@ def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
 
 
 def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
-    """Return True if the known cells (cells,) tell which marker it is."""
+    """True if the known cells (cells,) tell which marker it is."""
     most_unknown = len(known) if known_by == "other" else _UNKNOWN_BITS[known_by]
     return bool(
         np.count_nonzero(pattern.inner & ~known) <= most_unknown
@@ -289,13 +287,12 @@ class SeenEdges:
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """Return the edges near to where the square H has them, if enough are seen."""
+    """Return the edges near the square H, if enough are seen."""
     camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
         return None
     cell_px = float(sides_px.mean()) / cells
-    # The marker's sides, and perhaps the inner edges of its border.
     rings = (1.0, 1.0 - 2.0 / cells) if cell_px > _INNER_CELL_PX else (1.0,)
     at = np.repeat(rings, 4)
     side = np.arange(len(at)) % 4
@@ -365,7 +362,7 @@ def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> 
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return which profiles (rows, n) go from black to white, and how white the paper is."""
+    """Which profiles (rows, n) go from black to white, and how white the paper is."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

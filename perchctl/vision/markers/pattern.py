@@ -65,8 +65,7 @@ class Pattern:
 
 
 def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """Return the rim of a marker with the inner bits (n, n), 1 = white, whose blur may reach the
-    edge."""
+    """Return the rim of inner bits (n, n), 1 = white, whose blur may reach the edge."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -83,7 +82,7 @@ def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return how a marker looks, with spots in all cells that are uncovered."""
+    """Return how a marker looks, with spots in all uncovered cells."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -112,7 +111,7 @@ def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
 
 
 def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if every cell at these corners has its colour, clearly."""
+    """True if every cell at these corners clearly has its colour."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -128,7 +127,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if nearly all cells have their colour."""
+    """True if nearly all cells have their colour."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -138,7 +137,7 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
 
 
 def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if the grey values in the cells go with the pattern."""
+    """True if the grey values in the cells go with the pattern."""
     return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
@@ -157,7 +156,7 @@ def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the mean grey value of each cell; None outside of the picture."""
+    """The mean grey value of each cell; None outside of the picture."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
@@ -165,7 +164,7 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Return the grey values (k,) at the spots; None outside of the picture."""
+    """The grey values (k,) at the spots; None outside of the picture."""
     at = apply_homography(homography_from_unit(corners_px), pattern.spots)
     # Spots are inside of the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
@@ -175,7 +174,7 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
-    """Return the whiteness at the spots with a blur of half a cell."""
+    """The whiteness at the spots with a blur of half a cell."""
     n, fine = len(drawing.cells), 8
     sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
     white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
@@ -219,7 +218,7 @@ def make_drawing(
 
 
 def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
-    """Return the share of each cell in each node, (nodes, cells)."""
+    """The share of each cell in each node, (nodes, cells)."""
     edges = size * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = axis[:, None] - half_node, axis[:, None] + half_node
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
@@ -227,7 +226,7 @@ def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array
 
 
 def _wide(axis: Array, half_node: float) -> Array:
-    """Return the axis with `EDGE` nodes more at either end."""
+    """The axis with `EDGE` nodes more at either end."""
     more = 2.0 * half_node * np.arange(1, EDGE + 1)
     return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
 

@@ -181,8 +181,7 @@ def align(
 
 
 def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
-    """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
-    the increments so far."""
+    """The next increment's equations after the sum `total` (8,); None without contrast."""
     rows, products = seen.light
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
@@ -233,7 +232,7 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
-    """Return the correlation and height of the inner pattern in grey (n * n,)."""
+    """The correlation and height of the inner pattern in grey (n * n,)."""
     rows, products = drawing.plain
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.light[0][GAIN], grey
@@ -258,7 +257,7 @@ def _repeated(error: Array) -> float:
 
 
 def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
-    """Return the largest mean departure over a cell."""
+    """The largest mean departure over a cell."""
     index, count = _cells_of(grid, n_cells)
     total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
@@ -266,7 +265,7 @@ def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
 
 @lru_cache(maxsize=32)
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Return each node's number of its cell, and how many nodes each cell has."""
+    """Each node's cell number, and how many nodes each cell has."""
     x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
     own = y.astype(np.intp) * n_cells + x.astype(np.intp)
@@ -280,7 +279,7 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 
 
 def _lit_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
-    """Return the changes (9, n * n) of grey with increment and the blur's square."""
+    """Changes (9, n * n) of grey with increment and the blur's square."""
     gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
     bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
@@ -336,8 +335,7 @@ def distort_px(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """Return how far the lens moves each node that is seen through H, (2, n * n): computed for a
-    few nodes, and for the rest by the polynomial through these."""
+    """Return each node's lens shift through H, (2, n * n), interpolated from a few."""
     uv1, between = _few(grid)
     pin = project_nodes(H, uv1)
     shift = (distort_px(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -346,8 +344,7 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 @lru_cache(maxsize=64)
 def _few(grid: Grid) -> tuple[Array, Array]:
-    """Return Chebyshev's nodes over the grid (3, _FEW^2), and their weights (n, _FEW) at its
-    own."""
+    """Chebyshev nodes over the grid (3, _FEW^2) and the weights (n, _FEW) of its own."""
     reach = float(grid.axis[-1])
     x = chebyshev.chebpts2(_FEW)
     degree = _FEW - 1
@@ -358,7 +355,7 @@ def _few(grid: Grid) -> tuple[Array, Array]:
 def _patch_around(
     image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the picture that is needed, and its first pixel (2, 1)."""
+    """The part of the picture that is needed, and its first pixel (2, 1)."""
     h, w = image.shape
     x, y = project_nodes(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -372,8 +369,7 @@ def _patch_around(
 
 
 def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
-    """Return the grey values at the nodes, (n * n,), of a patch moved by the lens's shift (2, n *
-    n)."""
+    """Grey values (n * n,) at nodes of a patch moved by the lens's shift (2, n * n)."""
     at = (project_nodes(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -415,15 +411,13 @@ class RenderedDrawing:
 
     @cached_property
     def sheets(self) -> tuple[tuple[Array, Array], ...]:
-        """Each sheet at the nodes (n * n,), and its changes (9, n * n) with the eight terms of a
-        homography's increment and with the blur's square."""
+        """Sheets at the nodes (n * n,), and changes (9, n * n) with increment and squared blur."""
         sharp = sheets(self.drawing, self.grid.n)
         return tuple(_blurred_with_slope(each, self.sigma, self.grid.axis) for each in sharp)
 
     @cached_property
     def light(self) -> tuple[Array, Array]:
-        """What light makes of the drawing: rows (7 or 8, n * n), the last one only with a
-        sheet's end, and their products."""
+        """Rows (7 or 8, n * n) of the lit drawing, the last with a sheet's end; their products."""
         u, v, one = self.grid.uv1
         (white, _), *others = self.sheets
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -432,8 +426,7 @@ class RenderedDrawing:
 
     @cached_property
     def plain(self) -> tuple[Array, Array]:
-        """What light makes of a black square of the drawing's size, without its slopes and
-        bend: rows (4 or 5, n * n), and their products."""
+        """As `light`, (4 or 5, n * n), for a black square of that size without slopes and bend."""
         soft = blur_nodes(square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
         lit, _ = self.light

@@ -55,9 +55,8 @@ def search(
     look: Look = "all",
     own: AsideOf | None = None,
 ) -> FoundMarkers:
-    """Search the window, if there is one, and the whole picture where that gave too little; only
-    one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several where
-    none is expected."""
+    """Search the window, if any, and the whole picture where that gave too little; only one of them
+    if `look` is "near", "window" or "sharp". `own` chooses among several where none is expected."""
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.by_lines and expected and look != "sharp":
@@ -80,8 +79,7 @@ def search(
 def search_halved(
     picture: Picture, expected: Mapping[MarkerName, Array], own: AsideOf | None = None
 ) -> FoundMarkers | None:
-    """Search the window at half the size: a millisecond. None where that did not show all that
-    should be whole in the picture."""
+    """Search the window at half size, a millisecond; None where anything whole is missed."""
     shape = picture.image.shape
     in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
@@ -192,7 +190,7 @@ def choose(
 def _nearest_first(
     candidates: Mapping[MarkerName, list[Array]], own: AsideOf
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates that are least far aside first, without those that are too far. A lone
+    """The candidates that are least far aside first, without those that are too far. A lone
     one is left to the pipeline, which says why it is not taken."""
     if sum(map(len, candidates.values())) < 2:
         return candidates
@@ -207,7 +205,7 @@ def _nearest_first(
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs that belong together, misfit and indices, best first."""
+    """The pairs that belong together, misfit and indices, best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
     best: dict[int, tuple[float, int, int]] = {}
@@ -218,7 +216,7 @@ def _wholes(
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return how far the small marker is from its place; up to 1 is allowed."""
+    """Return how far the small marker is off its place; at most 1 is allowed."""
     mapped = nested(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
@@ -228,7 +226,7 @@ def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """Return the candidate that continues the last detections, if any."""
+    """The candidate that continues the last detections, if any."""
     if not expected or not quads:
         return None
     if name in expected:
