@@ -47,8 +47,7 @@ _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
 
 @dataclass(frozen=True)
 class WorkerRequirements:
-    """What each worker of a campaign must have; sent with each flight. `campaign` is a name of its
-    own, `state` what decides a flight on this computer, by name."""
+    """What each worker must have: `campaign` is a name of its own, `state` decides a flight."""
 
     campaign: str
     profiles: tuple[Profile, ...]
@@ -56,8 +55,7 @@ class WorkerRequirements:
 
 
 def process_state(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """Return the program, its libraries, the `profiles` with their files, and how many flights
-    this process flies at a time."""
+    """Return program, libraries, the `profiles` with files, and the process's flights at a time."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
         "python": ".".join(platform.python_version_tuple()[:2]),

@@ -58,8 +58,7 @@ WILD_M = 0.1
 
 @dataclass(frozen=True)
 class CaptureSamples:
-    """Samples of one listening period: the vehicle's telemetry, the motion capture's frames, and
-    the capture's problem, None without one."""
+    """Telemetry, capture's frames, and the capture's problem (or None) of one listening period."""
 
     telemetry: tuple[Telemetry, ...] = ()
     frames: tuple[CaptureFrame, ...] = ()
@@ -255,8 +254,7 @@ def pair_motion(
 
 
 def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """Solve A and B by all pairs of moments between which it was turned; None where it was turned
-    about fewer than two axes."""
+    """Solve A and B by all pairs of moments of a turn; None for turns about less than two axes."""
     i, j = np.triu_indices(len(moved.own), 1)
     size = (moved.own[j] * moved.own[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)

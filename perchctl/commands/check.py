@@ -149,8 +149,7 @@ def _wrapped(text: str, first: str, others: str) -> list[str]:
 
 
 def camera_rows() -> Iterator[Row]:
-    """Yield a row for each camera of this computer. Nothing is set, and no picture taken. Errors:
-    NotFound where there are none."""
+    """Yield a row for each camera; nothing is set, no picture taken. Errors: NotFound if none."""
     cameras = find_cameras()
     if not cameras:
         raise NotFound(

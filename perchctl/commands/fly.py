@@ -253,8 +253,7 @@ def flight_record(
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Return the exit code of the flight, or that of its log if the flight was good and the log is
-    not."""
+    """Return the exit code of the flight, or if that was good, of its log."""
     code = EXIT_CODE_OF[outcome]
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
@@ -326,8 +325,7 @@ def plan_record(options: FlyOptions) -> dict[str, Any]:
 
 
 def plan_text(options: FlyOptions) -> str:
-    """Return the plan for people, at 80 columns: what, where, the way, and which values of the
-    profile are implausible."""
+    """Return the plan for people, at 80 columns, with the profile's implausible values."""
     resolved, profile, planner = plan_record(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""

@@ -312,8 +312,7 @@ def run_campaign(
     keep: Callable[[Any], None] = lambda result: None,
     objection: Callable[[list[Any]], PerchError | None] = lambda results: None,
 ) -> int:
-    """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
-    by Ctrl-C, or when a flight fails. Returns the exit code.
+    """Fly a campaign of `total` flights; report those flown, however it ends; return the exit code.
 
     `campaign` gets the executor and the function to call with each result; `report` gets the
     results, and the error if not all were flown. `earlier` results are counted, too; `keep` writes

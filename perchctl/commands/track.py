@@ -220,8 +220,7 @@ class Tracker:
         self._target: CameraPose | None = None
 
     def results(self, frame: Frame, name: str | int) -> list[TrackResult]:
-        """Return the frame's result, or those of its two fields; none for a live source's
-        repetition of the last picture."""
+        """Return the frame's result, or those of its two fields; none for a live repetition."""
         judged = self._perception.health.assess(frame, self._live or not self._stills)
         if self._live and judged == "repeated":
             return []

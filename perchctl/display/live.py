@@ -361,8 +361,7 @@ class Sketch:
 
 
 def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
-    """Return the frame with the outlines of its markers and the axes of its pose; bare if it was
-    not searched. `large_side_m` is the side of the large marker."""
+    """Return the frame with outlines of its markers and axes of its pose; bare if not searched."""
     if output is None or output.detections.frame_index != frame.index:
         return Sketch(frame.image)
     found = ((name, output.detections.get(name)) for name in MARKERS)

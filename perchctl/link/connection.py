@@ -104,11 +104,10 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """Return True if a driver that takes nothing will not take anything any more. Asked again
-        and again while it takes nothing, and only then: it has to be seen for `DEAD_S`.
+        """Return True if a driver will take nothing any more; to be called repeatedly while it
+        takes nothing, since it has to be seen for `DEAD_S`.
 
-        A radio that is only out of reach counts the packets it has lost, and goes on by itself. One
-        whose dongle was pulled out counts nothing (cflib repeats that for ever, too).
+        A radio out of reach counts its lost packets and goes on; an unplugged one counts none.
         """
         now_s, asked_s = time.monotonic(), self._asked_s
         self._asked_s = now_s
@@ -218,8 +217,7 @@ class Connection:
 
 
 class _Nowhere:
-    """Stands in the place of cflib's driver while there is none. By itself cflib looks only once a
-    second whether there is one again, and telemetry would wait for that."""
+    """Stands for cflib's missing driver, since cflib looks for a new one only once a second."""
 
     needs_resending = False
 
@@ -263,9 +261,8 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 
 def init_cflib() -> None:
-    """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence it: its log has tracebacks of what is reported by callback as well, and its radio prints
-    on stdout, which is for results."""
+    """Register cflib's drivers, keep its radio from giving up early, and silence it: its log
+    repeats what callbacks report, and its radio prints on stdout, which is for results."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 
