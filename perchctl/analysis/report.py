@@ -196,8 +196,7 @@ def _templates() -> jinja2.Environment:
 
 
 def film_data_url(flight: FlightAnalysis) -> tuple[str, str]:
-    """Return the flight's film as a `data:` address, and why it, or its camera pictures, are
-    missing; each may be empty. The log has at least one tick."""
+    """Return the film's `data:` address, and why it or its pictures are missing, or empty texts."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
     recorded = [recorded_pictures(path)] if is_recorded else []

@@ -100,9 +100,9 @@ def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
 
 
 class ClusterExecutor(Executor):
-    """An executor of flights on the workers of a dask cluster. dask flies the flight of a lost
-    worker again. A future fails with an error of `lost` if that happened too often, with
-    InvalidValue if the worker must not fly, and is cancelled if the scheduler is lost."""
+    """An executor on a dask cluster, which flies the flight of a lost worker again. A future fails
+    with an error of `lost` if that happened too often, with InvalidValue if the worker must not
+    fly, and is cancelled if the scheduler is lost."""
 
     lost = (KilledWorker,)
 

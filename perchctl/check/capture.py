@@ -194,8 +194,8 @@ STRANGER = 0.4
 
 @dataclass(frozen=True, eq=False)
 class PairedMotion:
-    """Pairs of one moment each: n attitudes as the vehicle and as the capture have them, the
-    capture's places (n, 3), and the accelerometer's largest difference from 1 g."""
+    """Pairs of one moment: n attitudes by vehicle and by capture, the capture's places (n, 3), and
+    the accelerometer's largest difference from 1 g."""
 
     own: Rotation
     seen: Rotation
@@ -370,8 +370,8 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """Say in one row whether `fly` finds a comparison by hand of this motion capture; no row with
-    decks, nor for the simulator's own vehicle, whose room is right as it is built."""
+    """Say in one row whether `fly` finds this capture compared by hand; no row with decks, nor for
+    the simulator, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
     return [_record_row(config, uri, now)]
