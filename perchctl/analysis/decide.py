@@ -40,8 +40,7 @@ class ReplayedDecision:
 
 
 def replayable_turns(log: FlightLog) -> tuple[list[Turn], str]:
-    """Return what can be replayed of a log: its turns up to the first that is missing, and a
-    sentence about that one, empty where none is. Errors: InvalidValue."""
+    """Return a log's turns up to a gap, and a sentence on it, else empty. Errors: InvalidValue."""
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
         raise InvalidValue(
@@ -62,9 +61,8 @@ def replay_decisions(
     profile: Profile,
     seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[ReplayedDecision]:
-    """Replay the planner turn by turn, with the observation that `seen` returns for each turn: by
-    default the recorded one. Only flown turns advance the planner's state. The replay ends with
-    the first turn on which the planner raises, as a flight does."""
+    """Replay the planner turn by turn on the observations that `seen` returns, by default the
+    recorded ones. Only flown turns advance its state. It ends where the planner raises."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
@@ -103,8 +101,7 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
 
 
 def field_difference(name: str, one: Any, other: Any) -> FieldDifference | None:
-    """Return the first field in which two values differ; None where nothing does. Of two kinds of
-    command the whole values are shown, with their class."""
+    """Return the first differing field, or None; two kinds of command are shown as a whole."""
     if type(one) is not type(other):
         return name, _shown(one), _shown(other)
     return _first_differing(name, to_exact_json(one), to_exact_json(other))

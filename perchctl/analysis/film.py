@@ -104,8 +104,7 @@ class _Stage:
         self._still = self._canvas.copy_from_bbox(self._figure.bbox)
 
     def drawn(self, index: int, image: Rgb | None, newest: dict[str, Any]) -> Rgb:
-        """Return the picture of a tick, (height, width, 3); `newest` is the record of the newest
-        frame, with its markers' corners."""
+        """Return a tick's picture, (height, width, 3); `newest`: the record of the newest frame."""
         record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
         if image is not None:
             self._image.set_data(image)
@@ -183,9 +182,8 @@ class _Stage:
 
 
 def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
-    """Return the vehicle's centre in each tick, (n, 2), and the target's height, None where it was
-    never seen: metres beside the target and above the ground, in the vertical plane that holds
-    the target and the place of take-off. Errors: InvalidValue for a log without a position."""
+    """Return the vehicle's centre in each tick, (n, 2), and the target's height (None: never seen):
+    metres aside and up, in the vertical plane of target and take-off. Errors: InvalidValue."""
     log = flight.log
     body_m, targets_m = (
         np.column_stack([log.column(f"{prefix}{axis}_m") for axis in "xyz"]) for prefix in ("", "t")
@@ -228,8 +226,7 @@ def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
 
 
 def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
-    """Write an animated GIF in one palette of greys and the lines' colours with white, so that
-    what stands still costs nothing."""
+    """Write a GIF in one palette of greys and line colours, so that what stands still is free."""
     from PIL import Image
 
     greys = np.repeat(np.linspace(0.0, 255.0, 64)[:, None], 3, axis=1)

@@ -45,7 +45,7 @@ def _number(label: str, unit: str = "", scale: float = 1.0, digits: int = 0) -> 
 
 @dataclass(frozen=True)
 class Measures:
-    """The numbers of a flight, as they are shown, compared and reported; None is not known.
+    """The numbers of a flight; None is not known.
 
     The settled errors are the RMS over the last `SETTLED_S` of the ascent from which the last
     contact was begun: horizontal distance of gear and target, and heading.
@@ -93,9 +93,8 @@ class Measures:
 class FlightAnalysis:
     """What one flight was, worked out from its log; each part once, when it is first used.
 
-    Times count from the flight's first turn. Where a part needs a value that no flight writes it
-    raises InvalidValue, TypeError, ValueError, LookupError or AttributeError, of which
-    `perchctl.record.log_values` makes one error.
+    Times count from the flight's first turn. A value that no flight writes raises InvalidValue,
+    TypeError, ValueError, LookupError or AttributeError; `perchctl.record.log_values` makes one.
     """
 
     def __init__(self, log: FlightLog) -> None:
@@ -110,8 +109,7 @@ class FlightAnalysis:
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
-        """Each stretch of turns in one phase that were held for one and the same reason, whatever
-        its numbers, which are the last ones'."""
+        """The stretches of turns in one phase held for one reason; numbers are the last ones'."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -236,8 +234,7 @@ _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
 
 @dataclass(frozen=True)
 class Takeover:
-    """What one sender sent in one go. Times are since the flight's first turn; `commands` counts
-    the commands by their kind, such as ``position setpoint``, in the order of their first."""
+    """What one sender sent in one go. Times are since the first turn; `commands` counts by kind."""
 
     by: str
     start_s: float

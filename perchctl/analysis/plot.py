@@ -70,9 +70,8 @@ def flight_png(flight: FlightAnalysis) -> bytes:
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:
-    """Draw detections against the filtered track (as the paper's figure 6), height, thrust and
-    battery, over the named phases; and the last seconds with the target in millimetres. Where the
-    pipeline had nothing to measure is marked at the bottom."""
+    """Draw detections and the filtered track (as the paper's figure 6), height, thrust and battery
+    over the phases; and the last seconds with the target in mm. Lost frames are marked below."""
     figure = new_figure(11.0, 14.0)
     *axes, last_ax = figure.subplots(7, 1, height_ratios=(1, 1, 1, 1, 1.1, 1.1, 2.0))
     for ax, (key, scale, label) in zip(axes[:4], TRACKS, strict=True):
@@ -169,8 +168,7 @@ def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
 
 
 def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
-    """The contact's approach in millimetres: single frames and the estimate, up to the last frame
-    with the target. Returns from when to when."""
+    """Draw the approach in mm up to the last frame with the target; return from when to when."""
     log, frames = flight.log, flight.frames
     end_s = (
         float(frames.times_with_target_s[-1])

@@ -89,8 +89,7 @@ class Replay:
     """Replay of a log through the planner, and through perception if pictures were recorded.
 
     Attributes:
-        decided: each turn of the planner, decided again; `differences` are of those that were
-            decided otherwise, sent or not.
+        decided: each turn of the planner; `differences`: of those decided otherwise, sent or not.
         seen: what the pictures show; None without any.
         changed: the keys in which the profile is another than the flown one's.
         gap: which turn is the first that the log has lost, or empty.
@@ -141,8 +140,7 @@ class Replay:
     def record(self) -> dict[str, Any]:
         """Return the replay as JSON's own types.
 
-        `ticks`, `differences` and `first_difference` are the planner's; `pictures` is None without
-        any, `changed` empty where the profile is the flown one.
+        `ticks`, `differences` and `first_difference` are the planner's; `pictures` may be None.
         """
         seen = self.seen
         pictures = seen and {
@@ -195,10 +193,9 @@ def replay(
 ) -> Replay:
     """Replay the flight by its own profile; or, with `profile`, by another one.
 
-    With the flown profile the planner gets the recorded observations, and perception is compared
-    separately. With another profile it gets what that profile's perception finds in the pictures.
-    `pipeline` processes them: by default the profile's, with the flown calibration and mask.
-    Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
+    By the flown profile the planner gets the recorded observations, and perception is compared by
+    itself; by another one it gets what that finds in the pictures. `pipeline`: by default the
+    profile's, with the flown calibration and mask. Errors: InvalidValue, NotFound.
     """
     flown = log.flown_profile
     turns, gap = replayable_turns(log)

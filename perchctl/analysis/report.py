@@ -149,8 +149,7 @@ POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-
 
 
 def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
-    """Return the page of at least one flight as HTML that needs no other file. Raises InvalidValue
-    for a value that no flight writes."""
+    """Return the page of one or more flights. Raises InvalidValue for what no flight writes."""
     articles = []
     for number, told in enumerate(flights, start=1):
         with log_values(told.flight.log.path):
@@ -197,8 +196,7 @@ def _templates() -> jinja2.Environment:
 
 
 def film_data_url(flight: FlightAnalysis) -> tuple[str, str]:
-    """Return the flight's film as a `data:` address, and why it, or its camera pictures, are
-    missing; each may be empty. The log has at least one tick."""
+    """Return the film's `data:` address, and why it or its pictures are missing, or empty texts."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
     recorded = [recorded_pictures(path)] if is_recorded else []
@@ -216,8 +214,7 @@ def film_data_url(flight: FlightAnalysis) -> tuple[str, str]:
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
-    """Return the error's text with the bare names of the files beside the log: a page that is sent
-    on names no folder of a computer."""
+    """Return the error's text with bare file names: a page that is sent on names no folder."""
     return str(error).replace(f"{log_path.parent}{os.sep}", "")
 
 
@@ -234,8 +231,7 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 @dataclass(frozen=True)
 class DecisionPicture:
-    """Camera picture behind a decision of the mission, as a JPEG with the detected markers drawn.
-    The last centimetres are flown without pictures: the caption has the time of this one."""
+    """JPEG behind a decision, with markers; the caption has its time, as the last cm have none."""
 
     caption: str
     jpeg: bytes
@@ -267,8 +263,7 @@ def read_reported_flight(log_path: Path) -> ReportedFlight:
 
 
 def decision_frames(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
-    """Find the frames on which the mission entered a new phase. Return by frame number a caption
-    and the log record of the frame's tick."""
+    """Return caption and tick's record, by frame number, of each frame that began a new phase."""
     log = flight.log
     found = {}
     for stay in log.phases:

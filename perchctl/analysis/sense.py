@@ -26,8 +26,7 @@ Picture = tuple[int, float, NDArray[np.uint8]]
 
 
 class PictureMissing(Exception):
-    """The replay of pictures ends here; the message says why. `is_another`: at a picture that is
-    not the flown one."""
+    """The pictures end here; the message says why. `is_another`: not the flown picture."""
 
     is_another = False
 
@@ -38,8 +37,7 @@ class _PictureIsAnother(PictureMissing):
 
 @dataclass(frozen=True, eq=False)
 class ReplayedInputs:
-    """Inputs of one turn as the replay computes them. `observation` is the recorded one with the
-    replayed perception in it; None before the first telemetry."""
+    """Replayed inputs of a turn: the recorded `observation` with replayed perception, or None."""
 
     turn: Turn
     poses: dict[str, UnfilteredPose]
@@ -136,11 +134,10 @@ def replay_inputs(
     pictures: Iterable[Picture],
     later_s: float = 0.0,
 ) -> Iterator[ReplayedInputs]:
-    """Replay perception turn by turn, from the first turn before take-off. `later_s` is added to
-    the exposure times of a live source.
+    """Replay perception turn by turn. `later_s` is added to the exposure times of a live source.
 
-    Raises PictureMissing at the first frame whose picture is missing, differs or cannot be read:
-    after it the pipeline's state would differ from the flight's.
+    Raises PictureMissing at the first picture that is missing, differs or cannot be read: from
+    there the pipeline's state would differ from the flight's.
     """
     given = _Given(pictures, pipeline.camera.size_px, later_s)
     inputs = FlightInputs(given, given, pipeline, profile, recorded=True)

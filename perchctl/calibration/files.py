@@ -1,5 +1,4 @@
-"""Calibration files: read from ROS (camera_info), OpenCV (FileStorage: YAML, XML, JSON) and Kalibr
-(camchain); written as one YAML that ROS, OpenCV's FileStorage and PyYAML all read."""
+"""Calibration files of ROS, OpenCV and Kalibr; one YAML for ROS, OpenCV and PyYAML written."""
 
 from __future__ import annotations
 

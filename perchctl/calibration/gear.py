@@ -1,7 +1,6 @@
 """The part of the picture that the vehicle itself covers, learned from pictures that move.
 
-While the vehicle is turned about, everything else in the picture changes. What stays the same, and
-is connected with the picture's edge, as legs and guards are, is the vehicle.
+While the vehicle is turned about, only it stays the same, connected with the picture's edge.
 """
 
 from __future__ import annotations

@@ -55,8 +55,7 @@ class _Picture:
     data: bytearray
 
     def pixels(self) -> NDArray[np.uint8] | None:
-        """Return the grey picture (height, width); None unless the data are `size` bytes of raw
-        pixels, or one whole JPEG of the announced size."""
+        """Return the grey picture (h, w) of complete raw or JPEG data of its size, else None."""
         shape, data = (self.height, self.width), bytes(self.data)
         if len(data) != self.size:
             return None
@@ -71,9 +70,8 @@ class AiDeckSource(LiveSource):
     """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG pictures.
 
     A picture's time is that of its first byte less `latency_s`: the deck sends the header as soon
-    as the picture is taken, and only the transfer behind it, of 60 ms and more for a raw one,
-    hangs on the air. Its age of arrival is the last byte's. A picture that is not whole is dropped;
-    what is no packet ends the connection, and the next one begins with a whole packet.
+    as it is taken, and the transfer (60 ms and more for a raw one) hangs on the air. Its age of
+    arrival is the last byte's. A partial picture is dropped; what is no packet ends the connection.
     """
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
@@ -146,13 +144,12 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
 
 
 # --- A colour camera's mosaic in what is delivered as a grey picture ---
-# The sensor's pixels look through colour filters, two by two, and a raw picture, or a JPEG that
-# was made of one as if it were grey, has their pattern all over it.
+# Pixels look through colour filters, two by two, whose pattern is in raw and grey JPEG pictures.
 
 
 LEAST_SHARE = 0.04
-"""By which the four filters' mean greys differ, over their mean: two pixels of a grey sensor that
-lie side by side differ by less than 1 % over a whole picture, a mosaic's by 20 % and more."""
+"""By which the filters' mean greys differ, over their mean: a grey sensor's by less than 1 %, a
+mosaic's by 20 % and more."""
 LEAST_LEVELS = 1.5
 PICTURES_IN_A_ROW = 3
 _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)
@@ -167,8 +164,7 @@ def has_mosaic(image: NDArray[np.uint8]) -> bool:
 def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return each pixel's grey with its neighbours: a quarter red, half green, a quarter blue.
 
-    The weights 1 2 1 along rows and columns cancel whatever repeats every two pixels, so it holds
-    for each order of the filters, and for a JPEG.
+    The weights 1 2 1 along rows and columns cancel what repeats every two pixels, in a JPEG too.
     """
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_8U, _KERNEL, _KERNEL), np.uint8)
 

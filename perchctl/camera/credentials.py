@@ -35,8 +35,7 @@ def _without_name(rest: str) -> str:
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """Return every key of the profile, for JSON that is kept and shown, without a password: it
-    opens no camera that wants one."""
+    """Return all keys of the profile for JSON, without a password: it opens no camera with one."""
     record = profile.model_dump(mode="json")
     record["camera"]["source"] = without_password(profile.camera.source)
     return record | {"description": without_password(profile.description)}

@@ -58,9 +58,8 @@ def configure_capture(
 class DeviceSource(LiveSource):
     """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
 
-    A picture that cannot be read or decoded is dropped. After `LOST_AFTER_FAILURES` in a row the
-    camera counts as lost: it is released, and opened again as soon as it is back. `opener` returns
-    anything with read() and release(), as `open_video_capture` does, and its errors.
+    A bad picture is dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is
+    released, and opened again once it is back. `opener`: as `open_video_capture`.
     """
 
     reconnect_wait_s = REOPEN_EVERY_S
@@ -104,8 +103,7 @@ NAMES = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class ConnectedCamera:
-    """`stable_path` names it wherever it is plugged in, where the system keeps such a link;
-    `problem` says why it cannot be opened."""
+    """`stable_path` names it in any socket, if there is one; `problem`: why it does not open."""
 
     number: int
     name: str = ""

@@ -149,8 +149,7 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:
-    """Return the picture files of a folder or glob (or those given, each once), naturally sorted;
-    raises NotFound if there are none."""
+    """Return the files of a folder, glob or list, each once, naturally sorted. Raises NotFound."""
     if not isinstance(where, str):
         return sorted(set(where), key=_natural)
     folder = Path(where)

@@ -47,10 +47,9 @@ class FrameHealth:
     def assess(self, frame: Frame, live: bool = True) -> Kind:
         """Judge the next frame: it is a measurement only if it is "ok".
 
-        A camera's noise makes each live picture differ from the last, so equal bytes
-        mean that the receiver or the stream repeats an old one; so does what the source
-        has found to be one (`Frame.repeated`), which is never frozen for that alone. In
-        recordings (`live` false) equal pictures are taken as they are.
+        A camera's noise makes each live picture differ, so equal bytes mean that the receiver or
+        stream repeats an old one, as does `Frame.repeated`, which is never frozen for that alone.
+        Recordings (`live` false) may have equal pictures.
         """
         before, self._picture = self._picture, frame.image
         if live and before is not None and same_bytes(before, frame.image):

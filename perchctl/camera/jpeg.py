@@ -29,8 +29,7 @@ def jpeg_extent(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
     """Return the length of the JPEG at the start of `data`, and the width and height that it says;
     None if it is incomplete.
 
-    Of a damaged one, where a segment is followed by no marker or another picture begins, return
-    where its structure breaks, and no size: (0, 0).
+    Of a damaged one return where its structure breaks, and (0, 0).
     """
     at, size_px, in_scan = 2, (0, 0), False
     while True:
@@ -61,16 +60,14 @@ def jpeg_extent(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
 class JpegSplitter:
     """Cuts a byte stream into whole JPEG pictures.
 
-    It follows the JPEG's own structure instead of the multipart headers. Wrong lengths, odd
-    boundaries and missing headers therefore do no harm, and a picture is out with its last byte.
+    It follows the JPEG's structure, so wrong headers do no harm, and a picture is out at its end.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[bytes, tuple[int, int]]]:
-        """Append bytes; return the pictures that are complete now, oldest first, with the width and
-        height that they say."""
+        """Append bytes; return the pictures complete now, oldest first, with width and height."""
         self._buffer += data
         pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
@@ -98,8 +95,7 @@ class JpegSplitter:
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the grey picture of any file's bytes; None if OpenCV cannot decode them. Whatever the
-    bytes are, it raises nothing."""
+    """Return the grey picture of any bytes, None if OpenCV cannot decode them; raises nothing."""
     if not data:
         return None  # of an empty array OpenCV makes an error
     try:

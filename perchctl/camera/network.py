@@ -43,9 +43,8 @@ _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    It gives up at once, too, where the server wants another name and password. They are sent once
-    the camera asks for them, digest (MD5) or basic, and to no address that it redirects to. It goes
-    straight to the camera: a proxy for the internet is not for it.
+    It gives up at once where the server wants another name and password. They are sent once asked
+    for, digest (MD5) or basic, and to no address that it redirects to. No proxy is used.
     """
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
@@ -69,8 +68,7 @@ class MjpegSource(LiveSource):
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
-        """Return the stream's response, with name and password once the camera has asked for them:
-        once, since cameras lock out who tries again and again."""
+        """Return the response; credentials go once, when asked, as cameras lock out repeaters."""
         opener, request = build_opener(ProxyHandler({})), Request(self._bare, headers=_HEADERS)
         response: HTTPResponse
         try:
@@ -140,8 +138,7 @@ _OPTIONS = {
 class TransferDelay:
     """Estimates a picture's extra transfer time over the fastest one of the last ten seconds.
 
-    Pure. The camera's timestamp of a picture shows the delay. Pictures that queue behind a stalled
-    radio arrive in a burst, and would look as if they had just been taken.
+    Pure. Pictures that queue behind a stalled radio arrive in a burst and would look just taken.
     """
 
     def __init__(self) -> None:

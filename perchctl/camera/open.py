@@ -33,8 +33,7 @@ FIRST_FRAME_WITHIN_S = 8.0
 
 @dataclass(frozen=True)
 class SourceName:
-    """What a source's text names. `scheme`: one of `SCHEMES`; `place`: what stands behind the
-    colon. As a text it shows no password."""
+    """A source by `scheme` (of `SCHEMES`) and `place` behind the colon; it shows no password."""
 
     scheme: str
     place: str

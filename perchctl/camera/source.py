@@ -21,9 +21,8 @@ from perchctl.vision import CameraModel, Frame
 class NewestSlot:
     """Keeps the newest picture, with the time of its first arrival.
 
-    A repeat by the receiver does not replace a picture that was not taken yet: it would look
-    younger than it is. After that picture was taken, the repeat has the same index and
-    `Frame.repeated`: a sign of life, not a measurement.
+    A receiver's repeat never replaces an untaken picture, which would look younger than it is.
+    Later it has the same index and `Frame.repeated`: a sign of life, not a measurement.
     """
 
     def __init__(self) -> None:
@@ -220,10 +219,8 @@ class LiveSource:
         began_s: float | None = None,
         encoded: bytes | None = None,
     ) -> None:
-        """Keep a picture that has arrived now. `waited_s`: how long it was under way beyond the
-        usual. `began_s`: when the picture began to arrive, where that is known and tells more of
-        its exposure than its end does: the latency is counted from there. `encoded`: as `Frame` has
-        it."""
+        """Keep a picture that has arrived now. `waited_s`: its time under way beyond the usual.
+        `began_s`: start of its arrival; the latency counts from there. `encoded`: as in `Frame`."""
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
         grey = to_grey(image)
@@ -241,8 +238,8 @@ class LiveSource:
 
 
 class WrappedSource:
-    """A source around another one: everything is the inner one's. Each frame is shown to `change`,
-    which must not raise; the frame that it returns is given instead, where it returns one."""
+    """A source around another one. Each frame is shown to `change`, which must not raise, and may
+    return a frame to be given instead."""
 
     def __init__(
         self, source: FrameSource, change: Callable[[Frame], Frame | None] = lambda frame: None

@@ -195,10 +195,9 @@ class Sweep:
     profiles: tuple[Profile, ...]
 
     def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
-        """Return the figures of each value (a cell), by the seeds that were flown with every
-        value, for JSON. `best`: the value with the most successes, of these the one with the
-        smallest median miss; `best_against_own` is the `Comparison` of the own value, A, with it,
-        None where they are the same."""
+        """Return each value's figures (a cell) for JSON, over the seeds flown with all. `best`:
+        most successes, then the smallest median miss; `best_against_own`: the `Comparison` of the
+        own value, A, with it; None where they are the same."""
         seeds = results_by_seed(results, len(self.profiles))
         own = len(self.profiles) - 1
         cells = [

@@ -36,8 +36,7 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
-    """Call `fly` with the seed's scenario on one core, and return its result (a dataclass) with
-    the CPU time and the scenario filled in. The flight's memory is freed."""
+    """Call `fly` with the seed's scenario on one core; add CPU time and scenario to its result."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     cpu_began_s = time.process_time()
     scenario = draw_scenario(profile, seed)
@@ -60,10 +59,9 @@ def _give_back_memory() -> None:
 def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
 ) -> FlightResult:
-    """Fly one seed of the profile's scenario. Any executor can carry this function to another
-    process or machine. `record` writes the pictures beside the log. A flight that is refused
-    before take-off is a result, too, and leaves no log. Errors: NotFound, InvalidValue
-    (calibration, log)."""
+    """Fly one seed of the profile's scenario; any executor can carry this function elsewhere.
+    `record` writes the pictures beside the log. A refused flight is a result, too, without a log.
+    Errors: NotFound, InvalidValue (calibration, log)."""
 
     def fly(_scenario: Scenario) -> FlightResult:
         log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
@@ -113,9 +111,8 @@ def fly_all(
     """Return `fly` of each seed, each once, in the order of the seeds; `on_result` gets them as
     they are done.
 
-    `executor` is any of `concurrent.futures`' kind, or None to fly here; its attribute `lost`, if
-    it has one, names the errors of a future whose flight was lost with its process. Errors:
-    PerchError, as soon as one flight fails.
+    `executor` None flies here; its `lost`, if any, names the errors of a future whose process was
+    lost. Errors: PerchError, as soon as one flight fails.
     """
     seeds = list(dict.fromkeys(seeds))
     by_seed: dict[K, R] = {}

@@ -1,5 +1,4 @@
-"""The processes that fly a campaign on this computer: the standard library's pool, deaf to
-signals, and killed where the campaign ends early."""
+"""Processes that fly a campaign here: a standard pool, deaf to signals, killed at an early end."""
 
 from __future__ import annotations
 
@@ -49,9 +48,8 @@ def flight_processes(jobs: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started
-    within it never see them. Python's handlers are replaced, too: a
-    library's thread may take the signal."""
+    """Hold back Ctrl-C and SIGTERM during the block; what it starts never sees them. Python's
+    handlers are replaced, too: a library's thread may take the signal."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     came: list[int] = []
     handlers: dict[signal.Signals, Any] = {}

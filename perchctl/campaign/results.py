@@ -77,9 +77,8 @@ class FlightResult(CampaignFlight):
 def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
     """Return a campaign's figures, ready for JSON.
 
-    `rates` has each end's share with its interval. `miss_m` is taken over the perched flights
-    (None without any; p95 by linear interpolation). `worst_seeds` names at most `WORST` flights,
-    all of them bad.
+    `rates` are shares with intervals. `miss_m` is over perched flights (None without; p95 by linear
+    interpolation). `worst_seeds` names at most `WORST` bad flights.
     """
     ends: dict[str, int] = {end: sum(r.outcome == end for r in results) for end in ENDS}
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]

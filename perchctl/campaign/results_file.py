@@ -30,8 +30,7 @@ R = TypeVar("R", bound=CampaignFlight)
 
 
 class CampaignResults(Generic[R]):
-    """The results of a campaign's seeds: `earlier` were read from its file, `remaining` are
-    the seeds still to be flown."""
+    """A campaign's results: `earlier` ones from its file; `remaining` seeds are still to fly."""
 
     def __init__(
         self,

@@ -52,8 +52,7 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
 
 
 def offline_rows(options: FlyOptions) -> list[Row]:
-    """Return the rows that cost no time, of the computer's disk and the profile. It opens no link
-    and no camera."""
+    """Return the instant rows, of disk and profile. It opens no link and no camera."""
     return [
         evaluate_row("log folder", log_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),

@@ -1,5 +1,4 @@
-"""`perchctl calibrate`: pictures in, calibration file out; a mask, a check, a converted
-file. `calibrate mount` is in a file of its own."""
+"""`perchctl calibrate`: a calibration file of pictures; a mask, a check, a converted file."""
 
 from __future__ import annotations
 
@@ -227,8 +226,7 @@ def _now() -> str:
 
 
 def _source(text: str, view: bool = False) -> str:
-    """Return the source that the command line names, as `open_camera` takes it. Raises NotFound,
-    InvalidValue, UsageError."""
+    """Return the source for `open_camera`. Raises NotFound, InvalidValue, UsageError."""
     source = parse_source(text)
     if view and not source.live:
         raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")

@@ -166,8 +166,7 @@ def _free_place(name: str) -> Path:
 
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
-    """Return the recordings of the part that is asked for, or of all; the last one of a part
-    counts. Errors: NotFound, InvalidValue."""
+    """Return the last recording of `part`, or of each part. Errors: NotFound, InvalidValue."""
     held = [recording for path in logs for recording in MountingRecording.read(path)]
     found = {each.part: each for each in held if part in (None, each.part)}
     if not found:

@@ -147,9 +147,8 @@ P = ParamSpec("P")
 def command(
     group: typer.Typer, *examples: str, ending: str = "", **settings: Any
 ) -> Callable[[Callable[P, int | None]], Callable[P, None]]:
-    """Return the decorator that makes a function a subcommand of `group`, whose help ends with the
-    examples and `ending`. The function returns the exit code, None for 0; the program leaves
-    with it. `settings` are typer's."""
+    """Return the decorator for a subcommand of `group`, whose help ends with `examples` and
+    `ending`. The function returns the exit code (None: 0). `settings` are typer's."""
     # \b keeps the lines as they are.
     lines = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)])
     epilog = f"{lines}\n\n{ending}"

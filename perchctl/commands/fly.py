@@ -222,8 +222,8 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
 
 
 def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
-    """Draw the flight beside its log if the profile asks for it, and return the picture's path.
-    A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
+    """Draw the flight beside its log if the profile asks for it, and return the path. A plot that
+    fails, or that Ctrl-C ends, is a warning."""
     if not profile.log.plot:
         return None
     picture = path_beside(log_path, ".png")
@@ -253,8 +253,7 @@ def flight_record(
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Return the exit code of the flight, or that of its log if the flight was good and the log is
-    not."""
+    """Return the exit code of the flight, or if that was good, of its log."""
     code = EXIT_CODE_OF[outcome]
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
@@ -326,8 +325,7 @@ def plan_record(options: FlyOptions) -> dict[str, Any]:
 
 
 def plan_text(options: FlyOptions) -> str:
-    """Return the plan for people, at 80 columns: what, where, the way, and which values of the
-    profile are implausible."""
+    """Return the plan for people, at 80 columns, with the profile's implausible values."""
     resolved, profile, planner = plan_record(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""

@@ -36,9 +36,8 @@ def handle_signals(handler: Handler) -> Iterator[None]:
 def operator_signals(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
     """Let Ctrl-C press the switch during a flight, and `LANDING_SIGNALS` land (main thread only).
 
-    A thread of its own reads the signals from a socket that the interpreter writes to at
-    once, so they count while the main thread hangs in a library. A hang-up that is ignored
-    already (nohup) stays ignored. `report` prints a line.
+    A thread reads them from a socket that the interpreter writes to at once, so they count while
+    the main thread hangs in a library. An ignored hang-up (nohup) stays so. `report` prints a line.
     """
 
     def handler(_signal: int, _frame: FrameType | None) -> None:

@@ -20,8 +20,7 @@ def say(sentence: str) -> None:
 
 
 def print_lines(text: str, stdout: bool = False) -> None:
-    """Print lines on stderr, or on stdout, if there still is one: a closed terminal, or a pipe
-    without a reader, is no reason to fail."""
+    """Print lines on stderr or stdout; a closed terminal or pipe is no reason to fail."""
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
@@ -38,8 +37,7 @@ def drop_stream(stream: TextIO) -> None:
 
 
 def ask(question: str) -> str:
-    """Return the line that somebody types. The question goes to stderr, as stdout is for the
-    result. Raises EOFError at the end of the input."""
+    """Return the line that is typed; the question goes to stderr. Raises EOFError at its end."""
     print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
     return input()
 

@@ -269,8 +269,7 @@ def _typed(question: str) -> str:
 
 
 def _read(name: str, typed: str) -> str:
-    """Return the text of a key's value for what a person types: numbers, with the question's unit
-    or without. Raises InvalidValue."""
+    """Return a key's text for what is typed, numbers with or without unit. Raises InvalidValue."""
     if name not in MEASURES:
         return typed
     unit, size = MEASURES[name]

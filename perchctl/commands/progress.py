@@ -1,5 +1,4 @@
-"""What a person sees while a command works: bars of progress on stderr, on a terminal only, and the
-guide of a measurement by hand, as rows with bars on terminal and page."""
+"""What a person sees during a command: progress bars on a terminal, and a measurement's guide."""
 
 from __future__ import annotations
 

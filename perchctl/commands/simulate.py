@@ -284,8 +284,8 @@ def _require_simulator() -> None:
 def make_executor(
     jobs: int | None, cluster: str | None, profiles: Sequence[Profile], flights: int
 ) -> AbstractContextManager[Executor]:
-    """Return the executor of a campaign: processes of this computer, or the workers of a cluster,
-    which must have the files of `profiles`. Errors: UsageError."""
+    """Return a campaign's executor: processes here, or a cluster's workers, which must have the
+    files of `profiles`. Errors: UsageError."""
     if cluster is None:
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -312,8 +312,7 @@ def run_campaign(
     keep: Callable[[Any], None] = lambda result: None,
     objection: Callable[[list[Any]], PerchError | None] = lambda results: None,
 ) -> int:
-    """Fly a campaign of `total` flights, and report those that were flown, however it ends: also
-    by Ctrl-C, or when a flight fails. Returns the exit code.
+    """Fly a campaign of `total` flights; report those flown, however it ends; return the exit code.
 
     `campaign` gets the executor and the function to call with each result; `report` gets the
     results, and the error if not all were flown. `earlier` results are counted, too; `keep` writes

@@ -209,8 +209,8 @@ class TrackResult:
 
 
 class Tracker:
-    """Turns frames into results by the profile's pipeline, with the camera in the place of vehicle
-    and gear; with `stills` each picture is searched thoroughly, and nothing is remembered."""
+    """Turns frames into results by the profile's pipeline, with the camera for vehicle and gear;
+    with `stills` each picture is searched thoroughly by itself."""
 
     def __init__(self, profile: Profile, camera: CameraModel, *, live: bool, stills: bool) -> None:
         pipeline = make_pipeline(camera_profile(profile), camera)
@@ -220,8 +220,7 @@ class Tracker:
         self._target: CameraPose | None = None
 
     def results(self, frame: Frame, name: str | int) -> list[TrackResult]:
-        """Return the frame's result, or those of its two fields; none for a live source's
-        repetition of the last picture."""
+        """Return the frame's result, or those of its two fields; none for a live repetition."""
         judged = self._perception.health.assess(frame, self._live or not self._stills)
         if self._live and judged == "repeated":
             return []

@@ -66,8 +66,7 @@ class FlightPage:
         self._end(summary.outcome, first.partition(": ")[2], rows, log)
 
     def fail(self, error: BaseException, log: Path | None) -> None:
-        """Show that the flight ended in an error, or never began, with what the rescue reported;
-        `log` if there is one."""
+        """Show the error that ended or prevented the flight, with the rescue's report."""
         rows = [["flight", self._rescue]] if self._rescue else []
         self._end("failed", str(error) or type(error).__name__, rows, log)
 
@@ -86,9 +85,8 @@ class FlightPage:
 
 
 def flight_state(tick: Tick, drawn: dict[str, float]) -> dict[str, Any]:
-    """Return what the page shows of a tick: phase, battery, the rows of the terminal's panel,
-    whether the flight is over, and for its drawings height, error (m; None: no target) and `drawn`,
-    the sizes of marker and gear."""
+    """Return what the page shows of a tick: phase, battery, the panel's rows, whether it is over;
+    for its drawings height, error (m; None: no target) and `drawn`."""
     state, volts, target = tick.state, tick.telemetry.battery_v, tick.target
     off_m, below_m = (
         (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])

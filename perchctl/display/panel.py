@@ -20,8 +20,7 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 def status_rows(tick: Tick) -> list[tuple[str, str]]:
-    """Return name and text of each line of the display, at most 80 columns together; lengths are
-    in metres and centimetres, angles in degrees."""
+    """Return name and text of each line, at most 80 columns together, in m, cm and degrees."""
     state, target = tick.state, tick.target
     if target is None:
         error = "no target seen yet"
@@ -105,9 +104,9 @@ _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold r
 
 
 class FlightPanel:
-    """The display, as a watcher of the flight loop: on a terminal a panel below the events'
-    lines, elsewhere the lines alone. No method raises or waits, but `close` (bounded). A display
-    that fails is no reason to land: `problem` is always None, `failure` says why it fell silent.
+    """The display: on a terminal a panel below the events' lines, elsewhere the lines alone. No
+    method raises or waits, but `close` (bounded). A failed display is no reason to land:
+    `problem` is always None, `failure` says why it fell silent.
     """
 
     problem: str | None = None
@@ -129,8 +128,7 @@ class FlightPanel:
         self._thread.start()
 
     def tick(self, tick: Tick) -> None:
-        """Show this tick of the loop: at once if the phase is a new one, or 0.1 s after the last
-        one that was shown, or as the last one of all."""
+        """Show this tick: at once in a new phase, else 0.1 s after the last one, or at the end."""
         is_new = self._tick is None or self._tick.state.phase is not tick.state.phase
         self._tick = tick
         if is_new or tick.t_s >= self._next_s:

@@ -61,8 +61,7 @@ class FaultyRadio(Radio):
         self.receive: Callable[[Packet], None] | None = None
 
     def lose(self, end_s: float, up: bool, down: str, delay_s: float = math.inf) -> None:
-        """Until `end_s` lose all commands (`up`), and the log block of the name `down`, or "all";
-        with `delay_s` it comes late instead."""
+        """Until `end_s` lose commands (`up`) and block `down` or "all"; `delay_s` delays it."""
         self._losses.append((end_s, up, down, delay_s))
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
@@ -102,9 +101,8 @@ LOST = 0.2
 
 @dataclass(frozen=True)
 class CameraFault:
-    """How the camera's pictures are spoilt. `kind` is silent, frozen, snow, dark, covered, lossy,
-    late, out-of-order, mirrored or sooner (pictures that were late, as the profile expects, no
-    longer are). `late_s` belongs to late and sooner."""
+    """How pictures are spoilt: `kind` is silent, frozen, snow, dark, covered, lossy, out-of-order,
+    mirrored, late, or sooner than the profile expects (both by `late_s`)."""
 
     kind: str
     for_s: float
@@ -208,9 +206,8 @@ class PlantedError(Exception):
 
 
 class FaultyClock:
-    """The flight's clock in simulated time. What a fault does to the program happens where the loop
-    waits for its next tick. A killed program sends nothing more through `radio`. A flight that
-    takes longer than `stop_s` is ended.
+    """Simulated time: a fault acts on the program where the loop waits. A killed program sends
+    nothing through `radio`. A flight longer than `stop_s` is ended.
 
     Attributes:
         pending: is called where the loop waits next.
@@ -267,9 +264,8 @@ class FaultyClock:
 
 @dataclass
 class Edges:
-    """The parts of a flight that faults act on: its vehicle, radio, camera and clock, the
-    operator's Ctrl-C (`press`) and closed terminal (`hang_up`), and `disk`, whose `problem` is
-    that of the log's disk. `each` is called every `SAMPLE_S`."""
+    """What faults act on: vehicle, radio, camera, clock, the operator's Ctrl-C (`press`) and closed
+    terminal (`hang_up`), and the log's `disk`. `each` is called every `SAMPLE_S`."""
 
     vehicle: SimulatedVehicle
     radio: FaultyRadio

@@ -63,8 +63,7 @@ def packet_twice(edges: Edges, t_s: float, order: str) -> None:
 
 
 def reboots(edges: Edges, t_s: float, boots_s: float) -> None:
-    """Reboot the vehicle after a voltage drop: its motors stop, it receives nothing for `boots_s`,
-    and its log blocks are gone until the link starts them again."""
+    """Reboot the vehicle: it stops, hears nothing for `boots_s`, and has lost its log blocks."""
     edges.vehicle.firmware.reboot()
     edges.radio.lose(t_s + boots_s, up=True, down="all")
     edges.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), up=False, down="all")
@@ -81,15 +80,13 @@ def camera_fault(edges: Edges, t_s: float, kind: str, for_s: float, late_s: floa
 def external_positions(
     edges: Edges, t_s: float, how: str, for_s: float, late_s: float = 0.0
 ) -> None:
-    """Let the motion capture by which a vehicle without a deck flies fail as `CAPTURE_FAULTS` has
-    it, or be late by `late_s`."""
+    """Let the motion capture fail as `CAPTURE_FAULTS` has it, or be late by `late_s`."""
     assert edges.vehicle.capture is not None
     edges.vehicle.capture.begin_fault(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
 
 
 def deck_silent(edges: Edges, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the absolute positions of the vehicle's deck. Until then they corrected an
-    accelerometer that reads `acc_z_mps2` too much along z, because the motors shake it."""
+    """Stop the deck's positions, which corrected an accelerometer bias of `acc_z_mps2` along z."""
     edges.set_until(t_s + for_s, edges, "deck_silent", True, False)
 
 
@@ -273,9 +270,8 @@ def sooner_s(effect: Effect) -> float:
 
 
 class Injector:
-    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. `tick` is called with
-    each of the loop, `each` every `SAMPLE_S` of simulated time. `begin_s` is None until they
-    begin, `flown` is the phase of the newest tick."""
+    """Begins effects `moment_s` into `phase`, or at its end. `tick` gets each of the loop,
+    `each` every `SAMPLE_S`. `begin_s` is None before, `flown` is the newest tick's phase."""
 
     def __init__(
         self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float

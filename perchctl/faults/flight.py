@@ -65,8 +65,7 @@ PROBE = Packet(Port.LINK, 0, b"")
 
 
 class FaultyFlight:
-    """One flight with a fault and its judge, ready for a single call of `fly`. It is a watcher of
-    the loop, too, with the `problem` of the log's disk."""
+    """A flight with a fault and its judge, to `fly` once; a watcher with the disk's `problem`."""
 
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None

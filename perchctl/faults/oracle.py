@@ -133,7 +133,7 @@ class _Fall:
 
 
 class Oracle:
-    """The judge of a flight by a profile's limits: takes samples at most 20 ms apart. Within
+    """Judges a flight by a profile's limits and samples at most 20 ms apart. Within
     `magnet_radius_m` a contact is on the target.
 
     Attributes:
@@ -179,8 +179,7 @@ class Oracle:
         self._presses_s.append(t_s)
 
     def note_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
-        """Note that the program ended: `crashed` by an exception that no fault planted,
-        `endless` if it had to be ended from outside."""
+        """Note the end: `crashed` by an exception not planted, `endless`: ended from outside."""
         self._end_s = t_s
         if crashed:
             self._raise("crashed", t_s)

@@ -319,9 +319,8 @@ def target_places(scenario: Scenario) -> list[Place]:
 class UndetectedDrift:
     """How far (m) a fault may push the vehicle sideways with no sensor noticing.
 
-    A drift of the estimate counts while the vehicle does not steer by a visible target. A force
-    counts while it acts, if the target is the positioning system and is out of view. A step of
-    the estimate does not count, since it can be noticed.
+    A drift counts while the vehicle does not steer by a visible target; a force while it acts and
+    the target that gives positions is out of view. A step does not count: it can be noticed.
     """
 
     def __init__(
@@ -354,8 +353,8 @@ class UndetectedDrift:
 
 
 class DescentBound:
-    """The time by which the vehicle should descend: at once if the operator asks for it or an
-    exception ends the loop, else as soon as the fault has lasted longer than the profile waits."""
+    """When the vehicle should descend: at once by the operator's order or an exception, else once
+    the fault has lasted longer than the profile waits."""
 
     def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
@@ -379,10 +378,9 @@ class DescentBound:
         uplink: bool,
         lands: bool = False,
     ) -> bool:
-        """Return True if the vehicle should have come down by now and has not. One that touches
-        the ceiling in time may hang there, and one without `uplink` cannot obey until it hears
-        again. `lands`: it flies its own landing, whose trajectory starts from rest with each of
-        the three orders; a landing that climbs does not count."""
+        """Return True if it should have come down by now. One at the ceiling in time may hang,
+        one without `uplink` cannot obey. `lands`: by its own landing, whose trajectory starts from
+        rest with each of three orders; a landing that climbs does not count."""
         if self._due_s is None:
             return False
         if touching and t_s < self._due_s + REACTION_S:

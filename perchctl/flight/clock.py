@@ -41,8 +41,7 @@ class WallClock:
 class SimulatedClock:
     """Simulated time in real time: it waits for the loop, and the loop for it.
 
-    The simulator advances it with the wall's clock. On a busy computer it stands still.
-    `now` may be called from any thread.
+    The simulator advances it; on a busy computer it stands still. Any thread may call `now`.
     `zero_s`: its reading at the simulator's start, such that it first agrees with `time.monotonic`.
     """
 

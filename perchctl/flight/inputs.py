@@ -49,8 +49,7 @@ class TelemetrySource(Protocol):
 
 @dataclass(eq=False)
 class FlightInputs:
-    """Takes telemetry and at most one frame a tick, and makes the planner's observation of them:
-    the target, the ages of both, and what contradicts them."""
+    """Makes the planner's observation of telemetry and at most one frame a tick."""
 
     SENSED: ClassVar = (
         "telemetry",
@@ -101,8 +100,7 @@ class FlightInputs:
         return self.perception.history
 
     def poll_inputs(self, now_s: float, *, look: bool = True) -> None:
-        """Take in telemetry and at most one frame. Without `look`, at the ceiling, the frame only
-        shows that the camera lives."""
+        """Take in telemetry and a frame, which without `look` only shows that the camera lives."""
         perception, positioning = self.perception, self._positioning
         samples = self.link.telemetry()
         perception.history = add_samples(self.history, samples, self.profile.safety)
@@ -235,8 +233,8 @@ CARRIED_FOR_S = 0.1
 CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06  # turning motors scatter 1 g by 0.04, the mean by 0.013
 SINKING_MPS = -0.15  # more than a bias makes while the place is sent
 FROZEN_S = 0.06
-"""An attitude that stands still for longer is not the one at the picture's exposure, and 0.1 rad
-places a vehicle 1.2 m under the target 12 cm aside."""
+"""An attitude frozen for longer is not the exposure's, and 0.1 rad displaces a vehicle 1.2 m under
+the target by 12 cm."""
 
 
 class TargetPositioning:
@@ -292,8 +290,8 @@ def is_supported(history: History, now_s: float) -> bool:
 
 @runtime_checkable
 class TurnWatcher(Watcher, Protocol):
-    """A watcher of all that a flight log holds: of the turns without a tick, too, which are those
-    before take-off and those decided anew, and of what is sent in the loop's place."""
+    """A watcher of all that a log holds: also turns before take-off or decided anew, and what is
+    sent in the loop's place."""
 
     def turn(self, turn: Turn) -> None: ...
 
@@ -354,8 +352,8 @@ class TurnReporter:
         self._report(replace(self.flown(inputs, obs, new, command, None), role="redone"))
 
     def report_failure(self, inputs: FlightInputs, error: BaseException) -> None:
-        """Report the turn in which the flight broke off. It holds what the planner was given, and
-        what it had decided unless it raised: the command may have been sent."""
+        """Report the turn in which the flight broke off, with what was observed and decided: the
+        command may have been sent."""
         if self._open is None:
             return
         obs, decision = self._open

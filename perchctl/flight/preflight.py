@@ -40,8 +40,7 @@ def refuse_forbidden(telemetry: Telemetry | None, profile: Profile) -> None:
 
 
 def refuse_without_positions(link: Link, profile: Profile, *, positions: bool) -> None:
-    """Raises SafetyAbort without any position source. `positions`: those of the profile's motion
-    capture are being sent."""
+    """Raises SafetyAbort without a position source. `positions`: a motion capture's are sent."""
     if profile.positioning.by == "deck":
         refuse(GroundCriteria.no_position_source(link.decks(), profile))
     elif profile.positioning.by == "mocap" and not positions:
@@ -55,8 +54,8 @@ def refuse_wrong_positions(
     now_s: float,
     at_rest: RestCheck | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body. A tilted or
-    moved vehicle is not judged, nor anything old. `at_rest`: the turns before."""
+    """Raises SafetyAbort for positions in another unit, or of another world or body. Nothing
+    tilted, moved or old is judged. `at_rest`: the turns before."""
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
@@ -187,8 +186,7 @@ def target_view_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """Return the target as `target_view_from` gives it for a vehicle that leans so that the target
-    moves to the picture's edge, as if it stood farther away."""
+    """Return the view of a vehicle that leans so that the target moves to the picture's edge."""
     level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.whole and aside_m > 1e-9):

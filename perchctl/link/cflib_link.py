@@ -54,9 +54,8 @@ FAREWELL = RawThrust(0)
 class CflibLink:
     """`perchctl.link.protocol.Link` on an unmodified cflib.
 
-    `connection` is None before `connect` and after `close`. `landing_wait_s`: how long
-    `close` waits for a vehicle that still flies. `positioning` by motion capture sets the
-    vehicle's estimator to it.
+    `connection` is None unless connected. `landing_wait_s`: how long `close` waits for a vehicle
+    that still flies. `positioning` by motion capture sets the estimator to it.
     """
 
     def __init__(

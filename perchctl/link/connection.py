@@ -104,11 +104,10 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """Return True if a driver that takes nothing will not take anything any more. Asked again
-        and again while it takes nothing, and only then: it has to be seen for `DEAD_S`.
+        """Return True if a driver will take nothing any more; to be called repeatedly while it
+        takes nothing, since it has to be seen for `DEAD_S`.
 
-        A radio that is only out of reach counts the packets it has lost, and goes on by itself. One
-        whose dongle was pulled out counts nothing (cflib repeats that for ever, too).
+        A radio out of reach counts its lost packets and goes on; an unplugged one counts none.
         """
         now_s, asked_s = time.monotonic(), self._asked_s
         self._asked_s = now_s
@@ -137,8 +136,8 @@ class Connection:
             self._opener = start_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
-        """Release the driver and clean up. `farewell`: let cflib send its zero setpoint, which
-        drops a vehicle that flies; else nothing more is sent."""
+        """Release the driver. `farewell`: let cflib send its zero setpoint, which drops a vehicle
+        that flies; else nothing more is sent."""
         calls = [self.cf.close_link]
         with self._change:
             self._left = True
@@ -206,9 +205,9 @@ class Connection:
     def _agrees_on_safelink(self, driver: Any) -> bool:
         """Wait, bounded, for a new driver's safelink; True if it has one, or needs none.
 
-        A vehicle that was spoken to by safelink hears one packet of a driver without it, and then
-        none (docs/firmware.md, "Safelink"). A radio that opens while the vehicle is out of reach is
-        such a driver, for as long as it lives."""
+        A vehicle once spoken to by safelink hears one packet of a driver without it, then none
+        (docs/firmware.md, "Safelink"). A radio opened out of the vehicle's reach is such a driver
+        for as long as it lives."""
         end_s = time.monotonic() + SAFELINK_S
         while self._has_safelink and getattr(driver, "needs_resending", False):
             if self._left or time.monotonic() >= end_s:
@@ -218,8 +217,7 @@ class Connection:
 
 
 class _Nowhere:
-    """Stands in the place of cflib's driver while there is none. By itself cflib looks only once a
-    second whether there is one again, and telemetry would wait for that."""
+    """Stands for cflib's missing driver, since cflib looks for a new one only once a second."""
 
     needs_resending = False
 
@@ -263,9 +261,8 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 
 def init_cflib() -> None:
-    """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence it: its log has tracebacks of what is reported by callback as well, and its radio prints
-    on stdout, which is for results."""
+    """Register cflib's drivers, keep its radio from giving up early, and silence it: its log
+    repeats what callbacks report, and its radio prints on stdout, which is for results."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 

@@ -1,9 +1,8 @@
 """The estimator of a vehicle whose position is measured from outside: its parameters, its start,
 and the agreement of estimate and measurement.
 
-On the ground only. The filter is set to where the capture sees the vehicle while positions are
-arriving already, since without them it would drift from there at once; its heading is what no
-position can give it, and a wrong one sends the vehicle away in its first movement
+On the ground only. The filter is set to the capture's pose while positions arrive already: it
+would drift without. No position gives its heading, and a wrong one sends the vehicle away
 (docs/positioning.md).
 """
 
@@ -44,8 +43,7 @@ POLL_S = 0.02
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return what the firmware has to be set to for positions from outside, after the user's own
-    parameters; none with decks."""
+    """Return the parameters for external positions, set after the user's own; none with decks."""
     if config.by == "deck":
         return {}
     return {
@@ -115,8 +113,8 @@ def _agree(
     clock: Callable[[], float],
     wait: Callable[[float], None],
 ) -> bool:
-    """Return True once feed and estimate have agreed over fresh samples of both for `AGREE_FOR_S`,
-    and the vehicle has stood at `start`."""
+    """Return True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S`, and the
+    vehicle has stood at `start`."""
     end_s = clock() + AGREE_WITHIN_S
     since_s: float | None = None
     while (now_s := clock()) < end_s:
@@ -138,8 +136,8 @@ def _agree(
 
 
 class StandingFeed:
-    """Feed of a vehicle that stands at the world's origin, level, with its front along x: so the
-    world is defined. `wait` sends that place, `rate_hz` times a second."""
+    """Feed of a vehicle at the world's origin, level, its front along x, which defines the world.
+    `wait` sends that place, `rate_hz` times a second."""
 
     def __init__(
         self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]

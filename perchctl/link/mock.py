@@ -60,9 +60,8 @@ class Radio:
 class MockLink:
     """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
 
-    `vehicle` is a `perchctl.sim.SimulatedVehicle`, of which nothing is imported here. Commands
-    reach it as bytes, through the decoder of the simulated link's server, and its telemetry comes
-    in the same log blocks, through the same assembler, as by radio.
+    `vehicle` is a `perchctl.sim.SimulatedVehicle`, not imported here. Commands reach it as bytes
+    by the simulated link's decoder, telemetry in the same log blocks and assembler as by radio.
     """
 
     FAST_BLOCKS = FAST_BLOCKS

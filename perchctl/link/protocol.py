@@ -46,18 +46,16 @@ class Link(Protocol):
         """Hand one command to the vehicle. Never blocks for long."""
 
     def send_external(self, place: ExternalPosition) -> bool:
-        """Hand a position from outside to the vehicle's estimator, at once or not at all: it is
-        never queued behind anything, and raises nothing. Returns True if it went out. Called from
-        a thread of its own."""
+        """Hand an external position to the vehicle, at once or not at all: never queued, raises
+        nothing. Returns True if it went out. Called from a thread of its own."""
 
     def problem(self, now_s: float) -> str | None:
         """Return None while the link works, otherwise one sentence with the cause."""
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
-        """Ask `guard` regularly from now on, until the link is closed. `on_sent` is called, once it
-        is on its way, with each command that the link sends in the loop's place: its guard's, an
-        order once more over a link that was lost, and the farewell; from the link's own thread
-        where it has one."""
+        """Ask `guard` regularly until the link is closed. `on_sent` gets each command on its way in
+        the loop's place: the guard's, an order repeated over a lost link, the farewell; from the
+        link's own thread where it has one."""
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""

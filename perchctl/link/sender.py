@@ -107,8 +107,7 @@ class Sender:
             self._ready.notify_all()
 
     def repeat_order(self, since_s: float) -> None:
-        """Put the last command once more if it was an order, handed over since then: it may
-        have been lost together with the link."""
+        """Repeat a last order that was handed over since then: the link may have lost it."""
         with self._ready:
             if self._last is None:
                 return
