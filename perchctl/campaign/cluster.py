@@ -55,7 +55,7 @@ class WorkerRequirements:
 
 
 def process_state(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """Return program, libraries, the `profiles` with files, and the process's flights at a time."""
+    """Return program, libraries, `profiles` with files, and flights at a time."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
         "python": ".".join(platform.python_version_tuple()[:2]),
@@ -100,9 +100,9 @@ def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
 
 
 class ClusterExecutor(Executor):
-    """An executor of flights on the workers of a dask cluster. dask flies the flight of a lost
-    worker again. A future fails with an error of `lost` if that happened too often, with
-    InvalidValue if the worker must not fly, and is cancelled if the scheduler is lost."""
+    """An executor on a dask cluster, which flies the flight of a lost worker again. A future fails
+    with an error of `lost` if that happened too often, with InvalidValue if the worker must not
+    fly, and is cancelled if the scheduler is lost."""
 
     lost = (KilledWorker,)
 

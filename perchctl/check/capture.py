@@ -194,8 +194,8 @@ STRANGER = 0.4
 
 @dataclass(frozen=True, eq=False)
 class PairedMotion:
-    """Pairs of one moment each: n attitudes as the vehicle and as the capture have them, the
-    capture's places (n, 3), and the accelerometer's largest difference from 1 g."""
+    """Pairs of one moment: n attitudes by vehicle and by capture, the capture's places (n, 3), and
+    the accelerometer's largest difference from 1 g."""
 
     own: Rotation
     seen: Rotation
@@ -225,8 +225,7 @@ class FrameAlignment:
 def pair_motion(
     telemetry: Sequence[Telemetry], places: Sequence[VehiclePose]
 ) -> PairedMotion | None:
-    """Pair each place with the vehicle's attitude of its moment, every `EVERY_S`; None of fewer
-    than three pairs."""
+    """Pair places and attitudes every `EVERY_S`; None for fewer than three pairs."""
     if len(telemetry) < 2:
         return None
     history = History(tuple(telemetry))
@@ -254,7 +253,7 @@ def pair_motion(
 
 
 def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """Solve A and B by all pairs of moments of a turn; None for turns about less than two axes."""
+    """Solve A and B by pairs of moments; None for turns about fewer than two axes."""
     i, j = np.triu_indices(len(moved.own), 1)
     size = (moved.own[j] * moved.own[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)
@@ -370,8 +369,8 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """Say in one row whether `fly` finds a comparison by hand of this motion capture; no row with
-    decks, nor for the simulator's own vehicle, whose room is right as it is built."""
+    """Say in one row whether `fly` finds this capture compared by hand; no row with decks, nor for
+    the simulator, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
     return [_record_row(config, uri, now)]

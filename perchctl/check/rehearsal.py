@@ -81,8 +81,8 @@ class _Noted(WrappedSource):
 
 @dataclass(frozen=True)
 class _TelemetryOnly:
-    """All that the senses get of the link. With `feet_m` the vehicle stands there: one that gets
-    no position has an estimate that runs away."""
+    """All that the senses get of the link. With `feet_m` the vehicle stands there, since without
+    positions its estimate runs away."""
 
     take: TakeTelemetry
     feet_m: tuple[float, float, float] | None

@@ -118,8 +118,8 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def format_rows(rows: Sequence[Row], finished: bool = True) -> str:
-    """Return the rows at 80 columns: verdict, name, what was found, and below it what to do. Of a
-    check that did not come to its end nothing good is said."""
+    """Return the rows at 80 columns: verdict, name, finding, and below it what to do. An unfinished
+    check says nothing good."""
     lines = [line for row in rows for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)

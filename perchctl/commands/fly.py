@@ -222,8 +222,8 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
 
 
 def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
-    """Draw the flight beside its log if the profile asks for it, and return the picture's path.
-    A plot that fails, or that Ctrl-C ends, is a warning: the flight is over."""
+    """Draw the flight beside its log if the profile asks for it, and return the path. A plot that
+    fails, or that Ctrl-C ends, is a warning."""
     if not profile.log.plot:
         return None
     picture = path_beside(log_path, ".png")

@@ -284,8 +284,8 @@ def _require_simulator() -> None:
 def make_executor(
     jobs: int | None, cluster: str | None, profiles: Sequence[Profile], flights: int
 ) -> AbstractContextManager[Executor]:
-    """Return the executor of a campaign: processes of this computer, or the workers of a cluster,
-    which must have the files of `profiles`. Errors: UsageError."""
+    """Return a campaign's executor: processes here, or a cluster's workers, which must have the
+    files of `profiles`. Errors: UsageError."""
     if cluster is None:
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:

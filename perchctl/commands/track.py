@@ -209,8 +209,8 @@ class TrackResult:
 
 
 class Tracker:
-    """Turns frames into results by the profile's pipeline, with the camera in the place of vehicle
-    and gear; with `stills` each picture is searched thoroughly, and nothing is remembered."""
+    """Turns frames into results by the profile's pipeline, with the camera for vehicle and gear;
+    with `stills` each picture is searched thoroughly by itself."""
 
     def __init__(self, profile: Profile, camera: CameraModel, *, live: bool, stills: bool) -> None:
         pipeline = make_pipeline(camera_profile(profile), camera)

@@ -97,8 +97,7 @@ class LivePage:
         self._state_s = self._clock() if live else None
 
     def end(self, card: dict[str, Any]) -> None:
-        """Show how it ended: the last picture and numbers stay, with this card. Waits for a second
-        if somebody looks, so that they get it."""
+        """Show this card with the last picture and numbers; wait a second for who still looks."""
         with self._changed:
             self._card, self._state_s = card, None
             read_s = self._read_s
@@ -375,8 +374,8 @@ def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
-    """Return the picture in colour (blue, green, red), (h, w, 3) uint8. A line that leaves the
-    picture by far, and axes with a tip behind the camera, are left out."""
+    """Return the picture in colour (blue, green, red), (h, w, 3) uint8, without lines that leave it
+    by far, and axes with a tip behind the camera."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:
         _draw_line(picture, np.vstack([corners, corners[:1]]), _OUTLINE.get(name, _OTHER), 1)

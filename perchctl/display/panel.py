@@ -104,9 +104,9 @@ _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold r
 
 
 class FlightPanel:
-    """The display, as a watcher of the flight loop: on a terminal a panel below the events'
-    lines, elsewhere the lines alone. No method raises or waits, but `close` (bounded). A display
-    that fails is no reason to land: `problem` is always None, `failure` says why it fell silent.
+    """The display: on a terminal a panel below the events' lines, elsewhere the lines alone. No
+    method raises or waits, but `close` (bounded). A failed display is no reason to land:
+    `problem` is always None, `failure` says why it fell silent.
     """
 
     problem: str | None = None

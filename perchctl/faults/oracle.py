@@ -133,7 +133,7 @@ class _Fall:
 
 
 class Oracle:
-    """The judge of a flight by a profile's limits: takes samples at most 20 ms apart. Within
+    """Judges a flight by a profile's limits and samples at most 20 ms apart. Within
     `magnet_radius_m` a contact is on the target.
 
     Attributes:

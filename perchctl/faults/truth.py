@@ -353,8 +353,8 @@ class UndetectedDrift:
 
 
 class DescentBound:
-    """The time by which the vehicle should descend: at once if the operator asks for it or an
-    exception ends the loop, else as soon as the fault has lasted longer than the profile waits."""
+    """When the vehicle should descend: at once by the operator's order or an exception, else once
+    the fault has lasted longer than the profile waits."""
 
     def __init__(self, effects: tuple[e.Effect, ...], profile: Profile) -> None:
         self._effects, self._profile = effects, profile

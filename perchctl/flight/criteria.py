@@ -190,8 +190,8 @@ class GroundCriteria:
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
-        """An external position in another unit, with another axis up, or elsewhere, which waiting
-        will not mend. By the target the world is the vehicle's own, so only the fence counts."""
+        """A position in another unit, with another axis up, or elsewhere, which waiting will not
+        mend. By the target the world is the vehicle's own, so only the fence counts."""
         x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
@@ -261,10 +261,9 @@ class RestCheck:
     def moved_body_problem(
         self, place: ExternalPosition | None, profile: Profile
     ) -> Problem | None:
-        """Return the problem of a body that has moved since the vehicle stands still.
+        """Return the problem of a body that has moved while the vehicle stands still.
 
-        To be called in each turn with fresh telemetry and a fresh position; `place` None begins
-        anew, since the vehicle does not stand still."""
+        For each turn with fresh telemetry and position; `place` None (not still) begins anew."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
             return None

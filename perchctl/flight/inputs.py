@@ -233,8 +233,8 @@ CARRIED_FOR_S = 0.1
 CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06  # turning motors scatter 1 g by 0.04, the mean by 0.013
 SINKING_MPS = -0.15  # more than a bias makes while the place is sent
 FROZEN_S = 0.06
-"""An attitude that stands still for longer is not the one at the picture's exposure, and 0.1 rad
-places a vehicle 1.2 m under the target 12 cm aside."""
+"""An attitude frozen for longer is not the exposure's, and 0.1 rad displaces a vehicle 1.2 m under
+the target by 12 cm."""
 
 
 class TargetPositioning:

@@ -121,7 +121,7 @@ def fly(parts: FlightParts) -> FlightReport:
 
 
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    """Return a callback that passes on what is sent in the loop's place to those who watch it."""
+    """Return a callback that shows watchers what is sent in the loop's place."""
     told = [watcher for watcher in parts.watchers if isinstance(watcher, TurnWatcher)]
 
     def tell(sent: SentCommand) -> None:

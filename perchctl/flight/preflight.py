@@ -54,8 +54,8 @@ def refuse_wrong_positions(
     now_s: float,
     at_rest: RestCheck | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body. A tilted or
-    moved vehicle is not judged, nor anything old. `at_rest`: the turns before."""
+    """Raises SafetyAbort for positions in another unit, or of another world or body. Nothing
+    tilted, moved or old is judged. `at_rest`: the turns before."""
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:

@@ -91,9 +91,9 @@ def fly_session(
     Returns the report, and the gear's distance from the target's centre, m, where a simulator
     measures it.
 
-    `switch` carries the operator's commands. `watch_source` may wrap the camera's source, to look
-    at its frames. `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera
-    have answered; what it raises ends the session on the ground.
+    `switch` carries the operator's commands. `watch_source` may wrap the camera's source.
+    `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera have
+    answered; what it raises ends the session on the ground.
     """
     options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()
@@ -191,8 +191,8 @@ def start_position_feed(
     clock: Clock,
     ground_z_m: float = 0.0,
 ) -> PositionFeed | None:
-    """Settle the vehicle's estimate, and feed it a capture's positions until `stack` ends, after
-    the link is closed: a landing vehicle still needs them. None without a capture.
+    """Settle the estimate, and feed it a capture's positions until `stack` ends, after the link is
+    closed: a landing vehicle still needs them. None without a capture.
 
     Errors: those of `CflibLink.settle`, and InvalidValue, UsageError, ConnectionFailed."""
     if config.by == "target":

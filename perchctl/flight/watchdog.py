@@ -67,8 +67,8 @@ class Watchdog:
     `tick`, `rescuing` and `end` are called by the loop's thread, `poll` by the link's; each writes
     its own fields.
 
-    `position_age_s` gives the age of the newest external position at a time. `overruled_s` is how
-    late the loop was when a landing was decided for it, else 0.
+    `position_age_s` gives the age of the newest external position. `overruled_s` is how late the
+    loop was when a landing was decided for it, else 0.
     """
 
     def __init__(

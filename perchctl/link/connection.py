@@ -136,8 +136,8 @@ class Connection:
             self._opener = start_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
-        """Release the driver and clean up. `farewell`: let cflib send its zero setpoint, which
-        drops a vehicle that flies; else nothing more is sent."""
+        """Release the driver. `farewell`: let cflib send its zero setpoint, which drops a vehicle
+        that flies; else nothing more is sent."""
         calls = [self.cf.close_link]
         with self._change:
             self._left = True
@@ -205,9 +205,9 @@ class Connection:
     def _agrees_on_safelink(self, driver: Any) -> bool:
         """Wait, bounded, for a new driver's safelink; True if it has one, or needs none.
 
-        A vehicle that was spoken to by safelink hears one packet of a driver without it, and then
-        none (docs/firmware.md, "Safelink"). A radio that opens while the vehicle is out of reach is
-        such a driver, for as long as it lives."""
+        A vehicle once spoken to by safelink hears one packet of a driver without it, then none
+        (docs/firmware.md, "Safelink"). A radio opened out of the vehicle's reach is such a driver
+        for as long as it lives."""
         end_s = time.monotonic() + SAFELINK_S
         while self._has_safelink and getattr(driver, "needs_resending", False):
             if self._left or time.monotonic() >= end_s:

@@ -113,8 +113,8 @@ def _agree(
     clock: Callable[[], float],
     wait: Callable[[float], None],
 ) -> bool:
-    """Return True once feed and estimate have agreed over fresh samples of both for `AGREE_FOR_S`,
-    and the vehicle has stood at `start`."""
+    """Return True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S`, and the
+    vehicle has stood at `start`."""
     end_s = clock() + AGREE_WITHIN_S
     since_s: float | None = None
     while (now_s := clock()) < end_s:
@@ -136,8 +136,8 @@ def _agree(
 
 
 class StandingFeed:
-    """Feed of a vehicle that stands at the world's origin, level, with its front along x: so the
-    world is defined. `wait` sends that place, `rate_hz` times a second."""
+    """Feed of a vehicle at the world's origin, level, its front along x, which defines the world.
+    `wait` sends that place, `rate_hz` times a second."""
 
     def __init__(
         self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]

@@ -151,8 +151,8 @@ class SampleAssembler:
     ) -> Telemetry | None:
         """Take one packet of a block and return the sample that it completes, if any.
 
-        `t_s` is its stamp on the loop's clock, `start` the vehicle's start that it is from; values
-        from before the newest start are dropped."""
+        `t_s` is its stamp on the loop's clock, `start` the vehicle's start; values from before the
+        newest start are dropped."""
         if start < self._start:
             return None
         if start > self._start:
@@ -242,8 +242,8 @@ class LogBlocks:
     def resume(self, send: Callable[[Packet], bool]) -> bool:
         """Start the blocks again that come no more: send one packet; True if it went out.
 
-        To be called whenever there is room for a packet, from one thread. `send` must not wait. A
-        vehicle that still has a block answers that it exists, and starts it again all the same.
+        To be called from one thread whenever there is room. `send` must not wait. A vehicle that
+        still has a block says so, and starts it again all the same.
         """
         now_s = self._clock()
         if not self._resuming and now_s - self._resumed_s > RESUME_PERIOD_S:

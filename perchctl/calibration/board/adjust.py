@@ -1,5 +1,4 @@
-"""The camera and all board poses together: OpenCV's bundle adjustment, what of the views does not
-fit it, and how far its lens parameters may be off."""
+"""The camera and all board poses by OpenCV's bundle adjustment; outliers; lens uncertainty."""
 
 from __future__ import annotations
 
@@ -116,8 +115,8 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Ca
 def projection_derivatives(
     camera: CameraModel, pose: Array, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the derivatives of the pixels of points (n, 3) at a pose (rvec and tvec, (6,)) by the
-    lens parameters (2 n, p) and by the pose (2 n, 6)."""
+    """Return the derivatives of the pixels of points (n, 3) at a pose (rvec, tvec: (6,)) by lens
+    (2 n, p) and by pose (2 n, 6)."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
     p = len(lens_parameters(camera))
@@ -239,8 +238,7 @@ def jackknife_covariance(
     curvature_factor: float = 1.0,
     information_factor: float = 1.0,
 ) -> Array:
-    """Return the covariance (p, p) at a minimum: the inverse information, or what leaving out each
-    block in turn (the jackknife) shows where that is more.
+    """Return the covariance (p, p): the inverse information, or the jackknife's if more.
 
     Args:
         blocks: information J' J (p, p) and gradient J' r (p,) of each block of rows.

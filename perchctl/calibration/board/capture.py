@@ -1,5 +1,4 @@
-"""Views of a board: from pictures, and from a video or a live camera that a person is guided in
-front of; and how alike two views are, which decides which of many are kept."""
+"""Views of a board from pictures, a video or a live camera, and how alike two views are."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ def find_views(
     board: Board,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
-    """Return the views of the board in picture files, and the pictures that are broken or show
-    none. `progress` is called with the number of pictures done, and of all.
+    """Return the board's views in picture files, and the pictures that are broken or show none;
+    `progress` gets the numbers done and of all.
 
     Raises InvalidValue: unequal sizes.
     """
@@ -77,9 +76,8 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """Return where and how a view shows the board, (5,): the middle of its corners as a part of the
-    picture's width and height, its size as a part of the picture, and by how much its right and
-    its lower side are farther away than the others."""
+    """Return where and how a view shows the board, (5,): its middle and its size as parts of the
+    picture, and by how much its right and its lower side are farther away."""
     w, h = view.size_px
     x, y = view.corners_px.mean(axis=0) / (w, h)
     squares = view.object_m[:, :2] / board.square_m
@@ -171,8 +169,7 @@ class GuidedCapture:
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
     def update(self, seen: BoardView | str) -> bool:
-        """Judge one more picture, by its view of the board or why there is none; return true if the
-        view was taken: it is new, sharp and still."""
+        """Judge a picture by its view or the lack of one; true if taken: new, sharp and still."""
         before = self._last
         self._last = seen if isinstance(seen, BoardView) else None
         if isinstance(seen, str):

@@ -53,8 +53,7 @@ class Deviation:
 class CheckResult:
     """The verdict on a calibration by new pictures, and why.
 
-    rms_px is with the file's camera (infinite: it cannot see the boards), free_rms_px that of the
-    camera which fits the pictures best.
+    rms_px: by the file's camera (infinite: it sees no board); free_rms_px: by the best-fitting one.
     """
 
     passed: bool

@@ -73,8 +73,7 @@ class FoundViews:
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """Return the view of a board in a grey picture (h, w), or why there is none; of an interlaced
-    picture, whose fields show a moving board in two places, that of its first field."""
+    """Return the view in a grey picture (h, w), of its first field if interlaced, or why none."""
     image = split_fields(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))

@@ -34,8 +34,7 @@ _LIMIT_FLOOR_MM = 1.0
 class RangeError:
     """95 % line of the target's position error at one distance.
 
-    mm95: the worst place of those where a marker is seen whole and the boards were seen, so that it
-    rests on corners and not on what the lens model says beyond them; axis_mm95: straight ahead.
+    mm95: the worst place with a whole marker where boards were seen; axis_mm95: straight ahead.
     """
 
     z_m: float
@@ -44,7 +43,7 @@ class RangeError:
 
 
 def allowed_error_mm(z_m: float) -> float:
-    """Return the error that perching allows: 1 mm, or 1 % of the distance where that is more."""
+    """Return the allowed error: 1 mm, or 1 % of the distance if more."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
@@ -64,8 +63,8 @@ def predict_errors(
     covered: NDArray[np.bool_] | None = None,
     ranges_m: Sequence[float] = RANGES_M,
 ) -> tuple[RangeError, ...]:
-    """Return the 95 % lines of the target's position error at each distance, where all of a marker
-    lies in `covered` cells of the picture (None: anywhere), and straight ahead."""
+    """Return the 95 % lines of position error at each distance where a marker lies wholly in
+    `covered` cells (None: anywhere), and straight ahead."""
     result = []
     for z_m in ranges_m:
         lines_mm = []
@@ -82,8 +81,7 @@ def predict_errors(
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """Return how far a target seen by `truth` is from where `camera` puts it, at each of the
-    places of `truth`; the first is on the axis, (n,) mm."""
+    """Return how far apart `truth` and `camera` put a target at each place, (n,) mm, axis first."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)
     views = [

@@ -54,7 +54,7 @@ class Calibration:
         missing: pictures without a board, and why.
         errors: what the covariance means at the target, by distance.
         covered: the picture's cells (rows, columns) that boards were seen in.
-        lacks: what keeps it from being a good one, whatever its error, and what would mend it.
+        lacks: what keeps it from being good, and what would mend it.
     """
 
     board: str
@@ -79,8 +79,7 @@ class Calibration:
 
     @property
     def level(self) -> Level:
-        """Verdict by the predicted error straight ahead of the camera, where perching happens;
-        to the side twice the limit is accepted."""
+        """Verdict by the predicted error ahead, where it perches; twice the limit to the side."""
         ahead = max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         aside = max(e.mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.lacks:
@@ -196,9 +195,8 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
 def robust_fit(
     views: Sequence[BoardView], models: Sequence[str] = MODEL_NAMES
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
-    """Return the fit of the views without outliers, by the simplest of `models` that follows the
-    lens (one that cannot would call the views at the picture's rim outliers); those views, and
-    what was left out.
+    """Return the fit without outliers by the simplest of `models` that follows the lens (one that
+    cannot would call views at the rim outliers), its views, and what was left out.
 
     Raises InvalidValue: the views fit no camera.
     """

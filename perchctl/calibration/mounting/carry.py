@@ -183,8 +183,8 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
 class GyroRotation:
     """The integrated rotation R_world_body (n, 3, 3) at t_s (n,), with its rates (n, 3).
 
-    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the body's rotation, in world axes,
-    by the gyroscope's bias (rad/s) and by its scale error.
+    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the rotation, in world axes, by
+    the gyroscope's bias (rad/s) and by its scale error.
     """
 
     t_s: Array
@@ -373,9 +373,9 @@ class PoseResiduals:
 def weight_residuals(
     design: Array, misfit: Array, cov: Array, known: Array, late: Array | None = None
 ) -> PoseResiduals:
-    """Return the residuals of poses, weighted by their covariances (n, 3, 3) times a common factor
-    that is estimated. With `late` (n, 3), the derivative by a second of delay, the likeliest jitter
-    of the timestamps is estimated, too, and added to the covariances."""
+    """Return the residuals of poses, weighted by their covariances (n, 3, 3) times an estimated
+    factor. With `late` (n, 3), the derivative by a second of delay, the likeliest jitter of the
+    timestamps is added."""
     best_cost, best = np.inf, cov
     for jitter_s in (0.0,) if late is None else _JITTERS_S:
         spread = cov

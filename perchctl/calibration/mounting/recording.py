@@ -59,8 +59,7 @@ class TargetPose:
 
 @dataclass(eq=False)
 class MountingRecording:
-    """The recording of one part, which grows while it is recorded. `mirrored_pictures` counts those
-    in which the target was seen mirrored only."""
+    """One part's recording, which grows; `mirrored_pictures` counts targets seen mirrored only."""
 
     part: MountingPart
     attitudes: list[AttitudeSample] = field(default_factory=list)
@@ -123,8 +122,7 @@ class MountingRecording:
 
 
 def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
-    """Return the numbers of a key: an array, or a float where `shape` is (). Raises KeyError,
-    TypeError or ValueError where it does not hold such numbers."""
+    """Return a key's numbers, a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
     values = np.array(record[key], dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{key} must hold {math.prod(shape)} numbers")

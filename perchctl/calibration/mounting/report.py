@@ -71,8 +71,7 @@ class MountingReport:
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
 
     def profile_values(self) -> dict[str, float | tuple[float, ...]]:
-        """Return the values to write into the profile, by dotted key: what was measured, but for a
-        latency that each flight is to measure."""
+        """Return the values for the profile by dotted key; no latency that each flight measures."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.rotation is not None:
             values["camera.mount.rpy_deg"] = _rounded(self.rotation.rpy_deg, 2)
@@ -109,8 +108,7 @@ class MountingReport:
         return values
 
     def record(self) -> dict[str, Any]:
-        """Return the measured part of the object of `calibrate mount --json`: what was measured,
-        the sigmas, what the profile says, and what it is to say."""
+        """Return measured values, sigmas, and the profile's values before and after, for JSON."""
         values = self._values()
         return {v.key: v.measured.tolist() for v in values} | {
             "sigma": {v.key: v.sigma.tolist() for v in values},
