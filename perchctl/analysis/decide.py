@@ -108,7 +108,7 @@ def field_difference(name: str, one: Any, other: Any) -> FieldDifference | None:
 
 
 def first_field_difference(fields: Iterable[FieldDifference]) -> FieldDifference | None:
-    """Return the first difference among the fields, each with its recorded and replayed value."""
+    """Return the first difference among the fields; None without one."""
     return next((d for field in fields if (d := field_difference(*field)) is not None), None)
 
 

@@ -1,4 +1,4 @@
-"""A film of a flight: the camera's picture, a side view to scale, error and thrust over time."""
+"""A film of a flight: camera picture, side view, error and thrust."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class _Stage:
 
 def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
     """Return the vehicle's centre in each tick, (n, 2), and the target's height (None: never seen):
-    metres aside and up, in the vertical plane of target and take-off. Errors: InvalidValue."""
+    metres aside and above ground in the vertical plane through take-off. Errors: InvalidValue."""
     log = flight.log
     body_m, targets_m = (
         np.column_stack([log.column(f"{prefix}{axis}_m") for axis in "xyz"]) for prefix in ("", "t")
@@ -226,7 +226,7 @@ def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
 
 
 def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
-    """Write a GIF in one palette of greys and line colours, so that what stands still is free."""
+    """Write a GIF in one palette, so that what stands still costs nothing."""
     from PIL import Image
 
     greys = np.repeat(np.linspace(0.0, 255.0, 64)[:, None], 3, axis=1)

@@ -109,7 +109,7 @@ class FlightAnalysis:
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
-        """The stretches of turns in one phase held for one reason; numbers are the last ones'."""
+        """The stretches held in one phase for one reason, with the last turn's numbers."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -185,7 +185,7 @@ class FlightAnalysis:
         )
 
     def _settled(self) -> tuple[float | None, float | None]:
-        """Compute the RMS errors before the last contact: horizontal (m) and heading (rad)."""
+        """Compute RMS errors before the last contact: horizontal (m), heading (rad)."""
         ascent = contact_ascent(self.log.phases)
         if ascent is None:
             return None, None

@@ -159,7 +159,7 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
-    """Draw the commanded thrust in percent on an axis at the panel's right, which is returned."""
+    """Draw the commanded thrust in percent on a right axis, which is returned."""
     thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
     thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")

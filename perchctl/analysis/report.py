@@ -214,7 +214,7 @@ def film_data_url(flight: FlightAnalysis) -> tuple[str, str]:
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
-    """Return the error's text with bare file names: a page that is sent on names no folder."""
+    """Return the error's text without folders, as a page is sent on."""
     return str(error).replace(f"{log_path.parent}{os.sep}", "")
 
 
@@ -263,7 +263,7 @@ def read_reported_flight(log_path: Path) -> ReportedFlight:
 
 
 def decision_frames(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
-    """Return caption and tick's record, by frame number, of each frame that began a new phase."""
+    """Return caption and record, by number, of each frame that began a phase."""
     log = flight.log
     found = {}
     for stay in log.phases:

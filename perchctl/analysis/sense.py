@@ -22,7 +22,7 @@ from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame, Pipeline
 
 Picture = tuple[int, float, NDArray[np.uint8]]
-"""Of a frame: its number, its time as the source gave it, and the picture that was looked at."""
+"""Of a frame: its number, the source's time, and the searched picture."""
 
 
 class PictureMissing(Exception):
@@ -151,7 +151,7 @@ def replay_inputs(
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
-    """Yield the pictures; one that cannot be read ends the pictures, not the planner's replay."""
+    """Yield the pictures; an unreadable one ends them, not the planner's replay."""
     try:
         yield from pictures
     except (InvalidValue, NotFound) as error:

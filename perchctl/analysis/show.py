@@ -165,7 +165,7 @@ def with_hanging_indent(prefix: str, text: str) -> list[str]:
 
 
 def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
-    """Return a folder's ``flight_*.jsonl[.gz]``, the newest last record first. Errors: NotFound."""
+    """Return a folder's ``flight_*.jsonl[.gz]``, newest end first. Errors: NotFound."""
     if not folder.is_dir():
         raise NotFound(f"there is no folder {folder} with flight logs: name a log, or its folder")
     paths = [*folder.glob("flight_*.jsonl"), *folder.glob("flight_*.jsonl.gz")]

@@ -1,4 +1,4 @@
-"""What the camera saw in a flight, read off its log: frames, how good they were, and losses."""
+"""What the camera saw, by a flight's log: frames, their quality, and losses."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """Tell each kind of stop once: it may be repeated, and an emergency cut may come long after."""
+    """Tell each kind of stop once, as it may be repeated."""
     commands = flight.log.texts("cmd")
     for command, text in MOTORS.items():
         if command in commands:

@@ -1,4 +1,4 @@
-"""A live camera that a person is guided in front of: its frames, and what is shown with each."""
+"""A live camera that guides a person: its frames, and what is shown."""
 
 from __future__ import annotations
 

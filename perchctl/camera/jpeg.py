@@ -29,7 +29,7 @@ def jpeg_extent(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
     """Return the length of the JPEG at the start of `data`, and the width and height that it says;
     None if it is incomplete.
 
-    Of a damaged one return where its structure breaks, and (0, 0).
+    Of a damaged one return where its structure breaks, and no size: (0, 0).
     """
     at, size_px, in_scan = 2, (0, 0), False
     while True:

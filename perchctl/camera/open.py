@@ -53,8 +53,8 @@ class SourceName:
 
 
 def parse_source(text: str) -> SourceName:
-    """Return the source that a text names: a scheme in small or capital letters, and its place; or
-    a bare path of a video, a picture, a pattern or a folder of pictures. Nothing is opened.
+    """Return the source of a text: a scheme in either case and its place, or a bare path of video,
+    picture, pattern or folder. Nothing is opened.
 
     Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path
     that does not exist.

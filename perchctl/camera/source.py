@@ -85,7 +85,7 @@ class FrameSource(Protocol):
 
 
 def to_grey(image: Any) -> Grey:
-    """Return a contiguous 8-bit grey picture of an array of grey, BGR or BGRA, 8 or 16 bits."""
+    """Return a contiguous 8-bit grey picture of grey, BGR or BGRA, 8 or 16 bits."""
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     if image.ndim == 3 and image.shape[2] == 1:
@@ -112,7 +112,7 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
 
 
 def describe_error(error: Exception) -> str:
-    """Describe an unforeseen error within a sentence: its class, and its text without passwords."""
+    """Describe an unforeseen error by class and text, without passwords."""
     if isinstance(error, URLError) and isinstance(error.reason, Exception):
         error = error.reason
     if isinstance(error, TimeoutError):

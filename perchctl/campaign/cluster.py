@@ -55,7 +55,7 @@ class WorkerRequirements:
 
 
 def process_state(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """Return program, libraries, the `profiles` with files, and the process's flights at a time."""
+    """Return program, libraries, `profiles` with files, and flights at a time."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
         "python": ".".join(platform.python_version_tuple()[:2]),

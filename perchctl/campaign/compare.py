@@ -228,8 +228,7 @@ class Sweep:
 
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
-    """Return the sweep of ``key=value,value``; the values as in a profile's file. Errors:
-    UsageError, InvalidValue."""
+    """Return the sweep of ``key=value,value``. Errors: UsageError, InvalidValue."""
     key, equals, text = (part.strip() for part in sweep.partition("="))
     try:
         texts = list(split_values(text))

@@ -48,8 +48,7 @@ def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R
 
 
 def _give_back_memory() -> None:
-    """Free the memory of a flight. Its objects refer to each other, so Python would free them
-    many flights later."""
+    """Free a flight's memory, whose objects refer to each other, at once."""
     gc.collect()
     if not gc.get_freeze_count():
         # What is left is kept for all flights; to look through it takes as long as 30 pictures.

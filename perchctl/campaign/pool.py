@@ -1,4 +1,4 @@
-"""Processes that fly a campaign here: a standard pool, deaf to signals, killed at an early end."""
+"""Processes that fly a campaign, deaf to signals, killed at an early end."""
 
 from __future__ import annotations
 

@@ -130,8 +130,7 @@ def profile_sha256(profile: Profile) -> str:
 
 @cache
 def source_sha256(root: Path = SOURCE) -> str:
-    """Return the SHA-256 of all modules below `root`, by name and text; later changes of the files
-    do not count."""
+    """Return the SHA-256 of all modules below `root`, taken once."""
     whole = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         whole.update(f"{path.relative_to(root).as_posix()}\n".encode())

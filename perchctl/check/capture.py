@@ -225,8 +225,7 @@ class FrameAlignment:
 def pair_motion(
     telemetry: Sequence[Telemetry], places: Sequence[VehiclePose]
 ) -> PairedMotion | None:
-    """Pair each place with the vehicle's attitude of its moment, every `EVERY_S`; None of fewer
-    than three pairs."""
+    """Pair places and attitudes every `EVERY_S`; None for fewer than three pairs."""
     if len(telemetry) < 2:
         return None
     history = History(tuple(telemetry))
@@ -254,7 +253,7 @@ def pair_motion(
 
 
 def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """Solve A and B by all pairs of moments of a turn; None for turns about less than two axes."""
+    """Solve A and B by pairs of moments; None for turns about fewer than two axes."""
     i, j = np.triu_indices(len(moved.own), 1)
     size = (moved.own[j] * moved.own[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)

@@ -272,8 +272,7 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
 
 
 def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
-    """Return one row for the radio, and one for each vehicle that answers: what `find_vehicles`
-    found."""
+    """Return a row for the radio and for each vehicle that answered."""
     radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")
     if radio_problem:
         cause, _, advice = radio_problem.partition("\n")

@@ -1,4 +1,4 @@
-"""What a person sees during a command: progress bars on a terminal, and a measurement's guide."""
+"""What a person sees during a command: progress bars, and a guided measurement."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def external_positions(
 
 
 def deck_silent(edges: Edges, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the deck's positions, which corrected an accelerometer bias of `acc_z_mps2` along z."""
+    """Stop the deck's positions, which corrected a bias of `acc_z_mps2` by the motors' shaking."""
     edges.set_until(t_s + for_s, edges, "deck_silent", True, False)
 
 

@@ -263,7 +263,7 @@ class RestCheck:
     ) -> Problem | None:
         """Return the problem of a body that has moved while the vehicle stands still.
 
-        For each turn with fresh telemetry and position; `place` None begins anew."""
+        For each turn with fresh telemetry and position; `place` None (not still) begins anew."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
             return None

@@ -238,7 +238,7 @@ def jackknife_covariance(
     curvature_factor: float = 1.0,
     information_factor: float = 1.0,
 ) -> Array:
-    """Return the covariance (p, p): the inverse information, or the jackknife's where that is more.
+    """Return the covariance (p, p): the inverse information, or the jackknife's if more.
 
     Args:
         blocks: information J' J (p, p) and gradient J' r (p,) of each block of rows.

@@ -43,7 +43,7 @@ class RangeError:
 
 
 def allowed_error_mm(z_m: float) -> float:
-    """Return the error that perching allows: 1 mm, or 1 % of the distance where that is more."""
+    """Return the allowed error: 1 mm, or 1 % of the distance if more."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
