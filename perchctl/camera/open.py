@@ -33,8 +33,8 @@ FIRST_FRAME_WITHIN_S = 8.0
 
 @dataclass(frozen=True)
 class SourceName:
-    """What a source's text names. `scheme`: one of `SCHEMES`; `place`: what stands behind the
-    colon. As a text it shows no password."""
+    """A parsed source text. `scheme`: one of `SCHEMES`; `place`: the text after the colon. `str()`
+    of it shows no password."""
 
     scheme: str
     place: str

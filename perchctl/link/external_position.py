@@ -44,8 +44,8 @@ POLL_S = 0.02
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return what the firmware has to be set to for positions from outside, after the user's own
-    parameters; none with decks."""
+    """Return the firmware's parameters for external positions, to be set after the user's own;
+    none with decks."""
     if config.by == "deck":
         return {}
     return {
