@@ -73,7 +73,7 @@ def main() -> None:
         for e in result.errors:
             if e.z_m not in RANGES_M:
                 continue
-            true_mm = position_errors_mm(result.camera, truth, e.z_m, result.covered)
+            true_mm = position_errors_mm(result.camera, truth, e.z_m, result.covered_cells)
             for what, true, line95 in (
                 ("where boards were seen", true_mm.max(), e.mm95),
                 ("straight ahead", true_mm[0], e.axis_mm95),

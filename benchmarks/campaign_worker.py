@@ -47,7 +47,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "perchctl.perception.perception:update_calibration",
         "perchctl.flight.inputs:TurnReporter.flown",
         "perchctl.flight.inputs:TurnReporter.report_waiting",
-        "perchctl.flight.lockstep:Truth.tick",
+        "perchctl.flight.lockstep:TruthWatcher.tick",
     ),
 }
 """What is timed, each without what it calls of the others; the rest of a flight is "other"."""

@@ -4,10 +4,10 @@ The names of `__init__.pyi` are the public ones, for notebooks and scripts; `doc
 them at work. They are loaded when they are first used, so that the command line starts at once.
 """
 
-from perchctl.startup import is_program, leave_at_ctrl_c
+from perchctl.startup import exit_at_ctrl_c, is_command_line
 
-if is_program():
-    leave_at_ctrl_c()  # before lazy_loader, which takes a while to load
+if is_command_line():
+    exit_at_ctrl_c()  # before lazy_loader, which takes a while to load
 
 import lazy_loader
 

@@ -49,10 +49,10 @@ class Channel(Connection):
 
 
 def spawn(code: str, output: int | IO[bytes]) -> tuple[subprocess.Popen[bytes], Channel]:
-    """Run `code` in a Python of its own, in which perchctl can be imported, away from the
-    terminal's Ctrl-C. `output` takes what it prints: a file, or subprocess.PIPE.
+    """Run `code` in a new Python process that can import perchctl and is safe from the terminal's
+    Ctrl-C. `output` takes what it prints: a file, or subprocess.PIPE.
 
-    Returns the process and the connection to it, whose first message is None: it is up.
+    Returns the process and the connection to it; its first message, None, says that it is up.
     """
     root = str(Path(__file__).resolve().parents[1])
     own, its = socket.socketpair()
@@ -69,29 +69,29 @@ def spawn(code: str, output: int | IO[bytes]) -> tuple[subprocess.Popen[bytes], 
     return child, Channel(own.detach())
 
 
-def connect_back() -> Channel:
-    """Return a child's connection to the parent that has spawned it, and tell that it is up."""
+def connect_to_parent() -> Channel:
+    """Return the connection of a `spawn`ed child to its parent, and report that it is up."""
     channel = Channel(int(sys.argv[2]))
     channel.send(None)
     return channel
 
 
-def end_with_parent(last: Callable[[], object] = lambda: None) -> None:
+def end_with_parent(on_exit: Callable[[], object] = lambda: None) -> None:
     """End this process of `multiprocessing` as soon as its parent is gone, killed or not, since
-    nobody waits for its work; `last` is called before."""
+    nobody waits for its work; `on_exit` is called first."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def watch() -> None:
         parent.join()
         with contextlib.suppress(Exception):
-            last()
+            on_exit()
         os._exit(1)
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
-def end(child: subprocess.Popen[bytes], timeout_s: float) -> None:
+def wait_or_kill(child: subprocess.Popen[bytes], timeout_s: float) -> None:
     """Wait until the child has ended; kill it after `timeout_s`."""
     try:
         child.wait(timeout_s)

@@ -55,8 +55,8 @@ def file_kind(path: Path) -> str:
 
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
-    """Raise InvalidValue if the name does not end in one of `suffixes` (the case does not matter),
-    which the message says is `content`, or if `check_writable` does."""
+    """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or as
+    `check_writable`. `content` is what the message calls such a file's content."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
     check_writable(path, force)
@@ -89,7 +89,7 @@ def same_file(one: Path, other: Path) -> bool:
     return one.exists() and other.exists() and one.samefile(other)
 
 
-def cannot_be_written(
+def write_error(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
     """Return the operating system's refusal as an error of one sentence."""
@@ -132,7 +132,7 @@ def _refusals_of(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise cannot_be_written(path, error) from None
+        raise write_error(path, error) from None
 
 
 def file_mode(path: Path) -> int:

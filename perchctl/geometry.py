@@ -92,8 +92,8 @@ def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
     """Return the unit quaternion (w, x, y, z) with w >= 0: the inverse of
     `rotation_from_quaternion`.
 
-    Row `k` of the products below is the quaternion times four times its own part `k`; the
-    longest row is the one that no cancellation has spoilt.
+    Each row of the products is the quaternion times four times one of its parts; the longest is
+    the most exact.
     """
     d0, d1, d2 = R[0, 0], R[1, 1], R[2, 2]
     a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]

@@ -16,17 +16,17 @@ EXIT_CODE = 130
 SENTENCE = "Ctrl-C"
 
 
-def is_program() -> bool:
-    """True if this process is the command line: no program that imports perchctl, and none
-    of its child processes, which have its arguments."""
+def is_command_line() -> bool:
+    """Return True if this process is perchctl's command line: not a program that imports it, nor a
+    child process, which has the same arguments."""
     script = "" if "multiprocessing" in sys.modules else os.path.basename(sys.argv[0])
     if script == "-m":
         script = sys.orig_argv[-len(sys.argv)].removeprefix("-m")  # the module
     return script == "perchctl"
 
 
-def leave_at_ctrl_c() -> None:
-    """Leave at Ctrl-C from now on, unless it is ignored or somebody else's already."""
+def exit_at_ctrl_c() -> None:
+    """Exit at Ctrl-C from now on, unless Ctrl-C is ignored or has another handler already."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 

@@ -21,7 +21,7 @@ from perchctl import __version__
 from perchctl.commands.command_line import COMMANDS, report_failures
 from perchctl.commands.output import ask_to_confirm
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
-from perchctl.startup import is_program
+from perchctl.startup import is_command_line
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT
 
@@ -270,7 +270,7 @@ def test_a_program_that_imports_perchctl_keeps_its_ctrl_c(
     monkeypatch.setattr(sys, "argv", [name, *started.split()[1 + (name == "-m") :]])
     monkeypatch.setattr(sys, "orig_argv", ["python", *started.split()])
     monkeypatch.delitem(sys.modules, "multiprocessing", raising=False)
-    assert is_program() is mine
+    assert is_command_line() is mine
 
 
 @pytest.mark.parametrize(

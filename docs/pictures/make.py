@@ -45,7 +45,7 @@ from perchctl.display import (  # noqa: E402
     make_sketch,
 )
 from perchctl.display.page import flight_state  # noqa: E402
-from perchctl.display.panel import panel  # noqa: E402
+from perchctl.display.panel import status_panel  # noqa: E402
 from perchctl.flight import FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
 from perchctl.mission import Phase, PlannerState, Tick  # noqa: E402
@@ -194,7 +194,7 @@ def terminal(flown: Flight, file: Path) -> None:
             break
         text = f"[{span.start_s - flown.log.start_s:7.2f} s] {span.phase}: {span.reason}"
         console.print(Text(text), soft_wrap=True)
-    console.print(panel(flown.tick(index)))
+    console.print(status_panel(flown.tick(index)))
     svg = console.export_svg(title="perchctl", unique_id="perchctl")
     # Fonts from another server would be fetched by each reader.
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)

@@ -21,8 +21,8 @@ class FlightComparison:
     flights: tuple[FlightAnalysis, FlightAnalysis]
 
     @cached_property
-    def phases(self) -> list[dict[str, Any]]:
-        """How long each flight was in each phase that one of them flew through."""
+    def phase_times(self) -> list[dict[str, Any]]:
+        """Time in each phase that A or B flew through: phase, a_s, b_s."""
         names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.log.phases)
         found = []
         for name in names:
@@ -34,8 +34,8 @@ class FlightComparison:
         return found
 
     @cached_property
-    def profile(self) -> dict[str, tuple[Any, Any]]:
-        """The profile keys with different values, each with both."""
+    def changed_keys(self) -> dict[str, tuple[Any, Any]]:
+        """Dotted profile keys that differ, each with the values of A and B."""
         a, b = (flight.log.header.get("profile") for flight in self.flights)
         return profile_differences(a, b)
 
@@ -48,14 +48,14 @@ class FlightComparison:
         }
 
     def record(self) -> dict[str, Any]:
-        """Return the comparison for programs: SI; a difference is B's value less A's."""
+        """Return the comparison for JSON, in SI units; differences are B minus A."""
         a, b = (_flight_record(flight) for flight in self.flights)
         return {
             "a": a,
             "b": b,
             "differences": self.differences,
-            "phases": self.phases,
-            "profile": {key: {"a": a, "b": b} for key, (a, b) in self.profile.items()},
+            "phases": self.phase_times,
+            "profile": {key: {"a": a, "b": b} for key, (a, b) in self.changed_keys.items()},
         }
 
     def text(self) -> str:
@@ -72,17 +72,21 @@ class FlightComparison:
         yield ""
         yield _row("", "A", "B", "B - A")
         yield from self._measure_rows()
-        if self.phases:
+        if self.phase_times:
             yield ""
             yield "time in each phase [s]"
-        for each in self.phases:
+        for each in self.phase_times:
             a_s, b_s = each["a_s"], each["b_s"]
             yield _row(
                 f"  {printable(each['phase'])}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}"
             )
         yield ""
-        yield "profile keys that differ, A and B" if self.profile else "their profiles are the same"
-        for key, values in self.profile.items():
+        yield (
+            "profile keys that differ, A and B"
+            if self.changed_keys
+            else "their profiles are the same"
+        )
+        for key, values in self.changed_keys.items():
             a, b = ("none" if value is None else value for value in values)
             yield from with_hanging_indent(f"  {printable(key):<{_NAME - 2}}  ", f"{a}  {b}")
 
@@ -112,10 +116,10 @@ def _row(name: str, a: str, b: str, difference: str) -> str:
     return f"{name:<{_NAME}}{a:>{_CELL}}{b:>{_CELL}}{difference:>{_CELL}}".rstrip()
 
 
-def profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
-    """Return the dotted keys of two profiles, as JSON has them, that have different values, each
-    with both."""
-    a, b = _flat(one), _flat(other)
+def profile_differences(profile_a: Any, profile_b: Any) -> dict[str, tuple[Any, Any]]:
+    """Return the dotted keys in which two profiles (nested dicts, as from JSON) differ, each with
+    the values of A and B."""
+    a, b = _flat(profile_a), _flat(profile_b)
     return {
         key: (a.get(key, _NOT_THERE), b.get(key, _NOT_THERE))
         for key in dict.fromkeys((*a, *b))

@@ -28,9 +28,9 @@ class ReplayedDecision:
 
     Attributes:
         tick: number of turns that were flown before it.
-        difference: the first field in which it differs; None without one. A log before version 4
-            does not hold what the planner raised and has no difference there.
-        error: the name of what the planner raised, None where it did not.
+        difference: first field that differs from the log, or None. Logs before version 4 do not
+            hold exceptions of the planner, so these are not compared.
+        error: class name of the exception that the planner raised, or None.
     """
 
     tick: int
@@ -39,8 +39,9 @@ class ReplayedDecision:
     error: str | None = None
 
 
-def replayable_turns(log: FlightLog) -> tuple[list[Turn], str]:
-    """Return a log's turns up to a gap, and a sentence on it, else empty. Errors: InvalidValue."""
+def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
+    """Return the turns before the first one missing from the log, and a sentence that names the
+    missing turn (empty if none is). Errors: InvalidValue."""
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
         raise InvalidValue(
@@ -59,14 +60,15 @@ def replayable_turns(log: FlightLog) -> tuple[list[Turn], str]:
 def replay_decisions(
     turns: Iterable[Turn],
     profile: Profile,
-    seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
+    observation_of: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[ReplayedDecision]:
-    """Replay the planner turn by turn on the observations that `seen` returns, by default the
-    recorded ones. Only flown turns advance its state. It ends where the planner raises."""
+    """Replay the planner turn by turn, by default with the recorded observations. Only flown turns
+    advance the planner's state. The replay ends with the first turn on which the planner raises, as
+    a flight does."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
-        obs = seen(turn)
+        obs = observation_of(turn)
         if obs is None or turn.role == "waiting":
             continue
         try:
@@ -100,15 +102,16 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
 # --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---
 
 
-def field_difference(name: str, one: Any, other: Any) -> FieldDifference | None:
-    """Return the first differing field, or None; two kinds of command are shown as a whole."""
-    if type(one) is not type(other):
-        return name, _shown(one), _shown(other)
-    return _first_differing(name, to_exact_json(one), to_exact_json(other))
+def field_difference(name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
+    """Return the first subfield of field `name` in which two values differ, or None. Values of
+    different classes are returned whole, as text with their class."""
+    if type(recorded) is not type(replayed):
+        return name, _shown(recorded), _shown(replayed)
+    return _first_differing(name, to_exact_json(recorded), to_exact_json(replayed))
 
 
 def first_field_difference(fields: Iterable[FieldDifference]) -> FieldDifference | None:
-    """Return the first difference among the fields; None without one."""
+    """Return the first difference among fields (name, recorded and replayed value), or None."""
     return next((d for field in fields if (d := field_difference(*field)) is not None), None)
 
 

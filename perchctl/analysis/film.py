@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import draw_thrust
 from perchctl.errors import InvalidValue
-from perchctl.files import atomic_write, cannot_be_written
+from perchctl.files import atomic_write, write_error
 from perchctl.geometry import Array
 from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, PURPLE, SKY, VERMILLION, new_figure
 
@@ -64,7 +64,7 @@ def write_film(
         with atomic_write(path) as part:
             write(drawn, part, period)
     except OSError as error:
-        raise cannot_be_written(path, error) from None
+        raise write_error(path, error) from None
     return len(times_s)
 
 
@@ -169,7 +169,7 @@ class _Stage:
 
     def _set_traces(self, ax: Axes) -> None:
         flight = self._flight
-        aside_m = np.hypot(flight.tracked("ex_m"), flight.tracked("ey_m"))
+        aside_m = np.hypot(flight.tracked_values("ex_m"), flight.tracked_values("ey_m"))
         ax.plot(flight.log.t_s, 100.0 * aside_m, color=PURPLE, linewidth=1.2)
         ax.set_ylabel("off centre [cm]", color=PURPLE)
         ax.set_ylim(bottom=0.0)
@@ -182,8 +182,9 @@ class _Stage:
 
 
 def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
-    """Return the vehicle's centre in each tick, (n, 2), and the target's height (None: never seen):
-    metres aside and above ground in the vertical plane through take-off. Errors: InvalidValue."""
+    """Return the vehicle's centre in each tick, (n, 2) m: horizontal distance from the target and
+    height above ground, in the vertical plane through the target and the take-off point; and the
+    target's height, None if it was never seen. Errors: InvalidValue for a log without positions."""
     log = flight.log
     body_m, targets_m = (
         np.column_stack([log.column(f"{prefix}{axis}_m") for axis in "xyz"]) for prefix in ("", "t")

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.analysis.sight import Frames, TargetLoss, frames_of, percentile, target_losses
+from perchctl.analysis.sight import Frames, TargetLoss, percentile, read_frames, target_losses
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
@@ -45,10 +45,10 @@ def _number(label: str, unit: str = "", scale: float = 1.0, digits: int = 0) -> 
 
 @dataclass(frozen=True)
 class Measures:
-    """The numbers of a flight; None is not known.
+    """Key figures of a flight; None is unknown.
 
-    The settled errors are the RMS over the last `SETTLED_S` of the ascent from which the last
-    contact was begun: horizontal distance of gear and target, and heading.
+    The settled errors (horizontal distance of gear and target, and heading) are RMS values over
+    the last `SETTLED_S` of the ascent before the last contact.
     """
 
     duration_s: float | None = _number("flight", "s", digits=1)
@@ -73,7 +73,7 @@ class Measures:
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
 
     def value_text(self, name: str) -> str:
-        """Return a number as people read it, without its unit; ``-`` where it is not known."""
+        """Return a figure as text, in its display unit but without it; ``-`` if unknown."""
         (of,) = [f for f in fields(self) if f.name == name]
         value = getattr(self, name)
         if value is None:
@@ -81,8 +81,8 @@ class Measures:
         return f"{value * of.metadata['scale']:.{of.metadata['digits']}f}"
 
     @property
-    def rows(self) -> list[tuple[str, str]]:
-        """Each number that is known: its label and its text with the unit."""
+    def labels_and_texts(self) -> list[tuple[str, str]]:
+        """Label, and text with unit, of each known figure."""
         return [
             (f.metadata["label"], f"{self.value_text(f.name)} {f.metadata['unit']}".rstrip())
             for f in fields(self)
@@ -91,10 +91,11 @@ class Measures:
 
 
 class FlightAnalysis:
-    """What one flight was, worked out from its log; each part once, when it is first used.
+    """Analysis of one flight's log; each property is computed once, on first use.
 
-    Times count from the flight's first turn. A value that no flight writes raises InvalidValue,
-    TypeError, ValueError, LookupError or AttributeError; `perchctl.record.log_values` makes one.
+    Times count from the flight's first turn. A property that meets an invalid value in the log
+    raises InvalidValue, TypeError, ValueError, LookupError or AttributeError; within
+    `perchctl.record.wrap_log_errors` all of these become InvalidValue.
     """
 
     def __init__(self, log: FlightLog) -> None:
@@ -103,13 +104,14 @@ class FlightAnalysis:
     @cached_property
     def summary(self) -> FlightSummary:
         """How it ended."""
-        return FlightSummary.of(self.log)
+        return FlightSummary.from_log(self.log)
 
     # --- holds and notes
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
-        """The stretches held in one phase for one reason, with the last turn's numbers."""
+        """Each stretch of turns of one phase held for one reason. Numbers in a reason may change
+        from turn to turn; the last turn's are kept."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -139,16 +141,16 @@ class FlightAnalysis:
     @cached_property
     def frames(self) -> Frames:
         """The camera frames that the pipeline was given."""
-        return frames_of(self.log)
+        return read_frames(self.log)
 
     @cached_property
-    def losses(self) -> tuple[TargetLoss, ...]:
+    def target_losses(self) -> tuple[TargetLoss, ...]:
         """When the target was out of sight while it was needed."""
         return target_losses(self.log, self.frames)
 
     @cached_property
     def takeovers(self) -> tuple[Takeover, ...]:
-        """What was sent in the loop's place, each go by itself."""
+        """Series of commands that other senders than the flight loop sent."""
         return group_takeovers(self.log)
 
     @cached_property
@@ -176,7 +178,7 @@ class FlightAnalysis:
             frames=len(frames.t_s),
             frames_unseen=len(frames.times_without_target_s),
             frame_rate_hz=_known(frames.rate_hz),
-            frame_age_s=_known(frames.age_s),
+            frame_age_s=_known(frames.median_age_s),
             frame_gaps=len(gaps_s),
             frame_gaps_s=float(np.sum(gaps_s)),
             turns=len(log.records),
@@ -201,21 +203,22 @@ class FlightAnalysis:
 
     # --- single ticks
 
-    def tracked(self, key: str) -> Array:
-        """Return a field over the ticks, (n,), NaN where the target is only remembered."""
+    def tracked_values(self, log_field: str) -> Array:
+        """Return a log field of each tick, (n,), NaN while the target is not tracked."""
         remembered = [record.get("tracked") is False for record in self.log.records]
-        return np.where(remembered, np.nan, self.log.column(key))
+        return np.where(remembered, np.nan, self.log.column(log_field))
 
-    def at(self, t_s: float, key: str) -> float:
-        """Return a field at that time; NaN where it is missing or no number."""
-        value = self.log.records[self.log.index_at(t_s)].get(key) if self.log.records else None
+    def value_at(self, t_s: float, log_field: str) -> float:
+        """Return a log field at that time; NaN if it is missing or not a number."""
+        records = self.log.records
+        value = records[self.log.index_at(t_s)].get(log_field) if records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return math.nan
         return float(value)
 
 
 def contact_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
-    """Return the ascent from which the last contact was begun; None without a contact."""
+    """Return the ascent that led to the last contact; None without a contact."""
     ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
     return ascents[-1] if ascents else None
 
@@ -234,7 +237,8 @@ _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
 
 @dataclass(frozen=True)
 class Takeover:
-    """What one sender sent in one go. Times are since the first turn; `commands` counts by kind."""
+    """Series of commands that a sender (`by`) other than the flight loop sent. Times are since the
+    flight's first turn; `commands` counts them by kind, such as ``position setpoint``."""
 
     by: str
     start_s: float
@@ -248,7 +252,7 @@ class Takeover:
 
 
 def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
-    """Group what was sent in the loop's place by sender and time, oldest first."""
+    """Group the commands sent instead of the loop's by sender and time, oldest first."""
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None

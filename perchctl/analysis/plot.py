@@ -70,8 +70,9 @@ def flight_png(flight: FlightAnalysis) -> bytes:
 
 
 def flight_figure(flight: FlightAnalysis) -> Figure:
-    """Draw detections and the filtered track (as the paper's figure 6), height, thrust and battery
-    over the phases; and the last seconds with the target in mm. Lost frames are marked below."""
+    """Draw detections and the filtered track (as figure 6 of the paper), height, thrust and
+    battery over time, with the phases named, and a close-up in mm of the last seconds with the
+    target. Frames without a detection are marked at the bottom."""
     figure = new_figure(11.0, 14.0)
     *axes, last_ax = figure.subplots(7, 1, height_ratios=(1, 1, 1, 1, 1.1, 1.1, 2.0))
     for ax, (key, scale, label) in zip(axes[:4], TRACKS, strict=True):
@@ -122,7 +123,7 @@ def _draw_raw_and_filtered(
     for source, marker, colour, text in RAW:
         raw = scale * log.column(f"{source}{key}")
         ax.plot(frame_s, raw, marker, markersize=3, color=colour, label=text)
-    filtered = flight.tracked(f"e{key}")
+    filtered = flight.tracked_values(f"e{key}")
     if key == "yaw_rad":  # a gap, not a line across the panel, where it wraps
         filtered[np.flatnonzero(np.abs(np.diff(filtered)) > math.pi)] = np.nan
     filtered = scale * filtered
@@ -159,7 +160,7 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
-    """Draw the commanded thrust in percent on a right axis, which is returned."""
+    """Draw the commanded thrust in percent on a second y axis at the right, and return it."""
     thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
     thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")
@@ -184,7 +185,7 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
         for source, marker, _, _ in RAW:
             raw_mm = 1e3 * log.column(f"{source}{axis}_m")[near]
             ax.plot(frame_s[near], raw_mm, marker, markersize=2.4, color=colour, fillstyle="none")
-        e_mm = 1e3 * flight.tracked(f"e{axis}_m")[inside]
+        e_mm = 1e3 * flight.tracked_values(f"e{axis}_m")[inside]
         ax.plot(t_s, e_mm, color=colour, linewidth=1.4, label=f"e{axis}")
         span_mm.append(_most(np.abs(e_mm)))
     miss_mm = 1e3 * log.column("true_miss_m")[inside]

@@ -13,7 +13,7 @@ from perchctl.analysis.decide import (
     ReplayedDecision,
     first_field_difference,
     replay_decisions,
-    replayable_turns,
+    turns_and_gap_text,
 )
 from perchctl.analysis.sense import Picture, PictureMissing, ReplayedInputs, replay_inputs
 from perchctl.calibration import profile_camera
@@ -32,10 +32,10 @@ CAUTION = (
 
 @dataclass(frozen=True)
 class Difference:
-    """The first difference of a replay from its flight.
+    """First field of one turn in which a replay differs from the log.
 
-    `tick` counts the turns from take-off from 0, as the log's ticks do; of a turn before that
-    it is negative. `t_s`: since the first flown turn. `recorded`, `replayed`: as JSON has them.
+    `tick`: number of the turn since take-off, from 0; negative before take-off. `t_s`: since the
+    first flown turn. `recorded`, `replayed`: the two values, in JSON types.
     """
 
     tick: int
@@ -57,9 +57,9 @@ class PerceptionReplay:
 
     Attributes:
         turns: the replayed turns, up to the first missing picture.
-        differences: of the turns in which a pose, or what the planner sees, differs.
-        frames_flown: how many frames the flight looked at.
-        missing: what ended it before the flight; None where nothing did.
+        differences: one for each turn whose poses or observation differ.
+        frames_flown: number of frames that the flight processed.
+        missing: why it ended before the flight did, or None.
     """
 
     turns: Sequence[ReplayedInputs]
@@ -69,19 +69,19 @@ class PerceptionReplay:
 
     @property
     def frames(self) -> int:
-        """How many pictures were looked at again."""
+        """Number of frames that were processed again."""
         return _frames_of(each.turn for each in self.turns)
 
     @property
     def end_reason(self) -> str:
-        """Why it ends before the flight does, or empty."""
+        """Why the replay ends before the flight does, or empty."""
         return f"{self.missing}: what came after it cannot be seen again" if self.missing else ""
 
     @property
     def is_identical(self) -> bool:
         """True if no replayed value differs. A picture that is missing or unreadable does not
         count as a difference."""
-        return not (self.differences or (self.missing is not None and self.missing.is_another))
+        return not (self.differences or (self.missing is not None and self.missing.is_different))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,27 +89,28 @@ class Replay:
     """Replay of a log through the planner, and through perception if pictures were recorded.
 
     Attributes:
-        decided: each turn of the planner; `differences`: of those decided otherwise, sent or not.
-        seen: what the pictures show; None without any.
-        changed: the keys in which the profile is another than the flown one's.
-        gap: which turn is the first that the log has lost, or empty.
+        decisions: the planner's replayed decisions, one for each turn.
+        differences: one for each decision that differs from the log.
+        seen: replay of perception; None without pictures.
+        changed_keys: profile keys that differ from the flown profile.
+        gap_text: sentence that names the first turn missing from the log, or empty.
     """
 
     log: FlightLog
-    decided: Sequence[ReplayedDecision]
+    decisions: Sequence[ReplayedDecision]
     differences: Sequence[Difference]
     seen: PerceptionReplay | None = None
-    changed: tuple[str, ...] = ()
-    gap: str = ""
+    changed_keys: tuple[str, ...] = ()
+    gap_text: str = ""
 
     @property
     def ticks(self) -> int:
-        """How many of the turns were flown."""
-        return sum(each.turn.role == "flown" for each in self.decided)
+        """Number of replayed turns that were flown."""
+        return sum(each.turn.role == "flown" for each in self.decisions)
 
     @property
     def is_identical(self) -> bool:
-        """True if no decision and nothing that was seen differs."""
+        """True if neither a decision nor a perception result differs."""
         return not self.differences and (self.seen is None or self.seen.is_identical)
 
     @property
@@ -129,18 +130,19 @@ class Replay:
         if self.log.truncated:
             found.append("the log ends in the flight, without its summary: replayed is its rest")
         ended = "" if self.seen is None else self.seen.end_reason
-        found += [note for note in (self.gap, ended) if note]
-        if self.changed and not self.is_identical:
+        found += [note for note in (self.gap_text, ended) if note]
+        if self.changed_keys and not self.is_identical:
             found.append(CAUTION)
-        for each in self.decided:
+        for each in self.decisions:
             if each.error is not None:
                 found.append(f"the planner breaks down on turn {each.turn.number}: {each.error}")
         return found
 
     def record(self) -> dict[str, Any]:
-        """Return the replay as JSON's own types.
+        """Return the replay in JSON types.
 
-        `ticks`, `differences` and `first_difference` are the planner's; `pictures` may be None.
+        `ticks`, `differences` and `first_difference` are the planner's; `pictures` (perception) is
+        None without pictures; `changed` is empty for the flown profile.
         """
         seen = self.seen
         pictures = seen and {
@@ -155,13 +157,13 @@ class Replay:
             "ticks": self.ticks,
             **_counted(self.differences),
             "pictures": pictures,
-            "changed": list(self.changed),
+            "changed": list(self.changed_keys),
             "notes": self.notes,
         }
 
     def lines(self) -> list[str]:
         """Return the replay's lines for people, without `notes`."""
-        lines = [f"changed:   {', '.join(self.changed)}"] if self.changed else []
+        lines = [f"changed:   {', '.join(self.changed_keys)}"] if self.changed_keys else []
         text = "all with the same commands"
         if self.differences:
             text = f"{len(self.differences)} decided otherwise"
@@ -198,7 +200,7 @@ def replay(
     profile's, with the flown calibration and mask. Errors: InvalidValue, NotFound.
     """
     flown = log.flown_profile
-    turns, gap = replayable_turns(log)
+    turns, gap = turns_and_gap_text(log)
     used = profile or flown
     changed = changed_keys(flown, used)
     seen = None
@@ -221,8 +223,7 @@ def replay(
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
-    """Return the dotted keys in which two profiles differ, but for those that only name or
-    describe them."""
+    """Return the dotted keys in which two profiles differ, without name, description and date."""
     found = profile_differences(one.model_dump(mode="json"), other.model_dump(mode="json"))
     return tuple(key for key in found if key not in ("name", "description", "date"))
 
@@ -253,11 +254,11 @@ def _seen(
     pipeline: Pipeline,
 ) -> PerceptionReplay:
     # A source takes the latency off the time at which a picture came.
-    later_s = flown.camera.start_latency_s - profile.camera.start_latency_s
+    delay_s = flown.camera.start_latency_s - profile.camera.start_latency_s
     found: list[ReplayedInputs] = []
     missing: PictureMissing | None = None
     try:
-        for each in replay_inputs(turns, profile, pipeline, pictures, later_s):
+        for each in replay_inputs(turns, profile, pipeline, pictures, delay_s):
             found.append(each)
     except PictureMissing as error:
         missing = error
@@ -272,7 +273,7 @@ def _differing(
         was, seen = each.turn.observation, each.observation
         fields: list[tuple[str, Any, Any]] = [("poses", each.turn.poses, each.poses)]
         if was is not None and seen is not None:
-            fields += [(n, getattr(was, n), getattr(seen, n)) for n in FlightInputs.SENSED]
+            fields += [(n, getattr(was, n), getattr(seen, n)) for n in FlightInputs.SENSED_FIELDS]
         difference = first_field_difference(fields)
         if difference is not None:
             yield Difference(tick, log.to_flight_s(each.turn.t_s), *difference)

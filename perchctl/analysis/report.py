@@ -26,7 +26,7 @@ from perchctl.analysis.story import Sentence, count_text, length_text, tell_stor
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
-from perchctl.record import log_values, path_beside, read_log, recorded_pictures
+from perchctl.record import path_beside, read_log, recorded_pictures, wrap_log_errors
 
 UNFINISHED = "unfinished"
 TITLES = {
@@ -40,8 +40,8 @@ GRADES = {"perched": "good", "landed": "warn"}
 
 
 def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = False) -> Report:
-    """Write the page, whole or not at all; return what is on it. `with_film` embeds a film of each
-    flight.
+    """Write the HTML report of the logs atomically, and return its content. `with_film` embeds a
+    film of each flight.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.
     """
@@ -57,7 +57,7 @@ class Report:
     flights: tuple[ReportedFlight, ...]
 
     @property
-    def counts_text(self) -> str:
+    def outcome_counts_text(self) -> str:
         """``1 flight: 1 perched``, ``4 flights: 3 perched, 1 landed``."""
         outcomes = [told.outcome for told in self.flights]
         each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))
@@ -79,8 +79,8 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class ReportedFlight:
-    """One flight as the page has it. `pictures` is None where no recording was made;
-    `picture_problem` says why some could not be read."""
+    """One flight of a report. `pictures` is None without a recording; `picture_problem` says why
+    some could not be read."""
 
     flight: FlightAnalysis
     pictures: tuple[DecisionPicture, ...] | None = None
@@ -88,12 +88,12 @@ class ReportedFlight:
 
     @cached_property
     def story(self) -> tuple[Sentence, ...]:
-        """What happened."""
+        """The flight in sentences."""
         return tell_story(self.flight)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """What the flight found of latency and mounting that the profile should have."""
+        """Sentences on the measured latency and mounting that the profile should contain."""
         findings = self.flight.summary.findings
         return () if findings is None else findings.advice
 
@@ -103,8 +103,8 @@ class ReportedFlight:
         return UNFINISHED if self.flight.log.summary is None else self.flight.summary.outcome
 
     @property
-    def grade(self) -> str:
-        """How good the outcome is: good, warn or bad."""
+    def outcome_grade(self) -> str:
+        """Grade of the outcome: good, warn or bad."""
         return GRADES.get(self.outcome, "bad")
 
     @property
@@ -149,10 +149,11 @@ POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-
 
 
 def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
-    """Return the page of one or more flights. Raises InvalidValue for what no flight writes."""
+    """Return the report of at least one flight as self-contained HTML. Raises InvalidValue for
+    invalid values in a log."""
     articles = []
     for number, told in enumerate(flights, start=1):
-        with log_values(told.flight.log.path):
+        with wrap_log_errors(told.flight.log.path):
             articles.append(
                 _render(
                     "flight.html",
@@ -167,7 +168,7 @@ def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> s
         "page.html",
         flights=flights,
         articles=articles,
-        counts=Report(tuple(flights)).counts_text,
+        counts=Report(tuple(flights)).outcome_counts_text,
         policy=POLICY,
         version=perchctl.__version__,
     )
@@ -190,13 +191,14 @@ def _templates() -> jinja2.Environment:
     templates.globals.update(
         seven_phases=[phase.value for phase in tuple(Phase)[:7]],
         plot_of=lambda flight: _address("image/png", flight_png(flight)),
-        film_of=film_data_url,
+        film_of=film_url_and_problem,
     )
     return templates
 
 
-def film_data_url(flight: FlightAnalysis) -> tuple[str, str]:
-    """Return the film's `data:` address, and why it or its pictures are missing, or empty texts."""
+def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
+    """Return the flight's film as a `data:` URL, and why the film or its camera pictures are
+    missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()
     recorded = [recorded_pictures(path)] if is_recorded else []
@@ -231,7 +233,8 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 @dataclass(frozen=True)
 class DecisionPicture:
-    """JPEG behind a decision, with markers; the caption has its time, as the last cm have none."""
+    """Last camera picture before a phase change, as a JPEG with the detected markers drawn. The
+    caption has its time, as the last centimetres are flown without pictures."""
 
     caption: str
     jpeg: bytes
@@ -242,8 +245,8 @@ class DecisionPicture:
 
 
 def read_reported_flight(log_path: Path) -> ReportedFlight:
-    """Read one flight, with what was recorded beside its log. A recording that cannot be read
-    costs the pictures only.
+    """Read one flight from its log and from the recording beside it. A recording that cannot be
+    read costs only the pictures.
 
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """
@@ -252,8 +255,8 @@ def read_reported_flight(log_path: Path) -> ReportedFlight:
         return ReportedFlight(flight)
     shown: list[DecisionPicture] = []
     try:
-        with log_values(log_path):
-            decisions = decision_frames(flight)
+        with wrap_log_errors(log_path):
+            decisions = captions_and_records(flight)
         for picture in recorded_pictures(log_path, decisions):
             caption, record = decisions[picture.number]
             shown.append(DecisionPicture(caption, _jpeg(record, picture.image)))
@@ -262,8 +265,9 @@ def read_reported_flight(log_path: Path) -> ReportedFlight:
     return ReportedFlight(flight, tuple(shown))
 
 
-def decision_frames(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
-    """Return caption and record, by number, of each frame that began a phase."""
+def captions_and_records(flight: FlightAnalysis) -> dict[int, tuple[str, dict[str, Any]]]:
+    """Return, by frame number, the caption and the log record of the last frame before each phase
+    change."""
     log = flight.log
     found = {}
     for stay in log.phases:

@@ -26,13 +26,14 @@ Picture = tuple[int, float, NDArray[np.uint8]]
 
 
 class PictureMissing(Exception):
-    """The pictures end here; the message says why. `is_another`: not the flown picture."""
+    """A picture that the replay needs is missing (the message says why) or, with `is_different`, is
+    not the one that the flight processed."""
 
-    is_another = False
+    is_different = False
 
 
 class _PictureIsAnother(PictureMissing):
-    is_another = True
+    is_different = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +49,10 @@ class _Given:
     """The recorded edges of one turn after another, as the inputs ask for them."""
 
     def __init__(
-        self, pictures: Iterable[Picture], size_px: tuple[int, int], later_s: float
+        self, pictures: Iterable[Picture], size_px: tuple[int, int], delay_s: float
     ) -> None:
         self.size_px: tuple[int, int] | None = size_px
-        self._later_s = later_s
+        self._later_s = delay_s
         self._pictures = _readable(pictures)
         self._name = "the recording"
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
@@ -132,14 +133,15 @@ def replay_inputs(
     profile: Profile,
     pipeline: Pipeline,
     pictures: Iterable[Picture],
-    later_s: float = 0.0,
+    delay_s: float = 0.0,
 ) -> Iterator[ReplayedInputs]:
-    """Replay perception turn by turn. `later_s` is added to the exposure times of a live source.
+    """Replay perception turn by turn, from the first turn before take-off. `delay_s` is added to
+    the exposure times of a live source.
 
     Raises PictureMissing at the first picture that is missing, differs or cannot be read: from
     there the pipeline's state would differ from the flight's.
     """
-    given = _Given(pictures, pipeline.camera.size_px, later_s)
+    given = _Given(pictures, pipeline.camera.size_px, delay_s)
     inputs = FlightInputs(given, given, pipeline, profile, recorded=True)
     with _one_thread():
         for turn in turns:
@@ -162,7 +164,9 @@ def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
     if turn.observation is None or inputs.history.newest is None:
         return None
     seen = inputs.observation(turn.t_s)
-    return replace(turn.observation, **{name: getattr(seen, name) for name in FlightInputs.SENSED})
+    return replace(
+        turn.observation, **{name: getattr(seen, name) for name in FlightInputs.SENSED_FIELDS}
+    )
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ _HANG = 11
 
 
 def show_record(flight: FlightAnalysis) -> dict[str, Any]:
-    """Return all that `show_text` shows, for programs: SI, times from the flight's first turn."""
+    """Return the content of `show_text` for JSON: SI units, times from the flight's first turn."""
     log, end, header = flight.log, flight.summary, flight.log.header
     return {
         "log": str(log.path),
@@ -46,8 +46,7 @@ def _times(part: Any) -> dict[str, Any]:
 
 
 def show_text(flight: FlightAnalysis) -> str:
-    """Return how a flight ended, its figures, its phases, and what held it or took over, as lines
-    for a terminal."""
+    """Return outcome, figures, phases, holds and takeovers of a flight as text for a terminal."""
     lines = [*_end_lines(flight), *_named("record", _origin(flight.log)), *_measure_lines(flight)]
     phases = flight.log.phases
     for head, rows in (
@@ -98,7 +97,7 @@ def _origin(log: FlightLog) -> str:
 
 
 def utc_text(started_utc: Any) -> str:
-    """Return a header's `started_utc` as people read it."""
+    """Return the `started_utc` of a log header as readable text."""
     return str(started_utc).replace("T", " ").replace("+00:00", " UTC")
 
 
@@ -164,8 +163,9 @@ def with_hanging_indent(prefix: str, text: str) -> list[str]:
 # --- Which logs a folder holds, the newest first, and how each ended ---
 
 
-def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
-    """Return a folder's ``flight_*.jsonl[.gz]``, newest end first. Errors: NotFound."""
+def newest_logs(folder: Path, limit: int | None = None) -> list[Path]:
+    """Return the folder's flight logs (``flight_*.jsonl``, ``.jsonl.gz``), at most `limit`, sorted
+    by the time of their last record, newest first. Errors: NotFound."""
     if not folder.is_dir():
         raise NotFound(f"there is no folder {folder} with flight logs: name a log, or its folder")
     paths = [*folder.glob("flight_*.jsonl"), *folder.glob("flight_*.jsonl.gz")]
@@ -174,7 +174,7 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
             f"the folder {folder} holds no flight log (flight_*.jsonl): name a log, or another "
             f"folder"
         )
-    return sorted(paths, key=_age_key, reverse=True)[:most]
+    return sorted(paths, key=_age_key, reverse=True)[:limit]
 
 
 def _age_key(path: Path) -> tuple[int, str]:

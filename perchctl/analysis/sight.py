@@ -20,7 +20,7 @@ GAP_PERIODS = 2.5
 
 
 def percentile(values: Array, percent: float) -> float:
-    """A percentile of the known values; NaN where none is known."""
+    """Return a percentile of the values that are not NaN; NaN if all are."""
     known = values[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else math.nan
 
@@ -30,35 +30,35 @@ def percentile(values: Array, percent: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The camera frames that the pipeline was given, in order.
+    """Timing of the camera frames that the pipeline processed, in order.
 
     Attributes:
         t_s: (n,) times of exposure since the flight's first turn.
-        seen: (n,) bool, True for the frames that showed the target.
-        gaps_s: (k, 2) from when to when no usable frame came.
+        has_target: (n,) bool, True for the frames that showed the target.
+        gaps_s: (k, 2) start and end of each gap without a usable frame.
         rate_hz: 1 over the median time between two frames; NaN where it is unknown.
-        age_s: median age of a picture when it was used; NaN where it is unknown.
+        median_age_s: median age of a picture when it was used; NaN where it is unknown.
     """
 
     t_s: Array
-    seen: NDArray[np.bool_]
+    has_target: NDArray[np.bool_]
     gaps_s: Array
     rate_hz: float
-    age_s: float
+    median_age_s: float
 
     @property
     def times_with_target_s(self) -> Array:
         """Times of the frames that showed the target."""
-        return self.t_s[self.seen]
+        return self.t_s[self.has_target]
 
     @property
     def times_without_target_s(self) -> Array:
         """Times of the frames that did not show the target."""
-        return self.t_s[~self.seen]
+        return self.t_s[~self.has_target]
 
 
-def frames_of(log: FlightLog) -> Frames:
-    """Read the frames of a flight; the median period decides what is a gap."""
+def read_frames(log: FlightLog) -> Frames:
+    """Return the frame timing of a flight; gaps are found relative to the median period."""
     records = [record for record in log.records if record.get("frame_t_s") is not None]
     times_s = log.to_flight_s(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
@@ -69,15 +69,15 @@ def frames_of(log: FlightLog) -> Frames:
     between_s = np.diff(np.sort(times_s))
     return Frames(
         t_s=times_s,
-        seen=np.array([shows_target(record) for record in records], dtype=bool),
+        has_target=np.array([shows_target(record) for record in records], dtype=bool),
         gaps_s=gaps_s,
         rate_hz=1.0 / percentile(between_s[between_s > 0], 50),
-        age_s=age_s,
+        median_age_s=age_s,
     )
 
 
 def shows_target(record: Mapping[str, Any]) -> bool:
-    """True if the frame of a tick held the target, as the planner's estimate took it."""
+    """True if the target was detected in the frame of a tick, and its pose accepted."""
     found = any(record.get(f"{source}x_m") is not None for source in "jls")
     return found and record.get("measured") is not False
 
@@ -102,17 +102,17 @@ AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
 @dataclass(frozen=True)
 class TargetLoss:
-    """The target was out of sight while it was needed: from the last frame that showed it to the
-    next, or to the flight's end.
+    """Interval without the needed target: from the last frame that showed it to the next frame that
+    does, or to the flight's end.
 
     Attributes:
-        frames: how many came without the target; 0: no picture came at all.
+        frames_without_target: 0 if no picture came at all.
     """
 
     start_s: float
     end_s: float
-    regained: bool
-    frames: int
+    is_regained: bool
+    frames_without_target: int
 
     @property
     def duration_s(self) -> float:
@@ -120,7 +120,7 @@ class TargetLoss:
 
 
 def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
-    """Find all losses in order. At the ceiling no picture is evaluated, so there are none."""
+    """Return all losses in order; none at the ceiling, where no pictures are evaluated."""
     stays = log.phases
     starts_s = [float(t_s) for t_s in frames.times_with_target_s]
     ends_s = [*starts_s[1:], log.end_s]

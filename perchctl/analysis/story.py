@@ -37,7 +37,7 @@ MOTORS = {"stop": "The motors were stopped", "emergency": "The motors were cut a
 
 @dataclass(frozen=True)
 class Sentence:
-    """What happened at a time, s from the first tick; `grade`: step, good, warn or bad."""
+    """An event of the flight at `t_s` after the first tick; `grade`: step, good, warn or bad."""
 
     t_s: float
     text: str
@@ -45,12 +45,12 @@ class Sentence:
 
 
 def tell_story(flight: FlightAnalysis) -> tuple[Sentence, ...]:
-    """Tell the whole flight in order; empty for a log without ticks."""
+    """Return the events of a flight in order of time; empty for a log without ticks."""
     if not flight.log.records:
         return ()
     told = [
         *(_step(flight, stay) for stay in flight.log.phases),
-        *map(_loss, flight.losses),
+        *map(_loss, flight.target_losses),
         *_holds(flight),
         *_taken_over(flight),
         *(Sentence(max(0.0, t_s), _upper(note)) for t_s, note in flight.notes if note),
@@ -84,19 +84,20 @@ def _grade(stay: PhaseSpan) -> str:
 
 
 def _where(flight: FlightAnalysis, t_s: float) -> str:
-    up_m = flight.at(t_s, "ez_m")
-    aside_m = math.hypot(flight.at(t_s, "ex_m"), flight.at(t_s, "ey_m"))
+    up_m = flight.value_at(t_s, "ez_m")
+    aside_m = math.hypot(flight.value_at(t_s, "ex_m"), flight.value_at(t_s, "ey_m"))
     if not math.isfinite(up_m + aside_m):
         return ""
     return f", {length_text(up_m)} below the target and {length_text(aside_m)} off centre"
 
 
 def _loss(loss: TargetLoss) -> Sentence:
-    for_s = f"for {loss.duration_s:.1f} s" if loss.regained else "and not seen again"
-    if loss.frames:
-        text = f"The target was lost {for_s}: {count_text(loss.frames, 'frame')} without it"
+    for_s = f"for {loss.duration_s:.1f} s" if loss.is_regained else "and not seen again"
+    if loss.frames_without_target:
+        count = count_text(loss.frames_without_target, "frame")
+        text = f"The target was lost {for_s}: {count} without it"
     else:
-        text = f"No picture that could be used came {for_s if loss.regained else 'any more'}"
+        text = f"No picture that could be used came {for_s if loss.is_regained else 'any more'}"
     return Sentence(loss.start_s, text, "warn")
 
 
@@ -128,7 +129,7 @@ def _end(flight: FlightAnalysis) -> Iterator[Sentence]:
     end, phases, end_s = flight.summary, flight.log.phases, flight.log.end_s
     if flight.log.summary is None:
         text = f"The log ends here, in {phases[-1].phase if phases else '?'}"
-        height_m = flight.at(end_s, "z_m") - flight.at(0.0, "z_m")
+        height_m = flight.value_at(end_s, "z_m") - flight.value_at(0.0, "z_m")
         if phases and phases[-1].phase in FLYING | {"LANDING"} and math.isfinite(height_m):
             text += f" at {length_text(height_m)}"
         text += ": how the flight ended is not known, its program was ended"

@@ -168,8 +168,8 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
 def calibration_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
-    """Return the file's text; `notes` are further keys (ROS readers pass over them), arrays (n,
-    m)."""
+    """Return the content of a calibration file; `notes` are further keys, which ROS readers ignore;
+    arrays are (n, m)."""
     # ROS wants five coefficients of plumb_bob.
     short = camera.model == "plumb_bob" and camera.dist.size == 4
     entries: dict[str, str | float | int | Array] = {

@@ -26,11 +26,11 @@ _LEAST_SHARE = 5e-4  # of the picture, for a part of the gear
 _CLOSED_PX, _EDGE_PX = 7, 3  # gaps that are gear; blur around it
 
 
-def learn_gear(
+def learn_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
-    """Return which pixels (h, w) the vehicle covers, by the pictures of a recording, or of a live
-    camera for `LIVE_S` or until `stopped`.
+    """Return the mask (h, w) of the pixels that the vehicle covers, by the pictures of a recording,
+    or of a live camera for `LIVE_S` or until `stopped`.
 
     Raises:
         InvalidValue: too few pictures, unequal sizes, too little motion, or nothing found.

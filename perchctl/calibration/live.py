@@ -16,15 +16,15 @@ GONE_AFTER_S = 3.0
 
 @dataclass(frozen=True, eq=False)
 class GuidedFrame:
-    """What a guided recording shows a person with a frame.
+    """A frame of a guided recording, with the guidance shown beside it.
 
     Attributes:
         index, image: the frame's number and picture (h, w).
-        outlines: kind and corners (n, 2) px of what was found in it.
-        rows: name, text, and a share 0..1 for a bar (None: no bar) of each value to show.
-        advice: the one thing to do now.
-        line: the state in one line, for a pipe.
-        taken: the recording keeps this frame.
+        outlines: kind and corners (n, 2) px of each detection.
+        rows: name, text and bar length 0..1 (None: no bar) of each value to show.
+        advice: what to do now.
+        status_line: the state in one line, for output to a pipe.
+        taken: True if the recording keeps this frame.
     """
 
     index: int
@@ -32,14 +32,14 @@ class GuidedFrame:
     outlines: tuple[tuple[str, Array], ...]
     rows: tuple[tuple[str, str, float | None], ...]
     advice: str
-    line: str
+    status_line: str
     taken: bool = False
 
 
 def poll_frames(
     source: FrameSource, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> Iterator[tuple[float, Frame | None]]:
-    """Yield the time and the new frame, or None, at each poll of a source, until it has ended.
+    """Poll a source until it has ended; yield the time of each poll with the new frame, or None.
 
     Raises TimedOut: the source reports a problem, and gave no frame for `GONE_AFTER_S`.
     """

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera.jpeg import decode_grey, jpeg_extent
+from perchctl.camera.jpeg import decode_grey, jpeg_end_and_size
 from perchctl.camera.source import Clock, LiveSource
 
 PORT = 5000
@@ -61,7 +61,7 @@ class _Picture:
             return None
         if not self.is_jpeg:
             return np.frombuffer(data, np.uint8).reshape(shape)
-        is_whole = jpeg_extent(data) == (len(data), (self.width, self.height))
+        is_whole = jpeg_end_and_size(data) == (len(data), (self.width, self.height))
         image = decode_grey(data) if is_whole else None
         return image if image is not None and image.shape == shape else None
 
@@ -69,9 +69,10 @@ class _Picture:
 class AiDeckSource(LiveSource):
     """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG pictures.
 
-    A picture's time is that of its first byte less `latency_s`: the deck sends the header as soon
-    as it is taken, and the transfer (60 ms and more for a raw one) hangs on the air. Its age of
-    arrival is the last byte's. A partial picture is dropped; what is no packet ends the connection.
+    A picture's time is its first byte's arrival minus `latency_s`, as the deck sends the header on
+    exposure; the transfer takes 60 ms and more for a raw picture. Its arrival time is that of
+    the last byte. Incomplete pictures are dropped; an invalid packet ends the connection, and the
+    source reconnects.
     """
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
@@ -156,21 +157,22 @@ _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 def has_mosaic(image: NDArray[np.uint8]) -> bool:
-    """Return whether the pixels of the four places of a two by two pattern differ in brightness."""
+    """True if the mean brightness differs between the four pixels of a 2x2 colour mosaic."""
     means = [float(image[row::2, column::2].mean()) for row in (0, 1) for column in (0, 1)]
     return max(means) - min(means) > max(LEAST_SHARE * sum(means) / 4.0, LEAST_LEVELS)
 
 
 def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return each pixel's grey with its neighbours: a quarter red, half green, a quarter blue.
+    """Return the picture smoothed to grey: a quarter red, half green, a quarter blue.
 
-    The weights 1 2 1 along rows and columns cancel what repeats every two pixels, in a JPEG too.
+    The weights 1 2 1 along rows and columns cancel any pattern with a period of two pixels, so this
+    works for each order of the colour filters, and for a JPEG.
     """
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_8U, _KERNEL, _KERNEL), np.uint8)
 
 
 class MosaicFilter:
-    """Takes the mosaic out of a stream's pictures, from the first picture that shows one."""
+    """Removes the colour mosaic from a stream's pictures, once a picture has shown one."""
 
     def __init__(self) -> None:
         self._in_a_row = 0

@@ -16,8 +16,8 @@ _SECRET = re.compile(
 
 
 def without_password(text: str) -> str:
-    """Return the text without the names and passwords of its URLs, and without what stands behind
-    ``password=`` and its like; other text as it is. In doubt it leaves out too much."""
+    """Return the text without user names and passwords in URLs, and without the values of
+    ``password=`` and similar keys. In doubt too much is removed."""
     if start := _URL.match(text):  # all of it is one URL, spaces in the password too
         text = start.group() + _without_name(text[start.end() :])
     else:
@@ -35,7 +35,8 @@ def _without_name(rest: str) -> str:
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """Return all keys of the profile for JSON, without a password: it opens no camera with one."""
+    """Return all keys of the profile for JSON, with passwords removed: a profile read back from it
+    cannot open a camera that needs one."""
     record = profile.model_dump(mode="json")
     record["camera"]["source"] = without_password(profile.camera.source)
     return record | {"description": without_password(profile.description)}

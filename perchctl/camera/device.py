@@ -26,7 +26,7 @@ def open_video_capture(
     place: str, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> Any:
     """Return an opened cv2.VideoCapture of `camera_number(place)`, set to that size and to the
-    profile's format and rate. Raises NotFound with the cameras that exist."""
+    format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
         raise NotFound(f"camera:{number} was not found; {_there(find_cameras())}")
@@ -44,7 +44,7 @@ def open_video_capture(
 def configure_capture(
     capture: Any, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> None:
-    """Set format, then size, then rate, as what each may be hangs on the one before."""
+    """Set format, size and rate in this order, as each limits the next."""
     if config is not None and config.format is not None:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.format.ljust(4)))
     if size_px is not None:
@@ -103,7 +103,8 @@ NAMES = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class ConnectedCamera:
-    """`stable_path` names it in any socket, if there is one; `problem`: why it does not open."""
+    """A camera of this computer. `stable_path`: link that is the same at every port, if any;
+    `problem`: why it cannot be opened."""
 
     number: int
     name: str = ""
@@ -117,8 +118,8 @@ class ConnectedCamera:
 
 
 def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[ConnectedCamera]:
-    """Return this computer's cameras by their numbers: of each its first node, as the others often
-    give no pictures. Nothing is opened."""
+    """Return this computer's cameras in order of number, each with its first video node, as others
+    often give no pictures. Nothing is opened."""
     stable: dict[int, str] = {}
     for link in sorted((devices / "v4l" / "by-id").glob("*")):
         for number in _video_numbers([link.resolve()]):
@@ -147,10 +148,10 @@ def _of_system(number: int, attribute: str, names: Path) -> str:
 
 
 def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> int:
-    """Return the N of what stands behind ``camera:``: a number, a name or a part of one (quotes
-    and capitals do not matter), or a path of the device.
+    """Return the number of the camera that the text after ``camera:`` names: a number, a name or
+    part of a name (quotes and case do not matter), or a device path.
 
-    Errors: InvalidValue, several that fit; NotFound.
+    Errors: InvalidValue if several cameras match; NotFound.
     """
     wanted = text.strip().strip("\"'").strip()
     if wanted.isascii() and wanted.isdigit():

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.jpeg import decode_grey, jpeg_extent
+from perchctl.camera.jpeg import decode_grey, jpeg_end_and_size
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision import Frame
@@ -22,7 +22,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 
 
 class RecordedSource:
-    """What the two recordings share; `_read` gives the next picture and its time, or None.
+    """Base of the recorded sources; `_read` returns the next picture and its time, or None.
 
     `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown. `paths`:
     the files of pictures, in the order of their frames' indices; empty of a video.
@@ -70,7 +70,7 @@ class RecordedSource:
 
 
 class VideoSource(RecordedSource):
-    """A video file; times from the container where they rise, else from its rate."""
+    """A video file; times are the container's if they increase, else from the frame rate."""
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
@@ -139,7 +139,7 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """
     # Decoders fill the rest with grey, and say so on stderr without the file's name.
     png_ends = not data.startswith(b"\x89PNG") or b"IEND" in data
-    jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_extent(data) is not None
+    jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_end_and_size(data) is not None
     if not (png_ends and jpeg_ends):
         raise ValueError("is cut off")
     image = decode_grey(data)

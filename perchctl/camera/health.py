@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from perchctl.vision import Frame
 
-Kind = Literal["ok", "repeated", "frozen", "snow", "uniform", "dark"]
+FrameKind = Literal["ok", "repeated", "frozen", "snow", "uniform", "dark"]
 
-VERDICT_TEXTS: dict[Kind, str] = {
+VERDICT_TEXTS: dict[FrameKind, str] = {
     "ok": "the picture is usable",
     "repeated": "the same picture as before",
     "frozen": "the picture stands still",
@@ -44,12 +44,12 @@ class FrameHealth:
         self._picture: NDArray[np.uint8] | None = None
         self._changed_s = 0.0
 
-    def assess(self, frame: Frame, live: bool = True) -> Kind:
-        """Judge the next frame: it is a measurement only if it is "ok".
+    def assess(self, frame: Frame, live: bool = True) -> FrameKind:
+        """Classify the next frame; only "ok" frames are measurements.
 
-        A camera's noise makes each live picture differ, so equal bytes mean that the receiver or
-        stream repeats an old one, as does `Frame.repeated`, which is never frozen for that alone.
-        Recordings (`live` false) may have equal pictures.
+        Noise makes each live picture differ from the last one, so identical bytes mean that the
+        receiver or the stream repeats a picture. `Frame.repeated` frames count as repeated, too,
+        but not as frozen. In recordings (`live` False) identical pictures are accepted.
         """
         before, self._picture = self._picture, frame.image
         if live and before is not None and same_bytes(before, frame.image):
@@ -61,8 +61,8 @@ class FrameHealth:
         return picture_kind(frame.image)
 
 
-def picture_kind(image: NDArray[np.uint8]) -> Kind:
-    """Return what the picture shows, judged by every eighth line and the second after it."""
+def picture_kind(image: NDArray[np.uint8]) -> FrameKind:
+    """Classify a picture by its content, from a sample of its lines."""
     height = image.shape[0]
     first = image[: max(height - 2, 1) : 8]
     mean, sigma = (float(each[0, 0]) for each in cv2.meanStdDev(first))
@@ -94,8 +94,7 @@ Grey = NDArray[np.uint8]
 
 
 def same_bytes(one: Grey, other: Grey) -> bool:
-    """Return whether both are one picture to the last bit. A row that differs ends the
-    comparison."""
+    """True if both pictures are identical; stops at the first row that differs."""
     middle = len(one) // 2
     return (
         one.shape == other.shape

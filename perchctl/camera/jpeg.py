@@ -25,11 +25,12 @@ _SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Start of frame: behind its length and precision stand height and width."""
 
 
-def jpeg_extent(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
-    """Return the length of the JPEG at the start of `data`, and the width and height that it says;
-    None if it is incomplete.
+def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
+    """Return the length of the JPEG at the start of `data`, and its width and height; None if it is
+    incomplete.
 
-    Of a damaged one return where its structure breaks, and no size: (0, 0).
+    For a damaged JPEG (a marker is missing, or another picture begins) return the offset of the
+    damage, and (0, 0) as size.
     """
     at, size_px, in_scan = 2, (0, 0), False
     while True:
@@ -60,14 +61,16 @@ def jpeg_extent(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
 class JpegSplitter:
     """Cuts a byte stream into whole JPEG pictures.
 
-    It follows the JPEG's structure, so wrong headers do no harm, and a picture is out at its end.
+    It follows the structure of the JPEGs, not the multipart headers, so wrong lengths and bad or
+    missing headers do no harm, and a picture is complete with its last byte.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[tuple[bytes, tuple[int, int]]]:
-        """Append bytes; return the pictures complete now, oldest first, with width and height."""
+        """Append bytes; return the pictures completed by them, oldest first, each as JPEG bytes and
+        (width, height)."""
         self._buffer += data
         pictures: list[tuple[bytes, tuple[int, int]]] = []
         if self._buffer.find(_END, max(len(self._buffer) - len(data) - 1, 0)) < 0:
@@ -75,7 +78,7 @@ class JpegSplitter:
             return pictures  # no picture ends in what is new
         while (start := self._buffer.find(_START)) >= 0:
             del self._buffer[:start]
-            extent = jpeg_extent(self._buffer)
+            extent = jpeg_end_and_size(self._buffer)
             if extent is None:
                 break
             end, size_px = extent

@@ -43,8 +43,9 @@ _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    It gives up at once where the server wants another name and password. They are sent once asked
-    for, digest (MD5) or basic, and to no address that it redirects to. No proxy is used.
+    It also gives up at once if the server rejects name and password. These are sent only when the
+    camera asks for them (digest with MD5, or basic), and never to a redirected address. Proxy
+    settings are ignored.
     """
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
@@ -136,9 +137,10 @@ _OPTIONS = {
 
 
 class TransferDelay:
-    """Estimates a picture's extra transfer time over the fastest one of the last ten seconds.
+    """Estimates a picture's extra transfer time over the fastest picture of the last 10 s.
 
-    Pure. Pictures that queue behind a stalled radio arrive in a burst and would look just taken.
+    The delay is found from the camera's timestamps. Without it, pictures that arrive in a burst
+    after a radio stall would seem to be new.
     """
 
     def __init__(self) -> None:
@@ -164,7 +166,7 @@ class TransferDelay:
 class RtspSource(LiveSource):
     """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
 
-    Given up at once, too, where the camera wants another name and password.
+    It also gives up at once if the camera rejects name and password.
     """
 
     connect_timeout_s = 5.0

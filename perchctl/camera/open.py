@@ -33,7 +33,8 @@ FIRST_FRAME_WITHIN_S = 8.0
 
 @dataclass(frozen=True)
 class SourceName:
-    """A source by `scheme` (of `SCHEMES`) and `place` behind the colon; it shows no password."""
+    """A parsed source text. `scheme`: one of `SCHEMES`; `place`: the text after the colon. `str()`
+    of it shows no password."""
 
     scheme: str
     place: str

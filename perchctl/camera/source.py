@@ -21,8 +21,9 @@ from perchctl.vision import CameraModel, Frame
 class NewestSlot:
     """Keeps the newest picture, with the time of its first arrival.
 
-    A receiver's repeat never replaces an untaken picture, which would look younger than it is.
-    Later it has the same index and `Frame.repeated`: a sign of life, not a measurement.
+    A picture that the receiver repeats does not replace one that was not taken yet, so its arrival
+    time stays. Once that was taken, the repeat is given with the same index and `Frame.repeated`:
+    a sign of life, not a measurement.
     """
 
     def __init__(self) -> None:
@@ -42,7 +43,7 @@ class NewestSlot:
             self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)
 
     def take(self) -> Frame | None:
-        """Return the kept frame once; None if no picture came since."""
+        """Return the newest frame; None if it was returned already."""
         frame, self._frame = self._frame, None
         return frame
 
@@ -97,10 +98,10 @@ def to_grey(image: Any) -> Grey:
 
 
 def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str) -> None:
-    """Raises InvalidValue when frames and calibration differ in size.
+    """Raises InvalidValue if frames and calibration differ in size.
 
-    Frames are not scaled to fit: cropped and scaled modes of a camera look the
-    same by their size's ratio, but need different calibrations.
+    Frames are not scaled to fit: cropped and scaled modes of a camera may have the same aspect
+    ratio, but need different calibrations.
     """
     if size_px is None or size_px == camera.size_px:
         return
@@ -124,10 +125,10 @@ def describe_error(error: Exception) -> str:
 
 
 class LiveSource:
-    """Newest-frame slot between a reading thread and the loop.
+    """A live source: a thread reads the camera, and the loop polls the newest frame.
 
-    A subclass has `_connection`, which opens the camera and reads it. It is called again
-    `reconnect_wait_s` after it ended, until `max_failures` in a row have brought no picture.
+    A subclass defines `_connection`, which opens and reads the camera. It is called again
+    `reconnect_wait_s` after it ended, until `max_failures` in a row brought no picture.
     """
 
     live = True
@@ -176,7 +177,7 @@ class LiveSource:
         self._thread.start()
 
     def wait_first_frame(self, timeout_s: float) -> bool:
-        """Wait until the first frame is there; False when it fails or stays away so long."""
+        """Wait for the first frame; False if the source fails or the time is over."""
         self._first.wait(timeout_s)
         return self._arrived > 0
 
@@ -238,8 +239,8 @@ class LiveSource:
 
 
 class WrappedSource:
-    """A source around another one. Each frame is shown to `change`, which must not raise, and may
-    return a frame to be given instead."""
+    """Wrapper of a source. Each frame of the inner source is passed to `change`, which must not
+    raise and may return a frame to give instead; all else is the inner source's."""
 
     def __init__(
         self, source: FrameSource, change: Callable[[Frame], Frame | None] = lambda frame: None
@@ -277,7 +278,7 @@ class WrappedSource:
 
 
 def mirrored_note(config: CameraConfig) -> str:
-    """Say that the picture is mirrored, and behind a colon what to do with this profile."""
+    """Return a sentence: the picture is mirrored, and how to correct this profile."""
     advice = "switch that off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror, so take camera.mirrored out of the profile"
@@ -285,5 +286,5 @@ def mirrored_note(config: CameraConfig) -> str:
 
 
 def unmirror_frame(frame: Frame) -> Frame:
-    """Return the frame flipped left to right; it is no longer the JPEG that came."""
+    """Return the frame flipped left to right, without its original JPEG bytes."""
     return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)

@@ -47,15 +47,17 @@ _LIBRARIES = ("numpy", "mujoco-core", "filterpy", "distributed")
 
 @dataclass(frozen=True)
 class WorkerRequirements:
-    """What each worker must have: `campaign` is a name of its own, `state` decides a flight."""
+    """What each worker of a campaign must have; sent with each flight. `campaign_id` is unique;
+    `environment`: versions and hashes by name, which must be those of this computer."""
 
-    campaign: str
+    campaign_id: str
     profiles: tuple[Profile, ...]
-    state: dict[str, str]
+    environment: dict[str, str]
 
 
-def process_state(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """Return program, libraries, `profiles` with files, and flights at a time."""
+def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
+    """Return what a flight's result depends on, by name: versions of perchctl and its libraries,
+    hashes of the `profiles`, and the number of `threads`."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
         "python": ".".join(platform.python_version_tuple()[:2]),
@@ -68,7 +70,7 @@ def process_state(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
 
 def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
     """Return the requirements of a campaign that begins now."""
-    state = process_state(profiles, threads=1)
+    state = flight_environment(profiles, threads=1)
     return WorkerRequirements(secrets.token_hex(16), tuple(profiles), state)
 
 
@@ -76,23 +78,23 @@ _differences: dict[str, str] = {}
 """In what this worker differs from what its campaigns require, by campaign; empty: in nothing."""
 
 
-def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
-    """Call the pickled function with its arguments, after verifying a worker that is new.
-    Errors: InvalidValue if this worker must not fly; whatever the flight raises."""
+def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
+    """Run the pickled call of a flight, after verifying this worker once per campaign. Errors:
+    InvalidValue for a worker that must not fly; those of the flight."""
     worker = get_worker()
-    if required.campaign not in _differences:
-        here = process_state(required.profiles, worker.state.nthreads)
-        _differences[required.campaign] = ", ".join(
+    if requirements.campaign_id not in _differences:
+        here = flight_environment(requirements.profiles, worker.state.nthreads)
+        _differences[requirements.campaign_id] = ", ".join(
             f"{name} {here[name]} instead of {wanted}"
-            for name, wanted in required.state.items()
+            for name, wanted in requirements.environment.items()
             if here[name] != wanted
         )
-    if difference := _differences[required.campaign]:
+    if difference := _differences[requirements.campaign_id]:
         raise InvalidValue(
             f"worker {worker.address} on {platform.node()} has {difference}: make it the same "
             f"there, and start it again"
         )
-    fn, args, named = pickle.loads(order)
+    fn, args, named = pickle.loads(pickled_call)
     return fn(*args, **named)
 
 
@@ -100,17 +102,17 @@ def fly_verified(order: bytes, required: WorkerRequirements) -> Any:
 
 
 class ClusterExecutor(Executor):
-    """An executor on a dask cluster, which flies the flight of a lost worker again. A future fails
-    with an error of `lost` if that happened too often, with InvalidValue if the worker must not
-    fly, and is cancelled if the scheduler is lost."""
+    """An executor of flights on the workers of a dask cluster, which repeats the flights of a lost
+    worker. A future fails with an error of `lost` if its workers were lost too often, with
+    InvalidValue if its worker must not fly; it is cancelled with the scheduler."""
 
     lost = (KilledWorker,)
 
-    def __init__(self, client: Client, required: WorkerRequirements) -> None:
-        self._executor, self._required = client.get_executor(pure=False), required
+    def __init__(self, client: Client, requirements: WorkerRequirements) -> None:
+        self._executor, self._required = client.get_executor(pure=False), requirements
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Return the future of a flight."""
+        """Send a flight to the cluster, and return its future."""
         order = pickle.dumps((fn, args, kwargs))
         future: Future[R] = self._executor.submit(fly_verified, order, self._required)
         return future
@@ -118,8 +120,8 @@ class ClusterExecutor(Executor):
 
 @contextlib.contextmanager
 def cluster_pool(address: str, profiles: Sequence[Profile]) -> Iterator[Executor]:
-    """Yield an executor of the workers of the scheduler at `address` (``HOST:PORT`` or
-    ``tcp://HOST:PORT``), which have this computer's program and its data for these `profiles`.
+    """Yield an executor on the workers of the scheduler at `address` (``HOST:PORT`` or
+    ``tcp://HOST:PORT``), which must have the same program and profile files as this computer.
     Errors: UsageError, ConnectionFailed."""
     if not os.environ.get("PERCHCTL_DEBUG"):
         for name in (*_QUIET, *logging.root.manager.loggerDict):

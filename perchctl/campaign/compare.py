@@ -29,7 +29,7 @@ from perchctl.campaign.results import (
 )
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.plain_yaml import clip_text, split_values
-from perchctl.profile import Profile, changed_profile, profile_value, scalar_text
+from perchctl.profile import Profile, apply_settings, profile_value, yaml_scalar
 
 
 def fly_variants(
@@ -38,7 +38,7 @@ def fly_variants(
     executor: Executor | None = None,
     on_result: Callable[[FlightResult], None] = lambda result: None,
 ) -> list[FlightResult]:
-    """Fly each seed by all profiles before the next seed; arguments and errors as of `fly_all`."""
+    """Fly each seed with all profiles, then the next seed; else as `fly_all`."""
     variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
@@ -49,16 +49,16 @@ def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> FlightResul
 
 
 def results_by_seed(
-    results: Iterable[FlightResult], profiles: int
+    results: Iterable[FlightResult], profile_count: int
 ) -> list[tuple[FlightResult, ...]]:
-    """Return, in the order of the seeds, the results of each seed that all profiles have flown."""
+    """Return, in order of seed, the results of each seed that was flown with all profiles."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
         by_seed.setdefault(each.seed, {})[each.variant] = each
     return [
-        tuple(flown[number] for number in range(profiles))
+        tuple(flown[number] for number in range(profile_count))
         for _, flown in sorted(by_seed.items())
-        if len(flown) == profiles
+        if len(flown) == profile_count
     ]
 
 
@@ -93,15 +93,15 @@ MISS = ("miss_m",)
 
 
 def compare_variants(results: Iterable[FlightResult]) -> Comparison:
-    """Return the comparison of two profiles by the seeds that both have flown."""
+    """Return the comparison of two profiles over the seeds flown with both."""
     return compare_pairs([(a, b) for a, b in results_by_seed(results, 2)])
 
 
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """Return the comparison of two flights per seed. `comparisons`: the number of comparisons
-    that share the 5 %."""
+    """Return the comparison of two flights per seed. `comparisons`: how many share the 5 %
+    significance level."""
     questions = comparisons * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
@@ -150,7 +150,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
-    """Return the comparison as a table, followed by what is proven."""
+    """Return the comparison as a table, with the proven differences below."""
     flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
@@ -189,15 +189,16 @@ def _verdict(better: str | None, by: str = "") -> str:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The profiles of a sweep, one for each value of a key; the last one is the profile's own."""
+    """The profiles of a sweep, one for each value of a key; the last has the original value."""
 
     key: str
     profiles: tuple[Profile, ...]
 
     def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
-        """Return each value's figures (a cell) for JSON, over the seeds flown with all. `best`:
-        most successes, then the smallest median miss; `best_against_own`: the `Comparison` of the
-        own value, A, with it; None where they are the same."""
+        """Return the figures of each value (a cell) for JSON, over the seeds flown with all values.
+        `best`: the value with the most successes, then the smallest median miss;
+        `best_against_own`: `Comparison` of the original value (A) with `best` (B), None if these
+        are the same."""
         seeds = results_by_seed(results, len(self.profiles))
         own = len(self.profiles) - 1
         cells = [
@@ -213,14 +214,14 @@ class Sweep:
         return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
 
     def text(self, record: dict[str, Any]) -> str:
-        """Return the table of a sweep's `record`, and how the best value compares."""
+        """Return a sweep's `record` as a table, with the comparison of the best value."""
         rows: list[tuple[str, ...]] = [(self.key, "success", "miss [mm]: median", "p95", "")]
         for cell in record["cells"]:
             misses = ("-" if m is None else f"{1e3 * m:.1f}" for m in cell["miss_m"].values())
             rate = rate_text(cell["good"], cell["flights"])
             note = "own" if cell["own"] else ""
-            rows.append((scalar_text(cell["value"]), rate, *misses, note))
-        lines = [*align_columns(rows), "", f"best: {scalar_text(record['best'])}"]
+            rows.append((yaml_scalar(cell["value"]), rate, *misses, note))
+        lines = [*align_columns(rows), "", f"best: {yaml_scalar(record['best'])}"]
         if record["best_against_own"] is not None:
             lines += [f"picked out of {len(rows) - 1}, which is counted:"]
             lines += [comparison_text(("own", "best"), record["best_against_own"])]
@@ -228,7 +229,8 @@ class Sweep:
 
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
-    """Return the sweep of ``key=value,value``. Errors: UsageError, InvalidValue."""
+    """Return the sweep of the text ``key=value,value``, values as in a profile file. Errors:
+    UsageError, InvalidValue."""
     key, equals, text = (part.strip() for part in sweep.partition("="))
     try:
         texts = list(split_values(text))
@@ -239,7 +241,7 @@ def make_sweep(profile: Profile, sweep: str) -> Sweep:
             f"{clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
             f"planner.align.xy_m=0.02,0.04"
         )
-    profiles = [changed_profile(profile, [f"{key}={text}"], "sweep") for text in texts]
+    profiles = [apply_settings(profile, [f"{key}={text}"], "sweep") for text in texts]
     others = [p for k, p in enumerate(profiles) if p not in (profile, *profiles[:k])]
     return Sweep(key, (*others, profile))
 

@@ -36,7 +36,8 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
-    """Call `fly` with the seed's scenario on one core; add CPU time and scenario to its result."""
+    """Call `fly` on one core with the scenario drawn from `seed`, and return its result (a
+    dataclass) with CPU time and scenario filled in. Frees the flight's memory."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
     cpu_began_s = time.process_time()
     scenario = draw_scenario(profile, seed)
@@ -73,7 +74,7 @@ def fly_seed(
         summary = None if log is None else flight.close_log(log)
         return FlightResult(
             seed=seed,
-            outcome=OUTCOMES[flight.end],
+            outcome=OUTCOMES[flight.final_phase],
             reason=flight.report.reason,
             miss_m=flight.perched_miss_m,
             time_s=flight.report.duration_s,
@@ -107,11 +108,12 @@ def fly_all(
     executor: Executor | None = None,
     on_result: Callable[[R], None] = lambda result: None,
 ) -> list[R]:
-    """Return `fly` of each seed, each once, in the order of the seeds; `on_result` gets them as
-    they are done.
+    """Call `fly` on each seed; return the results in the order of the seeds. `on_result` is called
+    with each result as it comes.
 
-    `executor` None flies here; its `lost`, if any, names the errors of a future whose process was
-    lost. Errors: PerchError, as soon as one flight fails.
+    `executor`: as in `concurrent.futures`, or None for this process; its optional attribute `lost`
+    lists the exceptions of a future whose flight was lost with its process. Errors: PerchError, as
+    soon as one flight fails.
     """
     seeds = list(dict.fromkeys(seeds))
     by_seed: dict[K, R] = {}

@@ -27,14 +27,14 @@ class FlightProcesses(ProcessPoolExecutor):
         resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Return the future of a flight, which waits for a free process."""
+        """Queue a flight for the next free process, and return its future."""
         with defer_interrupts():  # threads and processes inherit the mask of who starts them
             return super().submit(fn, *args, **kwargs)
 
 
 @contextlib.contextmanager
 def flight_processes(jobs: int) -> Iterator[Executor]:
-    """Yield an executor of `jobs` processes; an exception ends them where they are."""
+    """Yield an executor with `jobs` processes, which are killed on an exception."""
     pool, others = FlightProcesses(jobs), set(multiprocessing.active_children())
     try:
         yield pool
@@ -48,8 +48,9 @@ def flight_processes(jobs: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM during the block; what it starts never sees them. Python's
-    handlers are replaced, too: a library's thread may take the signal."""
+    """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started in it
+    never get them. Python's handlers are replaced, too, as a thread of a library may take the
+    signal."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     came: list[int] = []
     handlers: dict[signal.Signals, Any] = {}

@@ -25,9 +25,9 @@ class CampaignFlight:
     """Result of one flight: the fields that campaigns of all kinds share.
 
     Attributes:
-        log, log_problem: the flight's log, and what it lacks; None without.
+        log, log_problem: path of the flight's log, and why it is incomplete; or None.
         cpu_s: CPU time of the flight, s.
-        scenario: what the seed drew.
+        scenario: the scenario drawn from the seed.
     """
 
     seed: int
@@ -55,8 +55,8 @@ class FlightResult(CampaignFlight):
         time_s: duration of the flight in the loop's time.
         attempts: perching attempts, the successful one included.
         locked: the supervisor had locked the vehicle at the end.
-        fell: it hit the floor other than by landing.
-        variant: the number of the profile that flew it, where several are compared.
+        fell: the vehicle hit the floor other than by landing.
+        variant: index of the flown profile, if several are compared.
     """
 
     outcome: FlightEnd
@@ -102,14 +102,14 @@ def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
-    """Return the bad flights: aborted before landed before refused before perched, then by seed."""
+    """Return the bad flights, in order of outcome (aborted, landed, refused, perched) and seed."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
 
 
 def all_refused_error(results: Sequence[FlightResult]) -> SafetyAbort | None:
-    """Return the error of a campaign whose flights were all refused, which no seed can cause;
-    None for any other."""
+    """Return the error of a campaign whose flights were all refused (so the seeds are not the
+    cause); None for any other."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
     first = min(results, key=lambda r: r.seed)

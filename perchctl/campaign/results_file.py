@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, Generic, TypeVar
 import perchctl
 from perchctl.campaign.results import CampaignFlight
 from perchctl.errors import InvalidValue
-from perchctl.files import cannot_be_written, check_writable
+from perchctl.files import check_writable, write_error
 from perchctl.profile import Profile
 from perchctl.record import (
     camera_record,
@@ -30,7 +30,8 @@ R = TypeVar("R", bound=CampaignFlight)
 
 
 class CampaignResults(Generic[R]):
-    """A campaign's results: `earlier` ones from its file; `remaining` seeds are still to fly."""
+    """The results file of a campaign: `earlier` are the results read from it, `remaining` the seeds
+    still to be flown."""
 
     def __init__(
         self,
@@ -43,8 +44,7 @@ class CampaignResults(Generic[R]):
         self._file = file
 
     def write_result(self, result: R) -> None:
-        """Write the result of a flight, which is on the disk when this returns. Errors:
-        InvalidValue."""
+        """Append the result of a flight to the file, and sync it to disk. Errors: InvalidValue."""
         if self._file is not None:
             _write(self._file, {"kind": "flight", **to_exact_json(result)})
 
@@ -53,7 +53,7 @@ class CampaignResults(Generic[R]):
 def campaign_results(
     profile: Profile,
     seeds: Sequence[int],
-    kind: type[R],
+    result_type: type[R],
     *,
     faults: Sequence[str] | None = None,
     out: Path | None = None,
@@ -63,9 +63,9 @@ def campaign_results(
 ) -> Iterator[CampaignResults[R]]:
     """Yield the results of a campaign, which are appended to the file `out`.
 
-    An existing file is refused, with `force` replaced, and with `resume` gone on with: it must
-    have been flown with the same program, profile and faults. Errors: InvalidValue, also for a
-    `log_dir` that cannot be written to.
+    An existing file is refused, replaced with `force`, or continued with `resume`: then program,
+    profile and faults must be the same. Errors: InvalidValue, also for a `log_dir` that is not
+    writable.
     """
     if log_dir is not None:
         check_writable(log_dir / "flight.jsonl", force=True)
@@ -84,12 +84,12 @@ def campaign_results(
     with ExitStack() as stack:
         try:
             if resume and out.exists():
-                good = _read(out, header, kind, earlier)
+                good = _read(out, header, result_type, earlier)
             out.parent.mkdir(parents=True, exist_ok=True)
             file = stack.enter_context(out.open("ab", buffering=0))
             file.truncate(good)
         except OSError as error:
-            raise cannot_be_written(out, error) from None
+            raise write_error(out, error) from None
         if not good:
             _write(file, header)
         yield CampaignResults(seeds, earlier, file)
@@ -105,11 +105,11 @@ _MUST_AGREE = {"source": "program", "profile_sha256": "profile", "faults": "sele
 
 
 def campaign_header(profile: Profile, faults: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return what a campaign that begins now flies: the first line of its file.
+    """Return the first line of a new campaign's file.
 
-    `perchctl` is the version, `source` the hash of its source. `profile` is its name;
-    `profile_sha256` is of all its values but name and description, and of the calibration.
-    `faults` are the names that a fault is drawn from; None without.
+    `perchctl` is the version, `source` the hash of the source code, `profile` the profile's name,
+    `profile_sha256` the hash of calibration and profile without name and description. `faults`:
+    names of the faults to draw from, or None.
     """
     return {
         **_FORM,
@@ -130,7 +130,8 @@ def profile_sha256(profile: Profile) -> str:
 
 @cache
 def source_sha256(root: Path = SOURCE) -> str:
-    """Return the SHA-256 of all modules below `root`, taken once."""
+    """Return the SHA-256 of names and content of all modules below `root`; cached, so later changes
+    of the files do not count."""
     whole = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         whole.update(f"{path.relative_to(root).as_posix()}\n".encode())
@@ -148,10 +149,10 @@ def _write(file: BinaryIO, record: dict[str, Any]) -> None:
             line = line[file.write(line) :]
         os.fsync(file.fileno())
     except OSError as error:
-        raise cannot_be_written(Path(file.name), error) from None
+        raise write_error(Path(file.name), error) from None
 
 
-def _read(path: Path, header: dict[str, Any], kind: type[R], earlier: dict[int, R]) -> int:
+def _read(path: Path, header: dict[str, Any], result_type: type[R], earlier: dict[int, R]) -> int:
     """Add the flights of a file to `earlier` by their seeds, and return the length of its whole
     lines. Errors: InvalidValue if it is no file of results, or of another campaign."""
     data = path.read_bytes()
@@ -170,7 +171,7 @@ def _read(path: Path, header: dict[str, Any], kind: type[R], earlier: dict[int, 
             )
         if any(flight.pop("kind") != "flight" for flight in flights):
             raise ValueError("a line of it is no flight")
-        results = [from_exact_json(kind, flight) for flight in flights]
+        results = [from_exact_json(result_type, flight) for flight in flights]
     except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise InvalidValue(
             f"{path}: not the lines of a campaign's results ({error}): take the original, or name "

@@ -27,7 +27,7 @@ from perchctl.check.row import (
     worst_finding,
 )
 from perchctl.errors import PerchError
-from perchctl.flight import GroundCriteria, out_of_view
+from perchctl.flight import GroundCriteria, view_problem
 from perchctl.geometry import Place
 from perchctl.profile import Profile
 from perchctl.target import overhead_text
@@ -52,7 +52,7 @@ _ADVICE = {
 
 
 def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
-    """Return the rows of a camera that gives no picture."""
+    """Return the rows of a camera that fails: one failed, the others skipped."""
     found, semicolon, advice = str(error).rpartition("; ")
     if not semicolon:
         found, advice = str(error), "see docs/check.md; perchctl check --cameras lists the cameras"
@@ -61,7 +61,7 @@ def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
 
 
 def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) -> Finding:
-    """Judge the size of the pictures, which `FrameSource` knows from the first one on."""
+    """Compare the size of the pictures with the calibration's."""
     found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, wanted_px))
     if size_px == wanted_px:
         return passed(f"{found} px, as calibrated")
@@ -70,7 +70,7 @@ def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) ->
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """Judge what the pictures of a rehearsal show."""
+    """Return the rows on the pictures of a rehearsal."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = picture_row_names(profile)
@@ -197,7 +197,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     # The world of a level vehicle that stands at the origin, its front along x.
     gear_m = np.asarray(profile.vehicle.gear_body_m)
     place = Place(np.array(feet) + rehearsal.target.e_m + gear_m, rehearsal.target.e_yaw_rad)
-    problem = out_of_view(place, feet, 0.0, profile, camera)
+    problem = view_problem(place, feet, 0.0, profile, camera)
     if problem is not None:
         return failed(problem.found, problem.advice)
     return passed("now, and at take-off height")
@@ -215,7 +215,7 @@ def picture_row_names(profile: Profile) -> tuple[str, ...]:
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Judge the loop by the time for a picture, and by the turns that begin late."""
+    """Judge the loop by its processing time for a picture and by late turns."""
     if rehearsal is None or len(rehearsal.work_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:

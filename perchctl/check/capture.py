@@ -58,14 +58,15 @@ WILD_M = 0.1
 
 @dataclass(frozen=True)
 class CaptureSamples:
-    """Telemetry, capture's frames, and the capture's problem (or None) of one listening period."""
+    """Samples of one listening period: the vehicle's telemetry, the motion capture's frames, and
+    the motion capture's problem or None."""
 
     telemetry: tuple[Telemetry, ...] = ()
     frames: tuple[CaptureFrame, ...] = ()
     problem: str | None = None
 
     def body_poses(self, config: PositioningConfig) -> list[VehiclePose]:
-        """Return the vehicle's body at the moments of exposure, oldest first."""
+        """Return the vehicle's poses by the motion capture, corrected for latency, oldest first."""
         return [
             VehiclePose.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
             for frame in self.frames
@@ -74,20 +75,20 @@ class CaptureSamples:
 
 
 def collect_samples(
-    take: Callable[[], list[Telemetry]],
+    take_telemetry: Callable[[], list[Telemetry]],
     source: CaptureSource,
     clock: Callable[[], float],
     wait: Callable[[float], None],
-    for_s: float = CAPTURE_S,
+    duration_s: float = CAPTURE_S,
 ) -> CaptureSamples:
-    """Collect the vehicle's telemetry and the capture's frames for `for_s` seconds."""
+    """Collect the vehicle's telemetry and the capture's frames for `duration_s` seconds."""
     began_s = clock()
     telemetry: list[Telemetry] = []
     frames: list[CaptureFrame] = []
     source.poll(began_s)  # what came before is old
-    take()
-    while (now_s := clock()) - began_s < for_s:
-        telemetry.extend(take())
+    take_telemetry()
+    while (now_s := clock()) - began_s < duration_s:
+        telemetry.extend(take_telemetry())
         frame = source.poll(now_s)
         if frame is not None:
             frames.append(frame)
@@ -102,28 +103,28 @@ BODY_ROWS = ("body", "body place")
 
 
 def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
-    """Return the rows of a capture that could not be opened, or sends nothing."""
+    """Return the rows of a motion capture that cannot be opened or sends nothing."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
     return [Row("capture", *failed(why, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
 
-def mocap_rows_at_rest(heard: CaptureSamples, profile: Profile) -> list[Row]:
+def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
     """Judge the samples of a motion capture taken while the vehicle stood still."""
     config = profile.positioning
-    if not heard.frames:
-        return failed_capture_rows(heard.problem or f"{config.label} sends no frame", config)
+    if not samples.frames:
+        return failed_capture_rows(samples.problem or f"{config.label} sends no frame", config)
     first = Row("capture", *passed(f"{config.label} sends"))
-    places = heard.body_poses(config)
+    places = samples.body_poses(config)
     if not places:
-        others = sorted({name for frame in heard.frames for name in frame.bodies})
+        others = sorted({name for frame in samples.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
         body = failed(found, "correct positioning.body, or show it to the cameras")
         return [first, Row("body", *body), Row("body place", *skipped("the body is not seen"))]
-    body = _body(heard, places, profile)
-    return [first, Row("body", *body), Row("body place", *_place(heard, places, profile))]
+    body = _body(samples, places, profile)
+    return [first, Row("body", *body), Row("body place", *_place(samples, places, profile))]
 
 
-def _body(heard: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
+def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
@@ -135,7 +136,7 @@ def _body(heard: CaptureSamples, places: list[VehiclePose], profile: Profile) ->
     rate_hz = (len(times) - 1) / span_s if span_s > 0.0 else 0.0
     gap_s = max((b - a for a, b in itertools.pairwise(times)), default=math.inf)
     # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
-    share = 1.0 - len(places) / len(heard.frames)
+    share = 1.0 - len(places) / len(samples.frames)
     found = (
         f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, {rate_hz:.0f} Hz, "
         f"the longest gap {1e3 * gap_s:.0f} ms, noise {1e3 * sigma_m:.1f} mm"
@@ -156,10 +157,10 @@ def _body(heard: CaptureSamples, places: list[VehiclePose], profile: Profile) ->
     )
 
 
-def _place(heard: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
+def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
     """Judge the body's place by the criteria of `fly`."""
-    newest = heard.telemetry[-1] if heard.telemetry else None
-    place = places[-1].to_external(pose=True)
+    newest = samples.telemetry[-1] if samples.telemetry else None
+    place = places[-1].to_external(attitude=True)
     if newest is None:
         return skipped("it cannot be compared: no telemetry")
     criteria = GroundCriteria(newest, profile)
@@ -194,43 +195,44 @@ STRANGER = 0.4
 
 @dataclass(frozen=True, eq=False)
 class PairedMotion:
-    """Pairs of one moment: n attitudes by vehicle and by capture, the capture's places (n, 3), and
-    the accelerometer's largest difference from 1 g."""
+    """Attitudes at n common times by the vehicle and by the capture, its positions (n, 3), and
+    the accelerometer's largest deviation from 1 g."""
 
-    own: Rotation
-    seen: Rotation
-    place_m: Array
-    moved_g: float
+    R_vehicle: Rotation
+    R_capture: Rotation
+    places_m: Array
+    max_deviation_g: float
 
     @property
     def displacements_m(self) -> Array:
-        """Displacement of each place from the first, (n, 3)."""
-        return np.asarray(self.place_m - self.place_m[0])
+        """Displacement of each position from the first, (n, 3)."""
+        return np.asarray(self.places_m - self.places_m[0])
 
 
 @dataclass(frozen=True, eq=False)
 class FrameAlignment:
-    """A and B of the module's text, and the share of a turn that they leave unexplained."""
+    """Rotations A and B of the module's text, and the mean relative residual."""
 
-    world: Rotation
-    body: Rotation
-    unexplained: float
+    R_world: Rotation
+    R_body: Rotation
+    residual_share: float
 
     @property
     def vertical(self) -> Array:
-        """The vertical in the capture's world, (3,)."""
-        return np.asarray(self.world.as_matrix()[:, 2])
+        """Upward unit vector in the capture's world, (3,)."""
+        return np.asarray(self.R_world.as_matrix()[:, 2])
 
 
 def pair_motion(
-    telemetry: Sequence[Telemetry], places: Sequence[VehiclePose]
+    telemetry: Sequence[Telemetry], capture_poses: Sequence[VehiclePose]
 ) -> PairedMotion | None:
-    """Pair places and attitudes every `EVERY_S`; None for fewer than three pairs."""
+    """Pair poses of the motion capture, `EVERY_S` apart, with the vehicle's attitudes at their
+    times; None for fewer than three pairs."""
     if len(telemetry) < 2:
         return None
     history = History(tuple(telemetry))
     own, seen, place_m, last_s = [], [], [], -math.inf
-    for placed in places:
+    for placed in capture_poses:
         inside = telemetry[0].t_s <= placed.t_s <= telemetry[-1].t_s
         if not inside or placed.t_s < last_s + EVERY_S:
             continue
@@ -253,15 +255,20 @@ def pair_motion(
 
 
 def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """Solve A and B by pairs of moments; None for turns about fewer than two axes."""
-    i, j = np.triu_indices(len(moved.own), 1)
-    size = (moved.own[j] * moved.own[i].inv()).magnitude()
+    """Solve for both rotations from all pairs of times between which the vehicle turned; None if it
+    turned about fewer than two axes."""
+    i, j = np.triu_indices(len(moved.R_vehicle), 1)
+    size = (moved.R_vehicle[j] * moved.R_vehicle[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)
     if kept.sum() < 3:
         return None
     i, j, size = i[kept], j[kept], size[kept]
-    world_own, world_seen = ((R[j] * R[i].inv()).as_rotvec() for R in (moved.own, moved.seen))
-    body_own, body_seen = ((R[i].inv() * R[j]).as_rotvec() for R in (moved.own, moved.seen))
+    world_own, world_seen = (
+        (R[j] * R[i].inv()).as_rotvec() for R in (moved.R_vehicle, moved.R_capture)
+    )
+    body_own, body_seen = (
+        (R[i].inv() * R[j]).as_rotvec() for R in (moved.R_vehicle, moved.R_capture)
+    )
     if not _has_many_axes(world_own) or not _has_many_axes(body_own):
         return None
     world, _ = Rotation.align_vectors(world_seen, world_own)
@@ -283,14 +290,14 @@ def _turned_rad(attitudes: Rotation) -> Array:
 
 
 def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) -> Finding:
-    """Compare vehicle and capture, and return the gravest finding."""
+    """Compare vehicle and capture, and return the worst finding."""
     if moved is None:
         return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
-    own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.own, moved.seen))
+    own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.R_vehicle, moved.R_capture))
     way_m = float(np.linalg.norm(moved.displacements_m, axis=1).max())
     body = f"rigid body {config.body!r}"
     others = "it is another body's: correct positioning.body"
-    if own_rad <= MOVED_RAD and moved.moved_g <= MOVED_G:
+    if own_rad <= MOVED_RAD and moved.max_deviation_g <= MOVED_G:
         if way_m > MOVED_M or seen_rad > MOVED_RAD:
             return failed(f"the {body} moves, and the vehicle stands still", others)
         return skipped("it was not moved", HOW_TO_TURN)
@@ -303,7 +310,7 @@ def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) ->
     if turns is None:
         turned_deg = math.degrees(own_rad)
         return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
-    if turns.unexplained > STRANGER:
+    if turns.residual_share > STRANGER:
         advice = "it is another body's, or its markers are too few or too symmetric"
         return failed(f"the {body} does not turn as the vehicle does", advice)
     return _world_finding(turns, moved) or _body_finding(turns, moved, config)
@@ -344,10 +351,10 @@ def _world_finding(turns: FrameAlignment, moved: PairedMotion) -> Finding | None
 
 
 def _body_finding(turns: FrameAlignment, moved: PairedMotion, config: PositioningConfig) -> Finding:
-    off_deg = math.degrees(float(turns.body.magnitude()))
+    off_deg = math.degrees(float(turns.R_body.magnitude()))
     if off_deg > BODY_WARN_DEG:
         profiled = rotation_from_rpy(*(math.radians(a) for a in config.body_rpy_deg))
-        rpy = rpy_from_rotation(turns.body.as_matrix() @ profiled)
+        rpy = rpy_from_rotation(turns.R_body.as_matrix() @ profiled)
         wanted = ", ".join(f"{math.degrees(angle):.0f}" for angle in rpy)
         verdict = failed if off_deg > BODY_FAIL_DEG else warned
         return verdict(
@@ -369,23 +376,25 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """Say in one row whether `fly` finds this capture compared by hand; no row with decks, nor for
-    the simulator, whose room is right as it is built."""
+    """Return one row on whether `fly` finds a saved lift comparison with this motion capture; none
+    without a motion capture, or for the simulated vehicle."""
     if config.by != "mocap" or simulated:
         return []
     return [_record_row(config, uri, now)]
 
 
-def save_comparison_row(lifted: Finding, config: PositioningConfig, uri: str, now: datetime) -> Row:
-    """Write down what the hand found, and return its row. A lift that showed nothing is not
-    written."""
-    passes, vehicle = lifted.verdict is Verdict.PASS, vehicle_uri(uri)
-    if lifted.verdict is Verdict.SKIPPED:
+def save_comparison_row(
+    finding: Finding, config: PositioningConfig, uri: str, now: datetime
+) -> Row:
+    """Save the finding of a lift comparison for `fly`, unless it was skipped, and return the row on
+    what is saved."""
+    passes, vehicle = finding.verdict is Verdict.PASS, vehicle_uri(uri)
+    if finding.verdict is Verdict.SKIPPED:
         return _record_row(config, uri, now)
-    why = save_comparison(config, vehicle, now, passes, lifted.found)
+    why = save_comparison(config, vehicle, now, passes, finding.found)
     if why is None:
         return _record_row(config, uri, now)
-    if not passes and load_comparison(config, vehicle).flight_objection(now) is None:
+    if not passes and load_comparison(config, vehicle).objection_and_advice(now) is None:
         found = f"what was found could not be written, and fly goes by an older pass: {why}"
         advice = "free some space, or give back the right to write there; do not fly before"
         return Row(COMPARED, *failed(found, advice))
@@ -396,7 +405,7 @@ def save_comparison_row(lifted: Finding, config: PositioningConfig, uri: str, no
 
 def _record_row(config: PositioningConfig, uri: str, now: datetime) -> Row:
     record = load_comparison(config, vehicle_uri(uri))
-    objection = record.flight_objection(now)
+    objection = record.objection_and_advice(now)
     if objection is None:
         return Row(COMPARED, *passed(record.text(now)))
     found, advice = objection

@@ -38,10 +38,10 @@ LOOKS_UP = math.cos(math.radians(45.0))
 
 
 def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
-    """Return a row for each question, in the order in which they matter.
+    """Return a row for each check of the profile, the most important first.
 
-    `source` takes the place of the profile's. Opens no link and no camera; reads the calibration's
-    file. Raises nothing.
+    `source` replaces the profile's. Opens no link and no camera; reads the calibration file. Raises
+    nothing.
     """
     plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = evaluate_rows(JUDGES, plan)
@@ -52,7 +52,7 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
 
 
 def offline_rows(options: FlyOptions) -> list[Row]:
-    """Return the instant rows, of disk and profile. It opens no link and no camera."""
+    """Return the rows on the computer's disk and the profile, without opening a link or camera."""
     return [
         evaluate_row("log folder", log_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),
@@ -60,8 +60,8 @@ def offline_rows(options: FlyOptions) -> list[Row]:
 
 
 def warnings_before_flight(options: FlyOptions) -> list[str]:
-    """Return a sentence for each row that warns. Errors: SafetyAbort for the first that fails; of
-    the calibration's file InvalidValue, NotFound; of the log's folder InvalidValue."""
+    """Return a sentence for each offline row that warns. Errors: SafetyAbort for the first row that
+    fails; InvalidValue, NotFound (calibration file); InvalidValue (log folder)."""
     profile_camera(options.profile.camera)
     check_writable(options.log_dir / "flight.jsonl", force=True)
     rows = offline_rows(options)
@@ -145,7 +145,7 @@ def _limits(name: str, profile: Profile) -> Finding:
     if not broken:
         return passed(f"{len(limits)} fit each other")
     keys = dict.fromkeys(key for limit in broken for key in limit.keys)
-    sentences = "; ".join(limit.sentence(profile) for limit in broken)
+    sentences = "; ".join(limit.violation_text(profile) for limit in broken)
     return warned(sentences, f"change {' or '.join(keys)}")
 
 
@@ -166,7 +166,7 @@ def _latency(plan: _Plan) -> Finding:
 
 
 def log_finding(folder: Path) -> Finding:
-    """Judge whether logs can be written to the folder, without making it, and the free space."""
+    """Judge the folder's free space, and whether it is writable, without creating it."""
     whole = folder.absolute()
     try:
         check_writable(folder / "flight.jsonl", force=True)

@@ -33,15 +33,15 @@ class Rehearsal:
     """Result of a rehearsal.
 
     Attributes:
-        arrivals: index and time of arrival of each picture that was taken up.
-        repeats: how often one was given out again; these count for nothing else.
-        work_s: of the turns that looked at a picture; late_s: of all turns.
+        arrivals: index and arrival time of each picture.
+        repeats: number of repeated pictures, counted only here.
+        work_s: processing time of each turn with a picture; late_s: delay of each turn.
         ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
-        problems: why pictures were no good, or were remarkable, with their number.
-        newest_outputs: the newest few; found: of how many pictures there was a target.
-        silent_s: since the last picture, at the end.
-        target: where it was at the end; None where it was not seen then.
-        blur_px: sigma of the edges of the target's markers; None where it could not be measured.
+        problems: number of pictures by problem.
+        newest_outputs: the last few frames; found: number of pictures with a target.
+        silent_s: time without a picture at the end.
+        target: the final estimate; None if the target was not in view.
+        blur_px: sigma of the markers' edges; None if not measured.
     """
 
     live: bool
@@ -62,7 +62,7 @@ class Rehearsal:
 
     @property
     def frame_period_s(self) -> float | None:
-        """The time between two pictures; None of too few, or of a recording."""
+        """Mean time between pictures; None for fewer than two, or for a recording."""
         if not self.live or len(self.arrivals) < 2:
             return None
         (first, begin_s), (last, end_s) = self.arrivals[0], self.arrivals[-1]
@@ -95,7 +95,7 @@ class _TelemetryOnly:
 
 
 def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
-    """Return the link's telemetry as a rehearsal uses it."""
+    """Return a stand-in for the link that gives a rehearsal its telemetry."""
     by_target = profile.positioning.by == "target"
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 
@@ -109,10 +109,9 @@ def rehearse(
     duration_s: float = REHEARSED_S,
     stopwatch: Callable[[], float] = time.perf_counter,
 ) -> Rehearsal:
-    """Run the senses for so long, at the loop's rate. The source's size must fit.
+    """Run perception for `duration_s` at the loop's rate. The source must have the calibrated size.
 
-    `stopwatch` takes the time of the work; the clock may be a simulated one, which work does not
-    move.
+    `stopwatch` measures processing times, as `clock` may be simulated.
     """
     noted = _Noted(source)
     senses = FlightInputs(rehearsal_telemetry(take, profile), noted, pipeline, profile)
@@ -136,7 +135,7 @@ def rehearse(
     done.silent_s = end_s - (done.arrivals[-1][1] if done.arrivals else start_s)
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
-    done.print_verdict = prints.verdict() if prints.judged else None
+    done.print_verdict = prints.error_and_text() if prints.has_enough_frames else None
     done.blur_px = _blur_px(done.newest_outputs, pipeline)
     return done
 

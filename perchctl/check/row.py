@@ -11,7 +11,7 @@ from perchctl.flight import Problem
 
 
 class Verdict(StrEnum):
-    """How a question was answered."""
+    """Verdict of one check."""
 
     PASS = "pass"
     WARN = "warn"
@@ -24,7 +24,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Row:
-    """One question about a set-up, answered."""
+    """Result of one check."""
 
     name: str
     verdict: Verdict
@@ -35,7 +35,7 @@ class Row:
 
 
 class Finding(NamedTuple):
-    """The answer to a question whose name is known elsewhere: a `Row` without it."""
+    """Result of a check without its name: a `Row` adds that."""
 
     verdict: Verdict
     found: str
@@ -43,7 +43,7 @@ class Finding(NamedTuple):
 
 
 class Unanswerable(Exception):
-    """A question could not be answered; `finding` is the skipped one."""
+    """A check could not be made; `finding` is its skipped finding."""
 
     def __init__(self, why: str, advice: str = "") -> None:
         super().__init__(why)
@@ -54,7 +54,7 @@ P = ParamSpec("P")
 
 
 def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
-    """Return the row of that name: what `judge` finds, skipped where it raises `Unanswerable`."""
+    """Return the row with the finding of `judge`, skipped if it raises `Unanswerable`."""
     try:
         return Row(name, *judge(*args, **kwargs))
     except Unanswerable as unknown:
@@ -64,50 +64,50 @@ def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs
 def evaluate_rows(
     judges: Mapping[str, Callable[P, Finding]], *args: P.args, **kwargs: P.kwargs
 ) -> list[Row]:
-    """Return a row for each judge, by its name, in the mapping's order."""
+    """Return a row for each judge (a check function), in the mapping's order."""
     return [evaluate_row(name, judge, *args, **kwargs) for name, judge in judges.items()]
 
 
 def skipped_rows(names: Iterable[str], why: str, advice: str = "") -> list[Row]:
-    """Return a skipped row for each name, all for one reason."""
+    """Return a skipped row for each name, all with the same reason."""
     return [Row(name, *skipped(why, advice)) for name in names]
 
 
 def passed(found: str) -> Finding:
-    """Return the finding of a question that passes; `found` is what was seen, with units."""
+    """Return a passing finding; `found` is the observation, with units."""
     return Finding(Verdict.PASS, found)
 
 
 def warned(found: str, advice: str) -> Finding:
-    """Return the finding of a question that warns, with what to do."""
+    """Return a warning finding, with advice."""
     return Finding(Verdict.WARN, found, advice)
 
 
 def failed(found: str, advice: str) -> Finding:
-    """Return the finding of a question that fails, with what to do."""
+    """Return a failing finding, with advice."""
     return Finding(Verdict.FAIL, found, advice)
 
 
 def skipped(why: str, advice: str = "") -> Finding:
-    """Return the finding of a question that could not be answered, with the reason."""
+    """Return a skipped finding, with the reason."""
     return Finding(Verdict.SKIPPED, why, advice)
 
 
 def problem_finding(problem: Problem | None, found: str) -> Finding:
-    """Judge by a criterion of `fly`: fail with its problem, or pass with `found`."""
+    """Return a failing finding for a problem of `fly`'s criteria; without one pass with `found`."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 
 def limits_finding(
     value: float, warn_above: float, fail_above: float, found: str, advice: str
 ) -> Finding:
-    """Judge by a figure that is the better the smaller it is; one that is no number fails."""
+    """Judge a value for which smaller is better; NaN fails."""
     if value <= warn_above:
         return passed(found)
     return (warned if value <= fail_above else failed)(found, advice)
 
 
 def worst_finding(*findings: Finding) -> Finding:
-    """Return the gravest finding, the first of several."""
+    """Return the worst finding; of equally bad ones the first."""
     order = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
     return max(findings, key=lambda finding: order.index(finding.verdict))

@@ -16,7 +16,7 @@ from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehe
 from perchctl.check.row import Finding, Row, evaluate_row, failed, passed, skipped, skipped_rows
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
 from perchctl.flight import FlyOptions, WallClock, check_options, start_simulated_vehicle
-from perchctl.link import ProbeLink, check_uri, find_vehicles
+from perchctl.link import ProbeLink, check_uri, find_uris_and_problem
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import Pipeline, make_pipeline
@@ -24,12 +24,12 @@ from perchctl.vision import Pipeline, make_pipeline
 
 @dataclass(frozen=True)
 class CheckScope:
-    """Extent of a check: whether the vehicle is lifted by hand, and how long each part takes, s.
+    """Extent of a check: whether the vehicle is lifted by hand, and the duration of each part.
 
     `announce` is called with a sentence on each step; `open_capture` opens a motion capture.
     """
 
-    lift: bool = False
+    with_lift: bool = False
     listen_s: float = vehicle.LISTEN_S
     rehearse_s: float = REHEARSED_S
     lift_s: float = vehicle.LIFT_S
@@ -39,16 +39,16 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """Return what answers, at the usual address and at that of `uri`, for `--scan`. Errors:
-    InvalidValue."""
+    """Return the rows of `--scan`: the vehicles that answer at the default address and at that of
+    `uri`. Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
-    return vehicle.radio_scan_rows(*find_vehicles(uri or ""))
+    return vehicle.radio_scan_rows(*find_uris_and_problem(uri or ""))
 
 
 def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
-    """Yield rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
-    profile's files), UsageError (a library that is missing, or does not load)."""
+    """Run all checks, and yield each row as it is known. Errors, before anything is opened:
+    InvalidValue, NotFound (files of the profile), UsageError (a library that does not load)."""
     check_options(options)
     calibrated = profile_camera(options.profile.camera)
     pipeline = make_pipeline(options.profile, calibrated)
@@ -63,10 +63,10 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
                 system, host = simulated.capture
                 config = profile.positioning.model_copy(update={"system": system, "host": host})
                 profile = profile.model_copy(update={"positioning": config})
-        room = _open_room(profile, scope, stack)
+        mocap = _open_room(profile, scope, stack)
         probe = ProbeLink(uri, profile.link, time.monotonic)
         stack.callback(probe.close)
-        session = VehicleSession(probe, options.uri, profile, room, scope)
+        session = VehicleChecks(probe, options.uri, profile, mocap, scope)
         take = yield from session.rows()
         shown = without_password(options.source)
         scope.announce(f"opening the camera {shown}")
@@ -84,11 +84,11 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     yield from offline_rows(options)
 
 
-Room = CaptureSource | str | None
+MocapOrProblem = CaptureSource | str | None
 """An open motion capture, or why it could not be opened; None where decks do it."""
 
 
-def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> Room:
+def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrProblem:
     config = profile.positioning
     if config.by != "mocap":
         return None
@@ -104,18 +104,18 @@ def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack)
 
 
 @dataclass(frozen=True)
-class VehicleSession:
-    """The rows of a vehicle and of its motion capture. `uri` is as it was given; the probe's may
-    be that of a simulated one."""
+class VehicleChecks:
+    """Checks of a vehicle and its motion capture. `uri` is the given one; the probe's may be a
+    simulated vehicle's."""
 
     probe: ProbeLink
     uri: str
     profile: Profile
-    room: Room
+    mocap: MocapOrProblem
     scope: CheckScope
 
     def rows(self) -> Generator[Row, None, TakeTelemetry]:
-        """Yields the rows; returns where telemetry comes from, if only from nowhere."""
+        """Yield the rows; return the function that takes telemetry, which may give none."""
         self.scope.announce(f"connecting to {self.uri}")
         try:
             self.probe.connect()
@@ -141,13 +141,13 @@ class VehicleSession:
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
         """Return the rows of the motion capture; none with decks."""
         config = self.profile.positioning
-        if self.room is None:
+        if self.mocap is None:
             return []
-        if isinstance(self.room, str):
-            return capture.failed_capture_rows(self.room, config)
+        if isinstance(self.mocap, str):
+            return capture.failed_capture_rows(self.mocap, config)
         seconds = self.scope.capture_s
         self.scope.announce(f"listening to {config.label} for {seconds:g} s")
-        seen = capture.collect_samples(take, self.room, time.monotonic, time.sleep, seconds)
+        seen = capture.collect_samples(take, self.mocap, time.monotonic, time.sleep, seconds)
         return capture.mocap_rows_at_rest(seen, self.profile)
 
     def _compared_rows(self) -> list[Row]:
@@ -159,7 +159,7 @@ class VehicleSession:
     def _lift_rows(self) -> Iterator[Row]:
         """Yield the rows for which somebody has to lift the vehicle."""
         compared = self._compared_rows()
-        if self.scope.lift:
+        if self.scope.with_lift:
             lifted = self._lift_finding()
             yield Row(vehicle.LIFTED, *lifted)
             if compared:
@@ -175,17 +175,17 @@ class VehicleSession:
         yield from compared
 
     def _lift_finding(self) -> Finding:
-        config, room, within_s = self.profile.positioning, self.room, self.scope.lift_s
+        config, mocap, within_s = self.profile.positioning, self.mocap, self.scope.lift_s
         if config.by == "target":
             return skipped("only in flight it gets its position, by the target")
-        if room is None:
+        if mocap is None:
             self.scope.announce(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
             return vehicle.lift_finding(vehicle.record_lift(self.probe, time.sleep, within_s))
-        if isinstance(room, str):
+        if isinstance(mocap, str):
             return skipped(f"no {config.label}")
         self.scope.announce(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
         take = self.probe.telemetry
-        seen = capture.collect_samples(take, room, time.monotonic, time.sleep, within_s)
+        seen = capture.collect_samples(take, mocap, time.monotonic, time.sleep, within_s)
         return capture.comparison_finding(
             capture.pair_motion(seen.telemetry, seen.body_poses(config)), config
         )

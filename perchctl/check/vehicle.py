@@ -39,18 +39,18 @@ Wait = Callable[[float], None]
 
 @dataclass(frozen=True)
 class VehicleStatus:
-    """Answers of a vehicle to the check's questions.
+    """State of a vehicle, as the check queried it.
 
-    `telemetry` is the newest, with its age, None without any. While it was listened to, its
-    position moved by `moved_m`.
+    `unlogged`: missing log variables; `echoes_s`: round-trip times, infinite if lost; `telemetry`:
+    the newest, `age_s` old; `moved_m`: motion during the check.
     """
 
     uri: str
     protocol: int = ProbeLink.NEEDED_PROTOCOL
-    missing: tuple[str, ...] = ()
+    unlogged: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
-    echoes: Sequence[float] = ()
-    quality: float | None = None
+    echoes_s: Sequence[float] = ()
+    link_quality: float | None = None
     telemetry: Telemetry | None = None
     age_s: float = 0.0
     samples_hz: float = 0.0
@@ -58,8 +58,8 @@ class VehicleStatus:
     moved_m: float = 0.0
 
     @property
-    def at_rest(self) -> Telemetry:
-        """The newest telemetry. Raises Unanswerable without any."""
+    def known_telemetry(self) -> Telemetry:
+        """The newest telemetry. Raises Unanswerable if there is none."""
         if self.telemetry is None:
             raise Unanswerable("no telemetry")
         return self.telemetry
@@ -72,17 +72,17 @@ class VehicleStatus:
 def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> VehicleStatus:
     """Query a connected vehicle, and collect its telemetry for `listen_s` seconds."""
     link.telemetry()
-    echoes = link.echoes(listen_s)
+    echoes = link.round_trips_s(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
     later = link.telemetry() or samples
     return VehicleStatus(
         uri=uri,
-        protocol=link.protocol(),
-        missing=link.missing,
+        protocol=link.protocol_version(),
+        unlogged=link.missing,
         parameters=link.parameters(),
-        echoes=echoes,
-        quality=link.quality,
+        echoes_s=echoes,
+        link_quality=link.quality,
         telemetry=later[-1] if later else None,
         age_s=link.age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
@@ -96,8 +96,8 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     """Judge the link by its echoes, and a radio's by its quality, too."""
-    sent, quality = len(vehicle.echoes), vehicle.quality
-    back_s = sorted(filter(math.isfinite, vehicle.echoes))
+    sent, quality = len(vehicle.echoes_s), vehicle.link_quality
+    back_s = sorted(filter(math.isfinite, vehicle.echoes_s))
     if not back_s:
         return failed("no packet came back", "restart the vehicle, bring the radio nearer")
     lost, p95_s = 1.0 - len(back_s) / sent, back_s[int(0.95 * (len(back_s) - 1))]
@@ -131,8 +131,8 @@ def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if vehicle.protocol < needed:
         advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
         return failed(found, advice)
-    if vehicle.missing:
-        found = f"{found}, not logged: {', '.join(vehicle.missing)}"
+    if vehicle.unlogged:
+        found = f"{found}, not logged: {', '.join(vehicle.unlogged)}"
         return failed(found, "update it to release 2026.08 or later")
     if vehicle.parameters.get(SELF_TEST) == 0:
         found = f"{found}, its self-test failed at boot"
@@ -141,7 +141,7 @@ def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 
 def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    t = vehicle.at_rest
+    t = vehicle.known_telemetry
     criteria = GroundCriteria(t, profile)
     return problem_finding(
         criteria.supervisor_fault or criteria.supervisor_not_ready, f"ready (0x{t.supervisor:04X})"
@@ -160,7 +160,7 @@ def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 
 def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    t = vehicle.at_rest
+    t = vehicle.known_telemetry
     if profile.positioning.by != "deck" and not vehicle.position_decks(profile):
         return skipped(BY_FLY)
     problem = GroundCriteria(t, profile).estimate_unsettled
@@ -181,7 +181,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 
 def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    t = vehicle.at_rest
+    t = vehicle.known_telemetry
     if profile.positioning.by != "deck":
         return skipped(BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
@@ -191,7 +191,7 @@ def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
     """Judge whether it stands level and still."""
-    t, limit_deg = vehicle.at_rest, profile.safety.start_tilt_deg
+    t, limit_deg = vehicle.known_telemetry, profile.safety.start_tilt_deg
     criteria = GroundCriteria(t, profile)
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"
     advice = "put it on level ground; if that is level, restart it there"
@@ -202,7 +202,7 @@ def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 
 def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    t = vehicle.at_rest
+    t = vehicle.known_telemetry
     if not t.battery_v >= NO_BATTERY_READING_V:
         return skipped("no reading", "restart the vehicle")
     found = f"{t.battery_v:.2f} V at rest"
@@ -239,22 +239,22 @@ MOVED_G = 0.05
 """A hand that lifts shows in the accelerometer; its noise at rest is a tenth of it."""
 
 
-def record_lift(link: ProbeLink, wait: Wait, within_s: float = LIFT_S) -> list[Telemetry]:
-    """Return the vehicle's telemetry of `within_s` seconds, in which somebody lifts it."""
+def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list[Telemetry]:
+    """Return the vehicle's telemetry of `duration_s`, while it is lifted by hand."""
     seen: list[Telemetry] = []
-    for _ in range(max(1, round(within_s / 0.1))):
+    for _ in range(max(1, round(duration_s / 0.1))):
         wait(0.1)
         seen.extend(link.telemetry())
     return seen
 
 
-def lift_finding(seen: Sequence[Telemetry]) -> Finding:
-    """Judge whether the position followed the hand."""
-    if not seen:
+def lift_finding(samples: Sequence[Telemetry]) -> Finding:
+    """Judge whether the estimated position followed the lift by hand."""
+    if not samples:
         return skipped("no telemetry")
-    heights_m = [t.position_m[2] for t in seen]
+    heights_m = [t.position_m[2] for t in samples]
     rise_m, back_m = max(heights_m) - heights_m[0], heights_m[-1] - heights_m[0]
-    moved_g = max(abs(t.acc_z_g - 1.0) for t in seen)
+    moved_g = max(abs(t.acc_z_g - 1.0) for t in samples)
     found = f"rose by {rise_m:.2f} m, then {back_m:+.2f} m"
     if rise_m < FOLLOWED_M and moved_g < MOVED_G:
         return skipped("it was not moved", HOW_TO_LIFT)
@@ -272,7 +272,8 @@ def lift_finding(seen: Sequence[Telemetry]) -> Finding:
 
 
 def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
-    """Return a row for the radio and for each vehicle that answered."""
+    """Return a row for the radio, and one for each vehicle that answers, from the result of
+    `find_uris_and_problem`."""
     radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")
     if radio_problem:
         cause, _, advice = radio_problem.partition("\n")

@@ -20,7 +20,7 @@ from perchctl.calibration import (
     capture_views,
     check_calibration,
     find_views,
-    learn_gear,
+    learn_mask,
     load_calibration,
 )
 from perchctl.camera import (
@@ -43,7 +43,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_result, say
-from perchctl.commands.progress import search_bar, show_guidance
+from perchctl.commands.progress import done_of_total_bar, guidance_display
 from perchctl.display import live_page
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
@@ -112,10 +112,10 @@ def camera(
 
     found = _find_views(pictures, size, layout, view, checked_file)
     file = checked_file(found.views[0].size_px)
-    without = f", {len(found.missing)} without" if found.missing else ""
+    without = f", {len(found.without_board)} without" if found.without_board else ""
     say(f"{len(found.views)} views of the board{without}")
     result = calibrate_camera(found, layout.notation())
-    write_files({file: result.text(file.stem, _now()).encode()})
+    write_files({file: result.file_text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
 
@@ -152,10 +152,10 @@ def mask(
     with contextlib.ExitStack() as stack:
         frames = open_camera(pictures, time.monotonic, size_px=size)
         stack.callback(frames.close)
-        stop = stack.enter_context(Stopper().installed())
+        stop = stack.enter_context(Stopper().as_handler())
         if frames.live:
             say("turn the vehicle about for 20 s (Ctrl-C ends and writes the mask)")
-        covered = learn_gear(frames, stop.requested.is_set)
+        covered = learn_mask(frames, stop.requested.is_set)
     write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
     share = 100.0 * covered.mean()
     say(f"wrote {output}: the vehicle covers {share:.1f} % of the picture; set camera.mask")
@@ -181,7 +181,7 @@ def check(
     found = _find_views(pictures, model.size_px, layout)
     check_size(found.views[0].size_px, model, without_password(pictures))
     result = check_calibration(model, found)
-    for item in found.missing:
+    for item in found.without_board:
         say(f"{item.view}: {item.reason}")
     for item in result.rejections:
         say(f"left out {item.view}: {item.reason}")
@@ -256,13 +256,13 @@ def _find_views(
             if frames.size_px is not None:
                 check(frames.size_px)
             return capture_live_views(frames, board, view)
-    with search_bar("searching the board") as progress:
+    with done_of_total_bar("searching the board") as progress:
         pictures = image_files(str(Path(source.place).expanduser()))
         found = find_views(pictures, board, progress)
     if not found.views:
-        first = found.missing[0]
+        first = found.without_board[0]
         raise InvalidValue(
-            f"none of {len(found.missing)} pictures of {source} shows the "
+            f"none of {len(found.without_board)} pictures of {source} shows the "
             f"board {board.notation()} ({first.view}: {first.reason}); is it wholly in view, "
             f"sharp, and --board its true layout?"
         )
@@ -270,17 +270,16 @@ def _find_views(
 
 
 def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundViews:
-    """Return views of a video or live camera, taken until all is covered or Ctrl-C ends it.
+    """Take views from a video or live camera until they cover everything, or Ctrl-C.
 
-    Raises:
-        InvalidValue: no view was taken. Those of `capture_views`.
+    Raises InvalidValue if no view was taken; else as `capture_views`.
     """
     with contextlib.ExitStack() as stack:
-        stop = stack.enter_context(Stopper().installed())
+        stop = stack.enter_context(Stopper().as_handler())
         # The page draws the picture and its corners, but no axes: any camera serves.
         any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
         page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
-        show = stack.enter_context(show_guidance(page))
+        show = stack.enter_context(guidance_display(page))
         if source.live:
             say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
         found = capture_views(source, board, show, stopped=stop.requested.is_set)

@@ -34,7 +34,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
 from perchctl.commands.output import add_problem, ask, print_lines, print_result, say
-from perchctl.commands.progress import show_guidance
+from perchctl.commands.progress import guidance_display
 from perchctl.display import live_page
 from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, UsageError
 from perchctl.files import check_writable
@@ -110,7 +110,7 @@ def mount(
     if into is not None:
         try:
             _check_unchanged(profile, vehicle)
-            before = write_profile_values(into, measured.profile_values())
+            before = write_profile_values(into, measured.new_profile_values())
             written = into
             say(f"wrote these into {written}; as it was before it is {before}")
         except (InvalidValue, NotFound) as error:  # the numbers stand
@@ -232,7 +232,7 @@ def _record_live(
             reader = PoseReader(profile, camera, frames.live)
             if frames.live:
                 frames.poll(time.monotonic())  # from before
-            with Stopper().installed() as stop, show_guidance(page) as show:
+            with Stopper().as_handler() as stop, guidance_display(page) as show:
                 stopped = stop.requested.is_set
                 record_mounting(
                     recording,

@@ -80,12 +80,12 @@ def check(
         say("scanning all channels and rates")
         return print_rows(scan_rows(uri), as_json)
     options = resolve_options(profile, uri, source)
-    scope = CheckScope(lift=lift, announce=say)
+    scope = CheckScope(with_lift=lift, announce=say)
     return print_rows(check_rows(options, scope), as_json)
 
 
 def print_rows(rows: Iterable[Row], as_json: bool) -> int:
-    """Print the rows, also so far as Ctrl-C or an error let them come; returns the exit code."""
+    """Print the rows, also those before a Ctrl-C or an error; return the exit code."""
     found: list[Row] = []
     interrupted = False
     try:
@@ -118,8 +118,8 @@ def exit_code(rows: Sequence[Row]) -> int:
 
 
 def format_rows(rows: Sequence[Row], finished: bool = True) -> str:
-    """Return the rows at 80 columns: verdict, name, finding, and below it what to do. An unfinished
-    check says nothing good."""
+    """Return the rows as text of 80 columns: verdict, name, finding, and the advice below. An
+    unfinished check gets no positive summary."""
     lines = [line for row in rows for line in _lines(row)]
     counts = {v: sum(row.verdict is v for row in rows) for v in Verdict}
     counted = ", ".join(f"{n} {SHOWN[v]}" for v, n in counts.items() if n)

@@ -21,7 +21,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from perchctl import __version__
-from perchctl.commands.output import drop_stream, say
+from perchctl.commands.output import discard_output, say
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
@@ -76,7 +76,7 @@ _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
 class Group(TyperGroup):
-    """A group of subcommands, of which the first is the main one: it runs if none is named."""
+    """A group of subcommands; the first one is the main one, which runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         named = (*self.commands, *_SETTINGS["help_option_names"])
@@ -227,8 +227,8 @@ def main() -> Any:
 
 @contextlib.contextmanager
 def report_failures(as_json: bool = False) -> Iterator[None]:
-    """Turn every failure of the block into one sentence on stderr, if wanted an object on stdout,
-    and its exit code, and each note on the profile into one sentence."""
+    """Report each failure of the block as a sentence on stderr, with `as_json` also as an object on
+    stdout, and exit with its code; print each note on the profile as a sentence."""
     try:
         with _notes():
             yield
@@ -239,7 +239,7 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
     except KeyboardInterrupt:
         _leave("Ctrl-C", Interrupted.exit_code, as_json)
     except BrokenPipeError:
-        drop_stream(sys.stdout)
+        discard_output(sys.stdout)
         raise typer.Exit(PerchError.exit_code) from None
     except Exception as error:
         if hasattr(error, "format_message"):  # wrong usage, which typer prints
@@ -252,7 +252,7 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
         is_full = isinstance(error, OSError) and _REFUSED.get(error.errno) == _FREE_SPACE
         if isinstance(error, OSError) and error.errno in _REFUSED and (error.filename or is_full):
             if error.filename is None:
-                drop_stream(sys.stdout)
+                discard_output(sys.stdout)
             place = str(error.filename or "the result")[:_LONGEST_PLACE]
             advice = _REFUSED[error.errno]
             what = "written" if is_full else "used"
@@ -277,7 +277,7 @@ def _print_failure(sentence: str, code: int) -> None:
     try:
         print(failure_record(sentence, code), flush=True)
     except OSError:
-        drop_stream(sys.stdout)
+        discard_output(sys.stdout)
 
 
 @contextlib.contextmanager

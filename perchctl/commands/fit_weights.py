@@ -31,9 +31,9 @@ from perchctl.profile import Profile, load_profile
 from perchctl.vision import CameraModel
 from perchctl.weights import (
     Experiment,
-    MocapTruth,
+    MocapPoses,
     SessionFile,
-    TypedTruth,
+    TypedPoses,
     fit_weights,
     report_text,
     weights_record,
@@ -134,7 +134,7 @@ def collect(
     if truth == "sim":
         _collect_simulated(session, config, camera, positions, frames, seed)
     else:
-        poses = TypedTruth() if truth == "typed" else _open_capture(config, target_body)
+        poses = TypedPoses() if truth == "typed" else _open_capture(config, target_body)
         with closing(poses):
             _collect_with_person(session, config, camera, positions, frames, poses, source)
     say(f"{session} is complete: perchctl fit-weights {session} -o weights.yaml fits the weights")
@@ -168,7 +168,7 @@ def _collect_with_person(
     camera: CameraModel,
     positions: int,
     frames: int,
-    poses: TypedTruth | MocapTruth,
+    poses: TypedPoses | MocapPoses,
     source: str | None,
 ) -> None:
     spec = profile.camera.source if source is None else source
@@ -194,7 +194,7 @@ def _collect_with_person(
         experiment.run(positions, frames)
 
 
-def _open_capture(profile: Profile, target_body: str) -> MocapTruth:
+def _open_capture(profile: Profile, target_body: str) -> MocapPoses:
     """Return the profile's motion capture, connected. Errors: UsageError, those of connecting."""
     if profile.positioning.by != "mocap":
         raise UsageError(
@@ -202,4 +202,4 @@ def _open_capture(profile: Profile, target_body: str) -> MocapTruth:
             "positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: cf}"
         )
     gear = np.asarray(profile.vehicle.gear_body_m, dtype=np.float64)
-    return MocapTruth(open_capture(profile.positioning), profile.positioning, target_body, gear)
+    return MocapPoses(open_capture(profile.positioning), profile.positioning, target_body, gear)

@@ -31,7 +31,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.interrupt import ignore_signals, interruptible, operator_signals
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
-from perchctl.commands.profile import picture_edges
+from perchctl.commands.profile import front_left_edges
 from perchctl.display import (
     FlightPage,
     FlightPanel,
@@ -138,7 +138,7 @@ def resolve_options(
     log_dir: Path | None = None,
     record: bool | None = None,
 ) -> FlyOptions:
-    """Return the command line's options on top of the profile; None is not given. Errors: NotFound,
+    """Merge the command line's options (None: not given) with the profile. Errors: NotFound,
     InvalidValue, UsageError."""
     profile = with_positioning(load_profile(profile_name), positioning)
     options = FlyOptions(
@@ -155,9 +155,10 @@ def resolve_options(
     return options
 
 
-def with_positioning(profile: Profile, by: str | None) -> Profile:
-    """Return the profile with `--positioning`; None: as the profile has it. Errors:
+def with_positioning(profile: Profile, method: str | None) -> Profile:
+    """Return the profile with the method of `--positioning`; unchanged for None. Errors:
     InvalidValue."""
+    by = method
     if by is None:
         return profile
     if by not in POSITIONINGS:
@@ -174,14 +175,14 @@ def with_positioning(profile: Profile, by: str | None) -> Profile:
 
 
 def ask_before_arming(uri: str) -> None:
-    """Raise UsageError without a yes from the terminal."""
+    """Ask whether to arm; raise UsageError unless the answer is yes."""
     if not ask_to_confirm(f"About to arm and fly {uri}. Is the space under the target clear?"):
         raise UsageError("not confirmed: nothing was started")
 
 
-def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = False) -> int:
-    """Fly, log, plot and report how the flight ended; return the exit code. `view`: with
-    the live page; with `asks` somebody at the terminal has to say yes before it arms."""
+def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool = False) -> int:
+    """Fly, log, plot and report how the flight ended; return the exit code. `view`: open the live
+    page; `confirm`: ask on the terminal before arming."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir,
@@ -198,7 +199,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(flight_page(options, view, switch))
-            report, miss_m = _session(options, log, panel, switch, page, asks)
+            report, miss_m = _session(options, log, panel, switch, page, confirm)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
@@ -222,8 +223,8 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, asks: bool = 
 
 
 def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
-    """Draw the flight beside its log if the profile asks for it, and return the path. A plot that
-    fails, or that Ctrl-C ends, is a warning."""
+    """Plot the flight beside its log if the profile asks for it, and return the plot's path. A plot
+    that fails or is interrupted is only a warning."""
     if not profile.log.plot:
         return None
     picture = path_beside(log_path, ".png")
@@ -241,7 +242,7 @@ def draw_flight_plot(log_path: Path, profile: Profile) -> Path | None:
 def flight_record(
     summary: FlightSummary, code: int, log: Path, plot: Path | None
 ) -> dict[str, Any]:
-    """Return the one object of `--json`; `error` is None if the flight and its log are good."""
+    """Return the JSON object of `--json`; its `error` is None if flight and log are good."""
     return summary.as_record() | {
         "lost_records": summary.lost_records,
         "log_problem": summary.log_problem,
@@ -253,7 +254,7 @@ def flight_record(
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Return the exit code of the flight, or if that was good, of its log."""
+    """Return the exit code of the flight or, if the flight was good, of its log."""
     code = EXIT_CODE_OF[outcome]
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
@@ -270,7 +271,7 @@ def _session(
     watched = log.watched
     if page is not None:
         watchers = (*watchers, page)
-        watched = lambda source: page.watched(log.watched(source))  # noqa: E731
+        watched = lambda source: page.watch_source(log.watched(source))  # noqa: E731
     with operator_signals(switch, say):
         ask = partial(ask_before_arming, options.uri) if asks else None
         return fly_session(options, watchers, switch, watched, log.remarks, ask)
@@ -280,7 +281,7 @@ def _session(
 def flight_page(
     options: FlyOptions, view: bool, switch: OperatorSwitch
 ) -> Iterator[FlightPage | None]:
-    """Yield the page of `--view`, whose STOP lands by the switch; None without it."""
+    """Yield the live page, whose STOP button presses the switch; None without `view`."""
     if not view:
         yield None
         return
@@ -325,12 +326,13 @@ def plan_record(options: FlyOptions) -> dict[str, Any]:
 
 
 def plan_text(options: FlyOptions) -> str:
-    """Return the plan for people, at 80 columns, with the profile's implausible values."""
+    """Return the plan as text of 80 columns: vehicle, camera, target, path, and implausible values
+    of the profile."""
     resolved, profile, planner = plan_record(options), options.profile, options.profile.planner
     camera, large, small = profile.camera, profile.target.large, profile.target.small
     mask = f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""
     turn = " ".join(f"{angle:g}" for angle in camera.mount.rpy_deg)
-    edges = picture_edges(camera.mount, camera.mirrored)
+    edges = front_left_edges(camera.mount, camera.mirrored)
     late = camera.latency_s
     rows = [
         ("vehicle", f"{options.uri}{f', seed {options.seed}' if options.simulated else ''}"),

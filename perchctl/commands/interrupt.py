@@ -36,12 +36,13 @@ def handle_signals(handler: Handler) -> Iterator[None]:
 def operator_signals(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
     """Let Ctrl-C press the switch during a flight, and `LANDING_SIGNALS` land (main thread only).
 
-    A thread reads them from a socket that the interpreter writes to at once, so they count while
-    the main thread hangs in a library. An ignored hang-up (nohup) stays so. `report` prints a line.
+    A separate thread reads the signals from Python's wakeup socket, so they take effect even while
+    the main thread hangs in a library. An ignored SIGHUP (nohup) stays ignored. `report` prints a
+    line.
     """
 
     def handler(_signal: int, _frame: FrameType | None) -> None:
-        switch.leave()
+        switch.interrupt()
 
     reader, writer = socket.socketpair()
     writer.setblocking(False)
@@ -92,13 +93,13 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def ignore_signals() -> Iterator[None]:
-    """Ignore Ctrl-C and SIGTERM during the block, but for what an inner block makes of them."""
+    """Ignore Ctrl-C and SIGTERM during the block, unless an inner block handles them."""
     with handle_signals(lambda _signal, _frame: None):
         yield
 
 
 class Stopper:
-    """Takes Ctrl-C as a request to end after this frame; a second one ends at once."""
+    """Handles Ctrl-C: the first sets `requested`, a second one raises KeyboardInterrupt."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
@@ -109,6 +110,6 @@ class Stopper:
         self.requested.set()
 
     @contextlib.contextmanager
-    def installed(self) -> Iterator[Stopper]:
+    def as_handler(self) -> Iterator[Stopper]:
         with handle_signals(self.press):
             yield self

@@ -28,13 +28,13 @@ from perchctl.commands.command_line import (
 from perchctl.commands.output import print_result, say
 from perchctl.errors import ReplayDiffers
 from perchctl.files import check_output, write_files
-from perchctl.profile import Profile, changed_profile, load_profile
+from perchctl.profile import Profile, apply_settings, load_profile
 from perchctl.record import (
     FlightLog,
-    log_values,
     path_beside,
     read_log,
     recorded_pictures,
+    wrap_log_errors,
 )
 
 PLOTS = ((".png", ".pdf", ".svg"), "what plots are drawn in")
@@ -83,7 +83,7 @@ def _opened(path: Path) -> Iterator[FlightLog]:
     Errors: NotFound, InvalidValue.
     """
     log = read_log(path)
-    with log_values(path):
+    with wrap_log_errors(path):
         yield log
 
 
@@ -215,10 +215,10 @@ def replay(
         wanted = None
         if profile is not None or settings:
             base = log.flown_profile if profile is None else load_profile(profile)
-            wanted = changed_profile(base, settings or ())
+            wanted = apply_settings(base, settings or ())
     is_recorded = pictures and path_beside(path, ".mcap").is_file()
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
-    if wanted is not None and not found.changed:
+    if wanted is not None and not found.changed_keys:
         say("nothing was changed: that is what was flown")
     if as_json:
         print_result(found.record())
@@ -251,7 +251,7 @@ def report(
         output = logs[0].with_name("session.html")
     place = _place(logs[0], output, PAGES, force)
     page = write_report(logs, place, with_film)
-    say(page.counts_text)
+    say(page.outcome_counts_text)
     print_result({"report": str(place), "flights": page.record()} if as_json else place)
 
 

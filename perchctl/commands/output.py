@@ -15,36 +15,36 @@ from perchctl.errors import PerchError
 
 
 def say(sentence: str) -> None:
-    """Print one sentence on stderr, as stdout is for the result. Never raises."""
+    """Print a sentence on stderr, as stdout is for results. Never raises."""
     print_lines(f"perchctl: {sentence}")
 
 
 def print_lines(text: str, stdout: bool = False) -> None:
-    """Print lines on stderr or stdout; a closed terminal or pipe is no reason to fail."""
+    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error."""
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
     except (OSError, ValueError) as error:
         if stdout and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             say(f"the result cannot be written: {error.strerror}; free some space")
-        drop_stream(stream)
+        discard_output(stream)
 
 
-def drop_stream(stream: TextIO) -> None:
-    """Discard what the stream still holds, so that it does not fail again at the program's end."""
+def discard_output(stream: TextIO) -> None:
+    """Discard the stream's buffered output, so that flushing it at exit does not fail."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def ask(question: str) -> str:
-    """Return the line that is typed; the question goes to stderr. Raises EOFError at its end."""
+    """Ask on stderr, and return the line typed. Raises EOFError at the end of the input."""
     print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
     return input()
 
 
 def ask_to_confirm(question: str) -> bool:
-    """Return True if somebody at the terminal says yes now: what was typed before the question
-    appeared is no answer to it."""
+    """Ask on the terminal; return True if the answer is yes. Input typed before the question is
+    discarded."""
     with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     try:

@@ -33,10 +33,10 @@ from perchctl.link import check_uri
 from perchctl.profile import (
     Mounting,
     Profile,
-    changed_profile,
-    editor_schema,
+    apply_settings,
     find_calibration,
     find_profile,
+    json_schema,
     load_profile,
     profile_text,
     profile_value,
@@ -188,7 +188,7 @@ def new(
     """
     check_output(output, (".yaml", ".yml"), force, "what a profile is")
     given = dict(setting.partition("=")[::2] for setting in settings or ())
-    new_profile(given, output.stem)  # before anything is asked
+    profile_and_keys(given, output.stem)  # before anything is asked
     answers = dict(given)
     for name in [name for name in QUESTIONS if name not in given] if defaults else []:
         answers[name] = default_answer(name, answers)
@@ -197,7 +197,7 @@ def new(
             f"A new profile: {output}. Enter takes what stands in brackets, {BACK} goes back."
         )
         answers = ask_questions(given)
-    profile, keys = new_profile(answers, output.stem)
+    profile, keys = profile_and_keys(answers, output.stem)
     shown = shlex.quote(str(output))
     write_files({output: (HEAD.format(name=shown) + profile_text(profile, keys)).encode()})
     if profile.camera.mirrored:
@@ -211,7 +211,7 @@ def new(
 
 
 def default_answer(name: str, answers: Answers) -> str:
-    """Return what Enter stands for, after the answers to the questions before."""
+    """Return the default answer to a question, given the answers to the ones before it."""
     uri, source = answers.get("link.uri", ""), answers.get("camera.source", "")
     if name == "camera.source" and uri.startswith(SIMULATED):
         return "sim:"
@@ -221,7 +221,7 @@ def default_answer(name: str, answers: Answers) -> str:
     if name == "camera.calibration" and made and not source.startswith("sim:"):
         return str(made[-1])
     if name == "left":
-        return edges_beside(answers["front"])[0]
+        return left_edges(answers["front"])[0]
     if name == "target.small.side_m":
         with contextlib.suppress(ValueError):  # what is no number is refused as the large side
             return f"{max(0.004, float(answers['target.large.side_m']) / 6.0):.4g}"
@@ -229,8 +229,8 @@ def default_answer(name: str, answers: Answers) -> str:
 
 
 def ask_questions(given: Answers) -> Answers:
-    """Return `given` with what somebody types: each question until its answer is valid, and what
-    was answered once more before it is taken. Raises UsageError if the input has ended."""
+    """Ask the questions not answered in `given`, each until its answer is valid, and have all
+    confirmed at the end; return all answers. Raises UsageError at the end of the input."""
     names = [name for name in QUESTIONS if name not in given]
     before: list[Answers] = [given]
     while True:
@@ -250,7 +250,7 @@ def ask_questions(given: Answers) -> Answers:
                 return answers
             else:
                 answered = {**answers, name: _read(name, typed) if typed else default}
-                new_profile(answered, "new")
+                profile_and_keys(answered, "new")
                 before.append(answered)
         except (PerchError, UnicodeDecodeError) as error:
             if isinstance(error, UsageError):
@@ -299,8 +299,8 @@ def _shown(name: str, value: str) -> str:
 
 
 def answers_text(answers: Answers) -> str:
-    """Return what the profile would say, for a last look."""
-    profile, _ = new_profile(answers, "new")
+    """Return the profile's values that the answers set, for confirmation."""
+    profile, _ = profile_and_keys(answers, "new")
     mirrored = "mirrored" if profile.camera.mirrored else "not mirrored"
     turn = profile.camera.mount.rpy_deg[2]
     rows = [(name, _shown(name, answers[name])) for name in QUESTIONS if name in answers]
@@ -308,9 +308,9 @@ def answers_text(answers: Answers) -> str:
     return "\n".join(f"  {name:<24} {text}" for name, text in rows)
 
 
-def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
-    """Return the profile that these answers make, and the keys to write to its file. What is not
-    answered yet has its default. Raises NotFound, InvalidValue, UsageError, each with the key."""
+def profile_and_keys(answers: Answers, name: str) -> tuple[Profile, set[str]]:
+    """Return the profile of these answers, with defaults for the others, and the keys to write to
+    its file. Raises NotFound, InvalidValue, UsageError, each with the key."""
     texts = {key: text for key, text in answers.items() if key not in EDGES_AND_CEILING}
     if "target.large.side_m" in texts and "target.small.side_m" not in texts:
         texts["target.small.side_m"] = default_answer("target.small.side_m", answers)
@@ -337,7 +337,7 @@ def new_profile(answers: Answers, name: str) -> tuple[Profile, set[str]]:
     for key, text in texts.items():
         is_text = isinstance(profile_value(Profile(), key), str)
         settings[key] = json.dumps(text) if is_text else text
-    profile = changed_profile(base, [f"{key}={text}" for key, text in settings.items()])
+    profile = apply_settings(base, [f"{key}={text}" for key, text in settings.items()])
     return profile, {*settings, *shipped, *SHOWN_KEYS} - {"name"}
 
 
@@ -348,10 +348,10 @@ def _mount_keys(answers: Answers) -> dict[str, Any]:
         return {}
     if front not in PICTURE_EDGES:
         raise InvalidValue(f"front: found {front!r}; allowed are {', '.join(PICTURE_EDGES)}")
-    left = left or edges_beside(front)[0]
-    if left not in edges_beside(front):
-        raise InvalidValue(f"left: found {left!r}; allowed are {', '.join(edges_beside(front))}")
-    turn_deg, mirrored = mount_from_edges(front, left)
+    left = left or left_edges(front)[0]
+    if left not in left_edges(front):
+        raise InvalidValue(f"left: found {left!r}; allowed are {', '.join(left_edges(front))}")
+    turn_deg, mirrored = yaw_deg_and_mirrored(front, left)
     return {"camera.mount.rpy_deg": (0.0, 0.0, turn_deg), "camera.mirrored": mirrored}
 
 
@@ -394,7 +394,7 @@ def _is_aideck(source: str) -> bool:
 )
 def schema() -> None:
     """Print the JSON schema of a profile's file, by which an editor completes and explains keys."""
-    print(json.dumps(editor_schema(), indent=2))
+    print(json.dumps(json_schema(), indent=2))
 
 
 # --- How a camera is turned, in words: which edge of its picture is the vehicle's front ---
@@ -413,20 +413,20 @@ PICTURE_EDGES: dict[str, tuple[int, int]] = {
 UPRIGHT = math.cos(math.radians(30.0))
 
 
-def edges_beside(front: str) -> tuple[str, str]:
-    """Return at which edges the vehicle's left side can be: first that of a picture that is not
-    mirrored."""
+def left_edges(front: str) -> tuple[str, str]:
+    """Return the edge of the vehicle's left side if its front is at `front`: in an unmirrored
+    picture, and in a mirrored one."""
     x, y = PICTURE_EDGES[front]
     plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
     mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))
     return plain, mirrored
 
 
-def mount_from_edges(front: str, left: str) -> tuple[float, bool]:
-    """Return the last of `camera.mount.rpy_deg` for a camera that looks up, and whether its picture
-    is mirrored. `left` is one of `edges_beside(front)`."""
+def yaw_deg_and_mirrored(front: str, left: str) -> tuple[float, bool]:
+    """Return the yaw in `camera.mount.rpy_deg` of a camera that looks up, and whether its picture
+    is mirrored. `left` is one of `left_edges(front)`."""
     x, y = PICTURE_EDGES[front]
-    mirrored = left == edges_beside(front)[1]
+    mirrored = left == left_edges(front)[1]
     if mirrored:
         x = -x  # of the picture as it is flipped before use
     # The front is at the angle a in the picture; x right, y down, seen from below: the turn is -a.
@@ -434,9 +434,9 @@ def mount_from_edges(front: str, left: str) -> tuple[float, bool]:
     return (180.0 if turn_deg == -180.0 else turn_deg + 0.0), mirrored
 
 
-def picture_edges(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
-    """Return the edges of the vehicle's front and left side in the picture as the camera gives it;
-    None for a camera that does not look up, or is turned by about an eighth of a circle."""
+def front_left_edges(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
+    """Return the edges of the raw picture at the vehicle's front and left side; None for a camera
+    that does not look up, or whose yaw is near an odd multiple of 45 deg."""
     R_cam_body = mount.T_body_cam[:3, :3].T
     if R_cam_body[2, 2] < UPRIGHT:
         return None

@@ -40,7 +40,7 @@ class FinishedFlight(Protocol):
 def progress_bar(
     total: int, earlier: Iterable[FinishedFlight] = (), stream: TextIO | None = None
 ) -> Iterator[Callable[[FinishedFlight], None]]:
-    """Yield the function to call with each finished flight. `earlier`: flown before."""
+    """Show a bar that counts flights; yield the function to call with each result."""
     ends = Counter(result.outcome for result in earlier)
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
     with _bar("flights", *columns, total=total, stream=stream, width=8) as update:
@@ -58,34 +58,34 @@ def progress_bar(
 
 
 @contextlib.contextmanager
-def count_bar(what: str, total: int | None, wanted: bool = True) -> Iterator[Callable[[], None]]:
-    """Yield the function to call for each one done; `total` None is an unknown number."""
-    with _bar(what, TimeRemainingColumn(), total=total, wanted=wanted) as update:
+def count_bar(label: str, total: int | None, is_shown: bool = True) -> Iterator[Callable[[], None]]:
+    """Show a progress bar; yield the function that advances it by one. `total` None: unknown."""
+    with _bar(label, TimeRemainingColumn(), total=total, is_shown=is_shown) as update:
         yield lambda: update(advance=1)
 
 
 @contextlib.contextmanager
-def search_bar(what: str) -> Iterator[Callable[[int, int | None], None]]:
-    """Yield the function to call with the number done, and the number to do if known."""
-    with _bar(what) as update:
+def done_of_total_bar(label: str) -> Iterator[Callable[[int, int | None], None]]:
+    """Show a progress bar; yield the function that sets the number done and the total."""
+    with _bar(label) as update:
         yield lambda done, total: update(completed=done, total=total)
 
 
 @contextlib.contextmanager
 def _bar(
-    what: str,
+    label: str,
     *more: ProgressColumn,
     total: int | None = None,
     stream: TextIO | None = None,
-    wanted: bool = True,
+    is_shown: bool = True,
     width: int = 40,
 ) -> Iterator[Callable[..., Any]]:
     console = Console(file=stream or sys.stderr)
-    if not (wanted and console.is_terminal):
+    if not (is_shown and console.is_terminal):
         yield lambda **changes: None
         return
     with Progress(
-        TextColumn(what),
+        TextColumn(label),
         BarColumn(width),
         MofNCompleteColumn(),
         *more,
@@ -103,11 +103,11 @@ _GUIDE_HZ = 8
 
 
 @contextlib.contextmanager
-def show_guidance(
+def guidance_display(
     page: LivePage | None, stream: TextIO | None = None
 ) -> Iterator[Callable[[GuidedFrame], None]]:
-    """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as a line
-    whenever that changes, and on the page if there is one."""
+    """Yield the function that shows a guided frame: as a table on a terminal, in a pipe as one line
+    per change, and on the page if there is one."""
     console = Console(file=stream or sys.stderr)
     with contextlib.ExitStack() as stack:
         table: Live | None = None
@@ -121,9 +121,9 @@ def show_guidance(
             nonlocal last_line
             if table is not None:
                 table.update(_table(guided))
-            elif guided.line != last_line:
-                last_line = guided.line
-                line = f"perchctl: {guided.line}"
+            elif guided.status_line != last_line:
+                last_line = guided.status_line
+                line = f"perchctl: {guided.status_line}"
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
             if page is not None:
                 page.show(Sketch(guided.image, guided.outlines))
@@ -147,6 +147,6 @@ def _table(guided: GuidedFrame) -> Table:
 
 
 def page_state(guided: GuidedFrame) -> dict[str, Any]:
-    """Return the page's rows (the shares as numbers, for bars) and its headline."""
+    """Return the state of the live page: rows (with bar lengths 0..1) and headline."""
     rows = [[value for value in row if value is not None] for row in guided.rows]
     return {"rows": rows, "phase": guided.advice}

@@ -307,16 +307,16 @@ def run_campaign(
     campaign: Callable[[Executor, Callable[[Any], None]], object],
     report: Callable[[list[Any], PerchError | None], None],
     total: int,
-    flyers: AbstractContextManager[Executor],
+    executor_context: AbstractContextManager[Executor],
     earlier: Sequence[Any] = (),
-    keep: Callable[[Any], None] = lambda result: None,
-    objection: Callable[[list[Any]], PerchError | None] = lambda results: None,
+    store_result: Callable[[Any], None] = lambda result: None,
+    find_error: Callable[[list[Any]], PerchError | None] = lambda results: None,
 ) -> int:
     """Fly a campaign of `total` flights; report those flown, however it ends; return the exit code.
 
     `campaign` gets the executor and the function to call with each result; `report` gets the
-    results, and the error if not all were flown. `earlier` results are counted, too; `keep` writes
-    each new one. `objection` returns the error that all results together amount to, if any.
+    results, and the error if there is one. `earlier` results are counted, too; `store_result`
+    writes each new one. `find_error` returns an error of the results as a whole, or None.
     Errors: PerchError if none was flown.
     """
     results = list(earlier)
@@ -325,7 +325,7 @@ def run_campaign(
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            flyers as executor,
+            executor_context as executor,
             progress_bar(total, list(results)) as advance,
         ):
             begun = True
@@ -333,7 +333,7 @@ def run_campaign(
             def note(result: Any) -> None:
                 with campaigns.defer_interrupts():
                     results.append(result)
-                    keep(result)
+                    store_result(result)
                     advance(result)
 
             campaign(executor, note)
@@ -348,7 +348,7 @@ def run_campaign(
         problem.args = (f"{problem}; {flown}",)
     if problem is not None and not results:
         raise problem
-    problem = problem or objection(results)
+    problem = problem or find_error(results)
     report(sorted(results, key=lambda result: result.seed), problem)
     if problem is None:
         return 0
@@ -357,10 +357,10 @@ def run_campaign(
 
 
 def stop_handler(
-    clock: Callable[[], float] = time.monotonic, leave: Callable[[int], object] = os._exit
+    clock: Callable[[], float] = time.monotonic, exit_process: Callable[[int], object] = os._exit
 ) -> Callable[[int, FrameType | None], None]:
-    """Return a handler: the first signal raises KeyboardInterrupt, a further one ends the program
-    where it is."""
+    """Return a signal handler: the first signal raises KeyboardInterrupt, a later one exits at
+    once."""
     first_s: list[float] = []
 
     def press(_number: int, _frame: FrameType | None) -> None:
@@ -368,7 +368,7 @@ def stop_handler(
             first_s.append(clock())
             raise KeyboardInterrupt
         if clock() - first_s[0] >= AGAIN_S:
-            leave(Interrupted.exit_code)
+            exit_process(Interrupted.exit_code)
 
     return press
 
@@ -377,7 +377,7 @@ def stop_handler(
 
 
 def print_log_folder(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
-    """Print on stderr where the logs are, and what they lack."""
+    """Print on stderr the folder of the logs, and whether some are incomplete."""
     if log_dir is None or not results:
         return
     say(f"the flights' logs are in {log_dir}")
@@ -387,7 +387,7 @@ def print_log_folder(results: Sequence[campaigns.CampaignFlight], log_dir: Path 
 
 
 def _list_faults(as_json: bool) -> int:
-    faults = {fault.name: fault.what for fault in fault_campaigns.FAULTS}
+    faults = {fault.name: fault.description for fault in fault_campaigns.FAULTS}
     table = "\n".join(campaigns.align_columns(list(faults.items())))
     print_result({"faults": faults} if as_json else table)
     return 0

@@ -119,16 +119,16 @@ def track(
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
         # Files of pictures need not belong together.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
-        stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
+        stack.enter_context(stop.as_handler())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
         page = stack.enter_context(live_page(camera, title, view, say))
         has_bar = not opened.live and not (lines and sys.stdout.isatty())
         advance = stack.enter_context(count_bar("frames", count, has_bar))
-        for frame in frames(opened, time.monotonic, stop):
+        for frame in poll_until_stopped(opened, time.monotonic, stop):
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
-            for tracked in tracker.results(frame, name):
+            for tracked in tracker.process(frame, name):
                 summary.add(tracked)
                 if lines:
                     line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
@@ -147,9 +147,11 @@ def track(
         raise Interrupted("Ctrl-C: stopped; what was printed is complete")
 
 
-def frames(source: FrameSource, now: Callable[[], float], stop: Stopper) -> Iterator[Frame]:
-    """Yield every frame of a recording, the newest ones of a live source, until the end or
-    Ctrl-C. A source that is silent is reported once, until it gives a frame again."""
+def poll_until_stopped(
+    source: FrameSource, now: Callable[[], float], stop: Stopper
+) -> Iterator[Frame]:
+    """Yield every frame of a recording, or the newest frames of a live source, until the end or
+    Ctrl-C. A live source without frames is reported once per outage."""
     is_silent = False
     while not stop.requested.is_set():
         now_s = now()
@@ -175,7 +177,7 @@ def frames(source: FrameSource, now: Callable[[], float], stop: Stopper) -> Iter
 
 
 @dataclass(frozen=True, eq=False)
-class CameraPose:
+class TargetInCamera:
     """The target's pose in the camera frame; `sigma_m` (3,) is along the camera's axes."""
 
     rvec_rad: Array
@@ -187,40 +189,41 @@ class CameraPose:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """The result of one picture.
+    """Tracking result of one picture.
 
     Attributes:
-        name: the picture's file name, or its frame's index if it has none.
-        output: what the pipeline found; None if the picture was not searched.
-        target: at stage ``none`` this is the filter's prediction.
-        notes: the sentences that the picture deserves.
+        name: the picture's file name, or else the frame's index.
+        output: the pipeline's output; None if the picture was not searched.
+        target: the target's pose; at stage ``none`` predicted by the filter.
+        notes: remarks on the picture, a sentence each.
     """
 
     name: str | int
     picture: Frame
     output: PipelineOutput | None = None
-    target: CameraPose | None = None
+    target: TargetInCamera | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def stage(self) -> str:
-        """The markers that this picture shows."""
+        """The detected markers: large, small, both or none."""
         return "none" if self.output is None else self.output.stage.value
 
 
 class Tracker:
-    """Turns frames into results by the profile's pipeline, with the camera for vehicle and gear;
-    with `stills` each picture is searched thoroughly by itself."""
+    """Runs the profile's pipeline on frames, for poses relative to the camera instead of the gear;
+    with `stills` each picture is searched thoroughly and by itself."""
 
     def __init__(self, profile: Profile, camera: CameraModel, *, live: bool, stills: bool) -> None:
         pipeline = make_pipeline(camera_profile(profile), camera)
         self._perception = Perception(pipeline, stills=stills)
         self._config, self._live, self._stills = profile.camera, live, stills
         self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
-        self._target: CameraPose | None = None
+        self._target: TargetInCamera | None = None
 
-    def results(self, frame: Frame, name: str | int) -> list[TrackResult]:
-        """Return the frame's result, or those of its two fields; none for a live repetition."""
+    def process(self, frame: Frame, name: str | int) -> list[TrackResult]:
+        """Return the results of a frame: one, two if it is interlaced (one for each field), or none
+        for a repeated picture of a live source."""
         judged = self._perception.health.assess(frame, self._live or not self._stills)
         if self._live and judged == "repeated":
             return []
@@ -229,7 +232,7 @@ class Tracker:
             return [TrackResult(name, frame, notes=about)]
         results = []
         for picture, output in self._perception.look(frame):
-            self._target = camera_pose(output, self._target)
+            self._target = target_in_camera(output, self._target)
             notes = (*about, *self._notes(output))
             results.append(TrackResult(name, picture, output, self._target, notes))
         return results
@@ -245,15 +248,19 @@ class Tracker:
             yield _DISAGREE
 
 
-def camera_pose(output: PipelineOutput, before: CameraPose | None) -> CameraPose | None:
+def target_in_camera(
+    output: PipelineOutput, before: TargetInCamera | None
+) -> TargetInCamera | None:
     """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
-    are one; None without a target. `before` is the last target: its tilt is kept while the filter
-    predicts."""
+    frames coincide; None without a target. `before`: the last pose, whose tilt is kept while the
+    filter predicts."""
     target, poses = output.target, output.poses
     if target is None:
         return None
     stage = target.stage.value
-    known: MarkerPose | CameraPose | None = poses.get("joint" if stage == "both" else stage, before)
+    known: MarkerPose | TargetInCamera | None = poses.get(
+        "joint" if stage == "both" else stage, before
+    )
     if stage == "both" and "joint" not in poses:
         known = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
     if known is None:
@@ -262,14 +269,14 @@ def camera_pose(output: PipelineOutput, before: CameraPose | None) -> CameraPose
     R = np.asarray(cv2.Rodrigues(known.rvec_rad)[0], dtype=np.float64)
     R = rot_z(target.e_yaw_rad - yaw_of(R)) @ R
     rvec = np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
-    return CameraPose(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
+    return TargetInCamera(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
 
 
 # --- What is printed --------------------------------------------------
 
 
 def track_record(tracked: TrackResult) -> dict[str, Any]:
-    """Return the line of `track --json`; what is not finite becomes None."""
+    """Return a line of `track --json`; None for values that are not finite."""
     target, output = tracked.target, tracked.output
     return {
         "frame": tracked.name,
@@ -307,7 +314,7 @@ def text_line(tracked: TrackResult) -> str:
     return f"{head}  {_target_text(tracked.target)}"
 
 
-def _target_text(target: CameraPose | None) -> str:
+def _target_text(target: TargetInCamera | None) -> str:
     if target is None:
         return "target not seen"
     x, y, z = (f"{100.0 * v:+7.2f}" for v in target.tvec_m)
@@ -315,7 +322,7 @@ def _target_text(target: CameraPose | None) -> str:
 
 
 def track_state(tracked: TrackResult) -> dict[str, Any]:
-    """Return what the live page shows of a frame, ready for JSON."""
+    """Return the state of the live page for a frame, for JSON."""
     rows = [
         ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
         ["markers", tracked.stage],
@@ -325,7 +332,7 @@ def track_state(tracked: TrackResult) -> dict[str, Any]:
 
 
 class TrackSummary:
-    """Counts results and the conditions that they note; each is printed once, as it begins."""
+    """Counts results, detections and notes; prints each kind of note once, when it first occurs."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -333,7 +340,7 @@ class TrackSummary:
         self._noted: Counter[str] = Counter()
 
     def add(self, tracked: TrackResult) -> None:
-        """Count this result, and print what is new in it."""
+        """Count a result, and print its new kinds of notes."""
         self.frames += 1
         if tracked.output is not None:
             seen = tracked.output.detections
@@ -346,7 +353,7 @@ class TrackSummary:
             self._noted[kind] += 1
 
     def text(self, took_s: float) -> str:
-        """Return the sentence at the end."""
+        """Return the summary of all frames."""
         frames, took_s = self.frames, max(took_s, 1e-6)
         large, small = (100.0 * self._found[name] / max(frames, 1) for name in ("large", "small"))
         counted = "".join(f"; {note} in {n}" for note, n in self._noted.items())

@@ -36,7 +36,7 @@ _PICTURE_STALE_S = 1.0
 
 
 class LivePage:
-    """Serves one page until closed.
+    """Serves one page on localhost until closed.
 
     Args:
         camera: for drawing the axes.
@@ -91,13 +91,14 @@ class LivePage:
             self._changed.notify_all()
 
     def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
-        """Show these numbers from now on; they are formatted only when a reader polls. With
-        `live`, updates must keep coming, and the page says when they stop."""
+        """Show the values that `describe` returns; it is called when a browser polls. With `live`,
+        the page warns when `set_state` is no longer called."""
         self._describe = describe
         self._state_s = self._clock() if live else None
 
     def end(self, card: dict[str, Any]) -> None:
-        """Show this card with the last picture and numbers; wait a second for who still looks."""
+        """Show a card with the outcome over the last picture and values. Waits up to a second for a
+        browser that is polling, so that it gets the card."""
         with self._changed:
             self._card, self._state_s = card, None
             read_s = self._read_s
@@ -107,10 +108,10 @@ class LivePage:
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
-        0..1; note, phase, battery, over), and title, fresh (whether pictures come), stop
-        (``none``, ``ready``, ``requested``, ``over``), age_s of these numbers (None where no
-        others are due), card (`end`'s, or None)."""
+        """Return the JSON that the page polls: the keys of `describe` (rows of name, text and
+        optional bar length 0..1; note, phase, battery, over), title, fresh (whether pictures come),
+        stop (``none``, ``ready``, ``requested``, ``over``), age_s of the values (None if no update
+        is due), and the card of `end`, or None."""
         try:
             described = self._describe()
         except Exception as error:
@@ -134,8 +135,8 @@ class LivePage:
         }
 
     def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
-        """Return the newest picture, drawn, if it is newer than `number`. None if none came for a
-        while."""
+        """Wait for a picture newer than `number`; return its number and JPEG, or None on a
+        timeout."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._number > number, WAIT_S)
             newest, sketch = self._number, self._sketch
@@ -166,7 +167,7 @@ class LivePage:
         self.problem = f"{type(error).__name__}: {error}"
 
     def close(self) -> None:
-        """End the streams and free the port; bounded."""
+        """End the streams and free the port; waits at most 2 s."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
@@ -183,8 +184,8 @@ def live_page(
     report: Callable[[str], None],
     on_stop: Callable[[], None] | None = None,
 ) -> Iterator[LivePage | None]:
-    """Yield a page for the block, or None if none is wanted; `report` prints its address, and at
-    the end its problem. `on_stop`: as in `LivePage`."""
+    """Serve a page during the block; yield None unless `wanted`. `report` prints the address, and
+    at the end the page's problem if any. `on_stop`: as in `LivePage`."""
     if not wanted:
         yield None
         return
@@ -234,7 +235,7 @@ class PageServer(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Keep an error in the page's `problem`, but for a reader that goes away."""
+        """Store an error in the page's `problem`, unless the browser just disconnected."""
         error = sys.exception()
         if error is not None and not isinstance(error, OSError):
             self.page.store_error(error)
@@ -346,12 +347,12 @@ _FAR_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """One picture and what to draw into it; made in the loop, drawn elsewhere.
+    """A picture with the overlay to draw on it, which is done outside the flight loop.
 
     Attributes:
         image: grey (h, w) uint8; not changed by drawing.
-        outlines: marker's name and its corners (4, 2) px.
-        pose: rvec (3,) and tvec (3,) of the axes to draw, and their length in m.
+        outlines: name and corners (4, 2) px of each marker.
+        pose: rvec (3,), tvec (3,) and length in m of the axes to draw.
     """
 
     image: NDArray[np.uint8]
@@ -360,7 +361,8 @@ class Sketch:
 
 
 def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
-    """Return the frame with outlines of its markers and axes of its pose; bare if not searched."""
+    """Return the frame with its marker outlines and the axes of the target's pose; without either
+    if `output` is None. `large_side_m` is the side of the large marker."""
     if output is None or output.detections.frame_index != frame.index:
         return Sketch(frame.image)
     found = ((name, output.detections.get(name)) for name in MARKERS)
@@ -374,8 +376,8 @@ def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
-    """Return the picture in colour (blue, green, red), (h, w, 3) uint8, without lines that leave it
-    by far, and axes with a tip behind the camera."""
+    """Return the picture with its overlay, BGR (h, w, 3) uint8. Lines far outside the picture, and
+    axes with a tip behind the camera, are left out."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:
         _draw_line(picture, np.vstack([corners, corners[:1]]), _OUTLINE.get(name, _OTHER), 1)

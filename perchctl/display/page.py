@@ -21,10 +21,9 @@ STEPS = [phase.value for phase in Phase if phase.is_flying and phase is not Phas
 
 
 class FlightPage:
-    """A flight's watcher; the pictures come through `watched`.
+    """Watcher of the flight loop for the live page; pictures come by `watch_source`.
 
-    A page that fails is no reason to land: `problem` is always None, `page.problem` holds
-    the error.
+    A failing page does not land the vehicle: `problem` stays None, `page.problem` has the error.
     """
 
     problem: str | None = None
@@ -39,8 +38,8 @@ class FlightPage:
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
         page.set_state(lambda: waiting, live=False)
 
-    def watched(self, source: FrameSource) -> FrameSource:
-        """Return the same source; each frame it gives is remembered for the page."""
+    def watch_source(self, source: FrameSource) -> FrameSource:
+        """Wrap a frame source so that the page shows its frames."""
         return WrappedSource(source, self._seen)
 
     def tick(self, tick: Tick) -> None:
@@ -60,13 +59,14 @@ class FlightPage:
             self._rescue = event.reason
 
     def end(self, summary: FlightSummary, log: Path) -> None:
-        """Show how the flight ended and where to look next, as the last that the page shows."""
+        """Show the flight's outcome, its log, and the command for a report, as the final state."""
         first, *lines = summary.text().splitlines()
         rows = [[part.strip() for part in line.split(":", maxsplit=1)] for line in lines]
         self._end(summary.outcome, first.partition(": ")[2], rows, log)
 
     def fail(self, error: BaseException, log: Path | None) -> None:
-        """Show the error that ended or prevented the flight, with the rescue's report."""
+        """Show that the flight ended in an error or never began, with the rescue's report, and the
+        log if there is one."""
         rows = [["flight", self._rescue]] if self._rescue else []
         self._end("failed", str(error) or type(error).__name__, rows, log)
 
@@ -84,9 +84,10 @@ class FlightPage:
             self.page.show(Sketch(frame.image))
 
 
-def flight_state(tick: Tick, drawn: dict[str, float]) -> dict[str, Any]:
-    """Return what the page shows of a tick: phase, battery, the panel's rows, whether it is over;
-    for its drawings height, error (m; None: no target) and `drawn`."""
+def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
+    """Return the page's state for a tick: phase, battery, the rows of the terminal's panel, whether
+    the flight is over, and for its drawings height and error (m; None: no target) and the sizes
+    large_m (marker) and gear_m."""
     state, volts, target = tick.state, tick.telemetry.battery_v, tick.target
     off_m, below_m = (
         (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])
@@ -102,5 +103,5 @@ def flight_state(tick: Tick, drawn: dict[str, float]) -> dict[str, Any]:
         "height_m": tick.telemetry.position_m[2] - ground_m,
         "off_m": off_m,
         "below_m": below_m,
-        **drawn,
+        **drawing_sizes,
     }

@@ -20,7 +20,8 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 def status_rows(tick: Tick) -> list[tuple[str, str]]:
-    """Return name and text of each line, at most 80 columns together, in m, cm and degrees."""
+    """Return name and text of each line of the status panel, at most 80 columns together, in m, cm
+    and degrees."""
     state, target = tick.state, tick.target
     if target is None:
         error = "no target seen yet"
@@ -104,9 +105,9 @@ _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold r
 
 
 class FlightPanel:
-    """The display: on a terminal a panel below the events' lines, elsewhere the lines alone. No
-    method raises or waits, but `close` (bounded). A failed display is no reason to land:
-    `problem` is always None, `failure` says why it fell silent.
+    """Watcher of the flight loop that prints events and, on a terminal, a status panel below them.
+    No method raises, and only `close` waits (bounded). A failing display must not land the vehicle:
+    `problem` is always None, `failure` says why the output stopped.
     """
 
     problem: str | None = None
@@ -128,7 +129,8 @@ class FlightPanel:
         self._thread.start()
 
     def tick(self, tick: Tick) -> None:
-        """Show this tick: at once in a new phase, else 0.1 s after the last one, or at the end."""
+        """Show a tick of the loop at once if its phase is new, else at most every 0.1 s; the last
+        tick is always shown."""
         is_new = self._tick is None or self._tick.state.phase is not tick.state.phase
         self._tick = tick
         if is_new or tick.t_s >= self._next_s:
@@ -136,14 +138,14 @@ class FlightPanel:
             self._wake.set()
 
     def event(self, event: Event) -> None:
-        """Write the line of an event, at once."""
+        """Print an event as one line, at once."""
         if self._start_s is None:
             self._start_s = event.t_s
         self._lines.append(f"[{event.t_s - self._start_s:7.2f} s] {event_text(event)}")
         self._wake.set()
 
     def close(self) -> None:
-        """Draw what is left and give the terminal back; waits at most a second."""
+        """Print what is pending and release the terminal; waits at most a second."""
         self._closing.set()
         self._wake.set()
         self._thread.join(CLOSE_TIMEOUT_S)
@@ -171,7 +173,7 @@ class FlightPanel:
         tick = self._tick
         if self._live is not None and tick is not None and tick is not self._drawn:
             self._drawn = tick
-            self._live.update(panel(tick), refresh=True)
+            self._live.update(status_panel(tick), refresh=True)
 
 
 def _new_live(stream: TextIO) -> Live:
@@ -186,9 +188,9 @@ def _new_live(stream: TextIO) -> Live:
     return Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True)
 
 
-def panel(tick: Tick) -> Panel:
-    """Return the tick as a panel of at most `WIDTH` columns and eight lines; nine with positions
-    from outside."""
+def status_panel(tick: Tick) -> Panel:
+    """Return the status panel of a tick: at most `WIDTH` columns and eight lines, nine with
+    external positions."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
     table.add_column(no_wrap=True, overflow="ellipsis")

@@ -70,7 +70,7 @@ def either(share: float, one: Any, other: Any) -> Draw:
     return lambda source: _value(one if chance(source, share) else other, source)
 
 
-def signed(size: Draw) -> Draw:
+def random_sign(size: Draw) -> Draw:
     """Draw a number of either sign."""
     return lambda source: (1.0 if chance(source, 0.5) else -1.0) * size(source)
 
@@ -80,13 +80,13 @@ def one_of(*choices: Any) -> Draw:
     return lambda source: choices[int(source.rng.integers(len(choices)))]
 
 
-def direction(source: DrawInputs) -> tuple[float, float]:
+def draw_direction(source: DrawInputs) -> tuple[float, float]:
     """Draw a horizontal unit vector of random direction."""
     angle = float(source.rng.uniform(-math.pi, math.pi))
     return math.cos(angle), math.sin(angle)
 
 
-def key_presses(period: Any, duration: Draw) -> Draw:
+def key_press_times(period: float | Draw, duration: Draw) -> Draw:
     """Draw the times of a key that is pressed again and again."""
 
     def draw(source: DrawInputs) -> tuple[float, ...]:
@@ -109,20 +109,20 @@ def effect(act: Callable[..., object], **values: Any) -> Draw:
 
 
 def _jump_xy(source: DrawInputs) -> e.Axes:
-    x, y = direction(source)
+    x, y = draw_direction(source)
     step_m = log_uniform(0.1, 2.0)(source)
     return x * step_m, y * step_m, 0.0
 
 
 def _drift(source: DrawInputs) -> e.Axes:
-    x, y = direction(source)
+    x, y = draw_direction(source)
     speed_mps = log_uniform(0.03, 0.3)(source)
     return x * speed_mps, y * speed_mps, uniform(-0.2, 0.2)(source) * speed_mps
 
 
 def _blow(source: DrawInputs) -> e.Axes:
     """Draw the force of a blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
-    x, y = direction(source)
+    x, y = draw_direction(source)
     z = uniform(-0.5, 0.5)(source)
     force_n = source.scenario.mass_kg * uniform(0.2, 1.0)(source) / 0.04
     return x * force_n, y * force_n, z * force_n
@@ -130,19 +130,19 @@ def _blow(source: DrawInputs) -> e.Axes:
 
 def _gust(source: DrawInputs) -> e.Axes:
     """Draw a force of up to a fifth of the weight, mostly sideways."""
-    x, y = direction(source)
+    x, y = draw_direction(source)
     z = uniform(-0.3, 0.3)(source)
     force_n = source.scenario.mass_kg * GRAVITY_MPS2 * uniform(0.05, 0.2)(source)
     return x * force_n, y * force_n, z * force_n
 
 
 def _a_step_aside(source: DrawInputs) -> tuple[float, float]:
-    x, y = direction(source)
+    x, y = draw_direction(source)
     return 0.3 * x, 0.3 * y
 
 
 def _beside(source: DrawInputs) -> tuple[Neighbour, ...]:
-    x, y = direction(source)
+    x, y = draw_direction(source)
     away_m = uniform(0.35, 1.2)(source)
     return (Neighbour((x * away_m, y * away_m)),)
 
@@ -180,11 +180,11 @@ def packet_loss(order: str) -> Draw:
     return effect(e.packet_lost, order=order, count=either(0.6, 1, 2))
 
 
-def camera(kind: str) -> Draw:
+def camera_effect(kind: str) -> Draw:
     return effect(e.camera_fault, kind=kind, for_s=duration_s())
 
 
-def wrong_positions(how: Any) -> Draw:
+def mocap_effect(how: str | Draw) -> Draw:
     return effect(e.external_positions, how=how, for_s=duration_s())
 
 
@@ -201,7 +201,7 @@ ONCE = effect(e.operator, presses_s=(0.0,))
 HUNG = effect(e.hung, for_s=duration_s(0.3))
 KICK = effect(e.push, force_n=_blow, for_s=0.04)
 GUST = effect(e.push, force_n=_gust, for_s=uniform(0.5, 1.0))
-COVERED = camera("covered")
+COVERED = camera_effect("covered")
 WEAK_MAGNET = effect(e.magnet_holds, of_weight=uniform(0.2, 1.1))
 NO_UPLINK = radio_effect(up=True)
 LOW_VOLTAGE = effect(e.log_reads, names=("pm.vbat",), value=uniform(2.6, 3.1), for_s=duration_s())
@@ -249,8 +249,8 @@ class Fault:
     """One entry of the catalogue. `draw` draws one effect, or a tuple of several."""
 
     name: str
-    what: str
-    draw: Any
+    description: str
+    draw: Draw | tuple[Draw, ...]
     phases: tuple[Phase, ...] = AIR
 
 
@@ -293,18 +293,18 @@ FAULTS: tuple[Fault, ...] = (
         effect(e.radio_loss, down="all", delay_s=log_uniform(0.05, 2.0), for_s=duration_s(0.5)),
     ),
     # The camera.
-    Fault("camera-silent", "no picture", camera("silent")),
-    Fault("camera-frozen", "the same picture again and again", camera("frozen")),
-    Fault("camera-snow", "a receiver's snow", camera("snow")),
-    Fault("camera-dark", "a nearly black picture", camera("dark")),
-    Fault("camera-lossy", "20 % of the pictures lost", camera("lossy")),
+    Fault("camera-silent", "no picture", camera_effect("silent")),
+    Fault("camera-frozen", "the same picture again and again", camera_effect("frozen")),
+    Fault("camera-snow", "a receiver's snow", camera_effect("snow")),
+    Fault("camera-dark", "a nearly black picture", camera_effect("dark")),
+    Fault("camera-lossy", "20 % of the pictures lost", camera_effect("lossy")),
     Fault("target-covered", "something hides the target", COVERED),
     Fault(
         "camera-late",
         "pictures 50 to 600 ms late that look fresh",
         effect(e.camera_fault, kind="late", for_s=duration_s(1.0), late_s=log_uniform(0.05, 0.6)),
     ),
-    Fault("camera-out-of-order", "in pairs, the newer one first", camera("out-of-order")),
+    Fault("camera-out-of-order", "in pairs, the newer one first", camera_effect("out-of-order")),
     Fault(
         "camera-mirrored",
         "mirrored pictures from the start",
@@ -321,13 +321,17 @@ FAULTS: tuple[Fault, ...] = (
         "height-jumps",
         "steps in height by 0.1 to 1 m",
         effect(
-            e.estimate_error, step_m=(0.0, 0.0, signed(log_uniform(0.1, 1.0))), for_s=duration_s()
+            e.estimate_error,
+            step_m=(0.0, 0.0, random_sign(log_uniform(0.1, 1.0))),
+            for_s=duration_s(),
         ),
     ),
     Fault(
         "heading-jumps",
         "turns by 10 to 180 deg",
-        effect(e.estimate_error, turn_deg=signed(log_uniform(10.0, 180.0)), for_s=duration_s()),
+        effect(
+            e.estimate_error, turn_deg=random_sign(log_uniform(10.0, 180.0)), for_s=duration_s()
+        ),
     ),
     Fault(
         "estimate-drifts",
@@ -342,15 +346,15 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "external-position",
         "positions freeze or end",
-        wrong_positions(either(0.5, "frozen", "silent")),
+        mocap_effect(either(0.5, "frozen", "silent")),
     ),
     Fault(
         "external-occluded",
         "the body is hidden",
         effect(e.external_positions, how="occluded", for_s=either(0.5, 0.3, duration_s(0.5))),
     ),
-    Fault("external-swapped", "another body takes its name", wrong_positions("swapped")),
-    Fault("external-scaled", "positions in millimetres", wrong_positions("millimetres")),
+    Fault("external-swapped", "another body takes its name", mocap_effect("swapped")),
+    Fault("external-scaled", "positions in millimetres", mocap_effect("millimetres")),
     Fault(
         "external-late",
         "positions come 50 to 150 ms later than they say",
@@ -383,7 +387,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "ceiling-beside-its-plane",
         "the target lies 2 to 20 cm above or below it",
-        effect(e.room, target_above_ceiling_m=signed(log_uniform(0.02, 0.2))),
+        effect(e.room, target_above_ceiling_m=random_sign(log_uniform(0.02, 0.2))),
         FROM_THE_START,
     ),
     Fault(
@@ -422,7 +426,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "operator-held",
         "Ctrl-C held for 0.1 to 1.8 s: it repeats every 30 ms",
-        effect(e.operator, presses_s=key_presses(0.03, log_uniform(0.1, 1.8))),
+        effect(e.operator, presses_s=key_press_times(0.03, log_uniform(0.1, 1.8))),
     ),
     Fault("hang-up", "the terminal is closed", effect(e.operator, presses_s=(0.0,), hang_up=True)),
     # The program.
@@ -459,12 +463,12 @@ FAULTS: tuple[Fault, ...] = (
         "hovers with up to 8 % more or less",
         effect(e.thrust_changed, to=_another_thrust),
     ),
-    Fault("external-mirrored", "positions come mirrored", wrong_positions("mirrored")),
+    Fault("external-mirrored", "positions come mirrored", mocap_effect("mirrored")),
     Fault("exception", "an exception ends the loop", effect(e.raises)),
     Fault(
         "operator-hammers",
         "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s",
-        effect(e.operator, presses_s=key_presses(uniform(0.08, 0.25), uniform(2.5, 4.0))),
+        effect(e.operator, presses_s=key_press_times(uniform(0.08, 0.25), uniform(2.5, 4.0))),
     ),
     # Two at once.
     Fault("covered-and-kick", "a blow; the target is hidden", (COVERED, KICK), BY_CAMERA),
@@ -491,7 +495,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "deck-silent",
         "the deck's positions end",
-        effect(e.deck_silent, for_s=duration_s(0.3), acc_z_mps2=signed(uniform(0.03, 0.08))),
+        effect(e.deck_silent, for_s=duration_s(0.3), acc_z_mps2=random_sign(uniform(0.03, 0.08))),
     ),
 )
 

@@ -1,6 +1,6 @@
 """The edges of a flight at which faults come in: its radio, its camera, and the program itself.
 
-What `perchctl.faults.effects` does acts on `Edges`.
+What `perchctl.faults.effects` does acts on `FaultRig`.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ def packet_kind(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """A radio that loses the packets that `air` loses, and more.
+    """A radio that loses the packets that `air` loses, and those that a fault names.
 
     Attributes:
         cut: the uplink has ended for good.
-        lost: how many of the next packets of an order are lost; `twice`: orders whose next packet
-            arrives twice.
-        receive: is called with the second copy of a packet.
+        lost: number of packets still to lose, by `packet_kind`; `twice`: the kinds whose next
+            packet arrives twice.
+        receive: called with the second copy of a packet.
     """
 
     def __init__(self, air: Radio | None = None) -> None:
@@ -60,9 +60,10 @@ class FaultyRadio(Radio):
         self.twice: set[str] = set()
         self.receive: Callable[[Packet], None] | None = None
 
-    def lose(self, end_s: float, up: bool, down: str, delay_s: float = math.inf) -> None:
-        """Until `end_s` lose commands (`up`) and block `down` or "all"; `delay_s` delays it."""
-        self._losses.append((end_s, up, down, delay_s))
+    def lose(self, end_s: float, uplink: bool, block: str, delay_s: float = math.inf) -> None:
+        """Until `end_s` lose all commands (`uplink`), and the packets of a log block, or of "all";
+        with `delay_s` these packets arrive late instead."""
+        self._losses.append((end_s, uplink, block, delay_s))
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
         if self.cut or not self._air.uplink_arrives(packet, now_s):
@@ -263,9 +264,10 @@ class FaultyClock:
 
 
 @dataclass
-class Edges:
-    """What faults act on: vehicle, radio, camera, clock, the operator's Ctrl-C (`press`) and closed
-    terminal (`hang_up`), and the log's `disk`. `each` is called every `SAMPLE_S`."""
+class FaultRig:
+    """The parts of a flight that faults act on: `press` is the operator's Ctrl-C, `hang_up` closes
+    the terminal, and `disk.problem` is that of the log's disk. Each of `on_sample` is called every
+    `SAMPLE_S`."""
 
     vehicle: SimulatedVehicle
     radio: FaultyRadio
@@ -275,7 +277,7 @@ class Edges:
     hang_up: Callable[[], None]
     disk: Any
     deck_silent: bool = False
-    each: list[Callable[[float], None]] = field(default_factory=list)
+    on_sample: list[Callable[[float], None]] = field(default_factory=list)
     _later: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
 
     def call_at(self, t_s: float, act: Callable[[], None]) -> None:
@@ -289,8 +291,8 @@ class Edges:
         self.call_at(end_s, partial(setattr, owner, name, after))
 
     def call_due(self, t_s: float) -> None:
-        """Call what is due by then, and each function of `each`; called every `SAMPLE_S`."""
+        """Call what is due by `t_s`, and each of `on_sample`; to be called every `SAMPLE_S`."""
         while self._later and self._later[0][0] <= t_s:
             self._later.pop(0)[1]()
-        for act in self.each:
+        for act in self.on_sample:
             act(t_s)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from perchctl.faults.edges import CameraFault, Edges, PlantedError
+from perchctl.faults.edges import CameraFault, FaultRig, PlantedError
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
 from perchctl.mission import Phase, Tick
@@ -23,7 +23,7 @@ Axes = tuple[float, float, float]
 """World axes."""
 FOR_EVER = 1e6
 SAMPLE_S = 0.01
-"""Between two calls of `Injector.each` and `Edges.call_due`."""
+"""Between two calls of `Injector.begin_due` and `FaultRig.call_due`."""
 LIGHTHOUSE = "deck.bcLighthouse4"
 CAPTURE_FAULTS = {
     "frozen": CaptureFault(frozen=True),
@@ -40,7 +40,7 @@ CAPTURE_FAULTS = {
 
 
 def radio_loss(
-    edges: Edges,
+    rig: FaultRig,
     t_s: float,
     for_s: float,
     up: bool = False,
@@ -49,52 +49,55 @@ def radio_loss(
 ) -> None:
     """Lose all commands (`up`), and the log block of the name `down`, or "all"; with `delay_s`
     these come late instead."""
-    edges.radio.lose(t_s + for_s, up, down, delay_s)
+    rig.radio.lose(t_s + for_s, up, down, delay_s)
 
 
-def packet_lost(edges: Edges, t_s: float, order: str, count: int) -> None:
-    """Lose the next `count` packets of an order (`packet_kind` of `perchctl.faults.edges`)."""
-    edges.radio.lost[order] = count
+def packet_lost(rig: FaultRig, t_s: float, order: str, count: int) -> None:
+    """Lose the next `count` packets of the kind `order` (`perchctl.faults.edges.packet_kind`)."""
+    rig.radio.lost[order] = count
 
 
-def packet_twice(edges: Edges, t_s: float, order: str) -> None:
-    """Let the next packet of an order arrive twice."""
-    edges.radio.twice.add(order)
+def packet_twice(rig: FaultRig, t_s: float, order: str) -> None:
+    """Let the next packet of the kind `order` arrive twice."""
+    rig.radio.twice.add(order)
 
 
-def reboots(edges: Edges, t_s: float, boots_s: float) -> None:
-    """Reboot the vehicle: it stops, hears nothing for `boots_s`, and has lost its log blocks."""
-    edges.vehicle.firmware.reboot()
-    edges.radio.lose(t_s + boots_s, up=True, down="all")
-    edges.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), up=False, down="all")
+def reboots(rig: FaultRig, t_s: float, boots_s: float) -> None:
+    """Reboot the vehicle after a voltage drop: its motors stop, it receives nothing for `boots_s`,
+    and its log blocks are gone until the link starts them again."""
+    rig.vehicle.firmware.reboot()
+    rig.radio.lose(t_s + boots_s, uplink=True, block="all")
+    rig.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), uplink=False, block="all")
 
 
 # --- The camera and the positions -------------------------------------
 
 
-def camera_fault(edges: Edges, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
+def camera_fault(rig: FaultRig, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
     """Spoil the camera's pictures (`CameraFault`)."""
-    edges.camera.begin(CameraFault(kind, for_s, late_s), t_s)
+    rig.camera.begin(CameraFault(kind, for_s, late_s), t_s)
 
 
 def external_positions(
-    edges: Edges, t_s: float, how: str, for_s: float, late_s: float = 0.0
+    rig: FaultRig, t_s: float, how: str, for_s: float, late_s: float = 0.0
 ) -> None:
-    """Let the motion capture fail as `CAPTURE_FAULTS` has it, or be late by `late_s`."""
-    assert edges.vehicle.capture is not None
-    edges.vehicle.capture.begin_fault(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
+    """Make the motion capture of a vehicle without a deck fail as `CAPTURE_FAULTS[how]`, or be late
+    by `late_s`."""
+    assert rig.vehicle.capture is not None
+    rig.vehicle.capture.begin_fault(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
 
 
-def deck_silent(edges: Edges, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the deck's positions, which corrected a bias of `acc_z_mps2` by the motors' shaking."""
-    edges.set_until(t_s + for_s, edges, "deck_silent", True, False)
+def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:
+    """Stop the absolute positions of the vehicle's deck. Until then they corrected an
+    accelerometer that reads `acc_z_mps2` too much along z, because the motors shake it."""
+    rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
 
 # --- The vehicle ------------------------------------------------------
 
 
 def estimate_error(
-    edges: Edges,
+    rig: FaultRig,
     t_s: float,
     step_m: Axes = (0.0, 0.0, 0.0),
     turn_deg: float = 0.0,
@@ -104,7 +107,7 @@ def estimate_error(
     """Add a step and a drift to the vehicle's state estimate."""
 
     def spoil(now: Any) -> None:
-        after_s = edges.vehicle.t_s - t_s
+        after_s = rig.vehicle.t_s - t_s
         x, y, z = step_m
         vx, vy, vz = drift_mps
         now.x_m += x + vx * after_s
@@ -115,22 +118,22 @@ def estimate_error(
         now.vz_mps += vz
         now.yaw_deg = math.remainder(now.yaw_deg + turn_deg, 360.0)
 
-    edges.set_until(t_s + for_s, edges.vehicle.firmware.estimator, "spoil", spoil, None)
+    rig.set_until(t_s + for_s, rig.vehicle.firmware.estimator, "spoil", spoil, None)
 
 
 def log_reads(
-    edges: Edges, t_s: float, names: tuple[str, ...], value: float | None, for_s: float
+    rig: FaultRig, t_s: float, names: tuple[str, ...], value: float | None, for_s: float
 ) -> None:
-    """Let log variables report `value` (None: their value of that moment) whatever is true."""
-    firmware = edges.vehicle.firmware
+    """Let log variables report `value` (None: their present value), whatever the true one is."""
+    firmware = rig.vehicle.firmware
     for name in names:
         firmware.log_overrides[name] = firmware.log_value(name) if value is None else value
-    edges.call_at(t_s + for_s, firmware.log_overrides.clear)
+    rig.call_at(t_s + for_s, firmware.log_overrides.clear)
 
 
-def battery_sags(edges: Edges, t_s: float, rate_vps: float, by_v: float) -> None:
+def battery_sags(rig: FaultRig, t_s: float, rate_vps: float, by_v: float) -> None:
     """Let the battery's resting voltage fall by `by_v` at this rate."""
-    world, left_v = edges.vehicle.world, by_v
+    world, left_v = rig.vehicle.world, by_v
 
     def sag(_now_s: float) -> None:
         nonlocal left_v
@@ -138,25 +141,25 @@ def battery_sags(edges: Edges, t_s: float, rate_vps: float, by_v: float) -> None
         world.battery_rest_v -= step_v
         left_v -= step_v
 
-    edges.each.append(sag)
+    rig.on_sample.append(sag)
 
 
-def thrust_changed(edges: Edges, t_s: float, to: tuple[float, float, float, float]) -> None:
-    """Leave each motor this part of its thrust, as with other propellers or a weak motor."""
-    powertrain = edges.vehicle.world.powertrain
+def thrust_changed(rig: FaultRig, t_s: float, to: tuple[float, float, float, float]) -> None:
+    """Multiply each motor's thrust by its factor in `to`, as with other propellers."""
+    powertrain = rig.vehicle.world.powertrain
     s1, s2, s3, s4 = (s * part for s, part in zip(powertrain.strength, to, strict=True))
     powertrain.strength = (s1, s2, s3, s4)
 
 
-def push(edges: Edges, t_s: float, force_n: Axes, for_s: float) -> None:
+def push(rig: FaultRig, t_s: float, force_n: Axes, for_s: float) -> None:
     """Let a force act on the vehicle."""
     still_n = (0.0, 0.0, 0.0)
-    edges.set_until(t_s + for_s, edges.vehicle.world, "external_force_n", force_n, still_n)
+    rig.set_until(t_s + for_s, rig.vehicle.world, "external_force_n", force_n, still_n)
 
 
-def magnet_lets_go(edges: Edges, t_s: float, after_s: float) -> None:
-    """Let the magnet go for good, so long after the contact."""
-    world, contact_s = edges.vehicle.world, math.inf
+def magnet_lets_go(rig: FaultRig, t_s: float, after_s: float) -> None:
+    """Release the magnet for good `after_s` after the contact."""
+    world, contact_s = rig.vehicle.world, math.inf
 
     def watch(now_s: float) -> None:
         nonlocal contact_s
@@ -165,56 +168,58 @@ def magnet_lets_go(edges: Edges, t_s: float, after_s: float) -> None:
         if now_s >= contact_s + after_s:
             world.magnet.let_go = True
 
-    edges.each.append(watch)
+    rig.on_sample.append(watch)
 
 
-def target_moves(edges: Edges, t_s: float, by_m: tuple[float, float]) -> None:
+def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
     """Move the target with its magnet."""
-    x, y = edges.vehicle.world.magnet.target_xy_m
-    edges.vehicle.move_target((x + by_m[0], y + by_m[1]))
+    x, y = rig.vehicle.world.magnet.target_xy_m
+    rig.vehicle.move_target((x + by_m[0], y + by_m[1]))
 
 
 # --- The operator and the program -------------------------------------
 
 
-def operator(edges: Edges, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False) -> None:
+def operator(
+    rig: FaultRig, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False
+) -> None:
     """Let the operator press Ctrl-C at these times, or close the terminal (`hang_up`)."""
     for press_s in presses_s:
-        edges.call_at(t_s + press_s, edges.hang_up if hang_up else edges.press)
+        rig.call_at(t_s + press_s, rig.hang_up if hang_up else rig.press)
 
 
-def killed(edges: Edges, t_s: float) -> None:
+def killed(rig: FaultRig, t_s: float) -> None:
     """Kill the program, which sends nothing more."""
-    edges.clock.pending = edges.clock.kill
+    rig.clock.pending = rig.clock.kill
 
 
-def suspended(edges: Edges, t_s: float, for_s: float) -> None:
+def suspended(rig: FaultRig, t_s: float, for_s: float) -> None:
     """Suspend the whole program."""
-    edges.clock.pending = partial(edges.clock.suspend, for_s)
+    rig.clock.pending = partial(rig.clock.suspend, for_s)
 
 
-def hung(edges: Edges, t_s: float, for_s: float) -> None:
-    """Let the loop's thread be stuck; the program's other threads live."""
-    edges.clock.pending = partial(edges.clock.hang, for_s)
+def hung(rig: FaultRig, t_s: float, for_s: float) -> None:
+    """Block the loop's thread for `for_s`; the program's other threads run on."""
+    rig.clock.pending = partial(rig.clock.hang, for_s)
 
 
-def slow(edges: Edges, t_s: float, tick_s: float, for_s: float) -> None:
+def slow(rig: FaultRig, t_s: float, tick_s: float, for_s: float) -> None:
     """Let each tick of the loop take `tick_s`."""
-    edges.clock.tick_s, edges.clock.slow_until_s = tick_s, t_s + for_s
+    rig.clock.tick_s, rig.clock.slow_until_s = tick_s, t_s + for_s
 
 
-def raises(edges: Edges, t_s: float) -> None:
-    """Raise an exception that the program does not foresee in the loop's thread."""
+def raises(rig: FaultRig, t_s: float) -> None:
+    """Raise an unforeseen exception in the loop's thread."""
 
     def fail() -> None:
         raise PlantedError("an exception that the fault raised")
 
-    edges.clock.pending = fail
+    rig.clock.pending = fail
 
 
-def disk_full(edges: Edges, t_s: float, for_s: float) -> None:
+def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
     """Fill the log's disk."""
-    edges.set_until(t_s + for_s, edges.disk, "problem", "No space left on device", None)
+    rig.set_until(t_s + for_s, rig.disk, "problem", "No space left on device", None)
 
 
 # --- What holds from the start ----------------------------------------
@@ -234,8 +239,8 @@ def room(scenario: Scenario, **fields: Any) -> Scenario:
 OF_THE_SCENARIO = (magnet_holds, room)
 
 
-def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
-    """Return the scenario with what holds from the start."""
+def scenario_for(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
+    """Return the scenario with the effects that hold from the start."""
     for effect in effects:
         if effect.func in OF_THE_SCENARIO:
             scenario = effect(scenario)
@@ -246,22 +251,22 @@ def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenari
     return scenario
 
 
-def changed_profile(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
+def profile_for(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
     """Return the profile with the positioning and the camera latency that the effects need."""
     for effect in effects:
         if effect.func in (external_positions, deck_silent):
             by = "deck" if effect.func is deck_silent else "mocap"
             positioning = profile.positioning.model_copy(update={"by": by})
             profile = profile.model_copy(update={"positioning": positioning})
-        latency_s = profile.camera.start_latency_s + sooner_s(effect)
+        latency_s = profile.camera.start_latency_s + latency_drop_s(effect)
         if latency_s > profile.camera.start_latency_s:
             camera = profile.camera.model_copy(update={"latency_s": latency_s})
             profile = profile.model_copy(update={"camera": camera})
     return profile
 
 
-def sooner_s(effect: Effect) -> float:
-    """Return the time by which the pictures will come sooner than the profile expects."""
+def latency_drop_s(effect: Effect) -> float:
+    """Return by how much the fault shortens the latency that the profile expects."""
     sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
@@ -270,30 +275,31 @@ def sooner_s(effect: Effect) -> float:
 
 
 class Injector:
-    """Begins effects `moment_s` into `phase`, or at its end. `tick` gets each of the loop,
-    `each` every `SAMPLE_S`. `begin_s` is None before, `flown` is the newest tick's phase."""
+    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. `tick` is called with
+    each tick of the loop, `begin_due` every `SAMPLE_S` of simulated time. `begin_s` is None until
+    the effects begin; `flown` is the phase of the newest tick."""
 
     def __init__(
-        self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
+        self, rig: FaultRig, effects: tuple[Effect, ...], phase: Phase, moment_s: float
     ) -> None:
-        self._edges, self._phase, self._moment_s = edges, phase, moment_s
+        self._edges, self._phase, self._moment_s = rig, phase, moment_s
         self._effects = [effect for effect in effects if effect.func not in OF_THE_SCENARIO]
         self._due_s: float | None = None
         self.begin_s: float | None = None
         self.flown: Phase | None = None
         self._shakes_mps2 = 0.0
         for effect in effects:
-            edges.camera.late_s += sooner_s(effect)
+            rig.camera.late_s += latency_drop_s(effect)
             if effect.func is deck_silent:
                 self._shakes_mps2 = effect.keywords["acc_z_mps2"]
-                edges.each.append(
-                    partial(_measure, edges, random.Random(edges.vehicle.scenario.seed))
+                rig.on_sample.append(
+                    partial(_measure, rig, random.Random(rig.vehicle.scenario.seed))
                 )
 
     def tick(self, tick: Tick) -> None:
         """Note the phase, and when the effects are due."""
         if self.flown is None and self._shakes_mps2:
-            self._edges.vehicle.firmware.estimator.shift_accelerometer(self._shakes_mps2)
+            self._edges.vehicle.firmware.estimator.add_accelerometer_bias(self._shakes_mps2)
         self.flown = tick.state.phase
         if self.begin_s is not None:
             return
@@ -303,8 +309,8 @@ class Injector:
         elif self._due_s is None:
             self._due_s = tick.t_s + self._moment_s
 
-    def each(self, t_s: float) -> None:
-        """Begin what is due."""
+    def begin_due(self, t_s: float) -> None:
+        """Begin the effects if they are due."""
         if self.begin_s is None and self._due_s is not None and t_s >= self._due_s:
             self.begin(t_s)
 
@@ -315,11 +321,11 @@ class Injector:
             effect(self._edges, t_s)
 
 
-def _measure(edges: Edges, noise: random.Random, _now_s: float) -> None:
+def _measure(rig: FaultRig, noise: random.Random, _now_s: float) -> None:
     """Give the estimator a position measured by the vehicle's own deck."""
-    if edges.deck_silent:
+    if rig.deck_silent:
         return
-    world, firmware = edges.vehicle.world, edges.vehicle.firmware
+    world, firmware = rig.vehicle.world, rig.vehicle.firmware
     sigma_m = firmware.scenario.estimate_noise_m
     x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
     firmware.estimator.take_external((x_m, y_m, z_m))

@@ -46,11 +46,11 @@ def _killed_in_landing(facts: Facts) -> float | None:
 
 
 def _let_go_later(facts: Facts) -> float | None:
-    return facts.let_go_s if facts.watched else None
+    return facts.magnet_failed_s if facts.was_watched else None
 
 
 def _too_low(facts: Facts) -> float | None:
-    return facts.slipped_s if facts.slipped_m < CATCHABLE_M else None
+    return facts.slipped_s if facts.slip_height_m < CATCHABLE_M else None
 
 
 def _knocked_off(facts: Facts) -> float | None:
@@ -67,8 +67,8 @@ def _too_weak(facts: Facts) -> float | None:
 def _sagged_too_fast(facts: Facts) -> float | None:
     if facts.weak_s is None or not facts.has_effect(battery_sags):
         return None
-    down_s = NOTICED_S + facts.low_m / DOWN_MPS
-    in_time = facts.low_s is not None and facts.weak_s - facts.low_s >= down_s
+    down_s = NOTICED_S + facts.battery_low_m / DOWN_MPS
+    in_time = facts.battery_low_s is not None and facts.weak_s - facts.battery_low_s >= down_s
     return None if in_time else facts.weak_s
 
 
@@ -82,7 +82,7 @@ EXPECTED_OUTCOMES = (
     ExpectedOutcome(
         "cut by the firmware",
         "2 s after the last setpoint the firmware cuts the motors and locks",
-        lambda facts: facts.cut_s,
+        lambda facts: facts.silence_lock_s,
         CUT_DOWN,
     ),
     ExpectedOutcome(

@@ -13,7 +13,7 @@ from perchctl.errors import PerchError
 from perchctl.faults import effects as e
 from perchctl.faults.catalogue import BY_NAME, FROM_THE_START, Case, draw_case
 from perchctl.faults.edges import (
-    Edges,
+    FaultRig,
     FaultyCamera,
     FaultyClock,
     FaultyRadio,
@@ -65,12 +65,13 @@ PROBE = Packet(Port.LINK, 0, b"")
 
 
 class FaultyFlight:
-    """A flight with a fault and its judge, to `fly` once; a watcher with the disk's `problem`."""
+    """One flight with a fault and its judge, ready for a single call of `fly`. It also watches
+    the loop; its `problem` is that of the log's disk."""
 
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None
     ) -> None:
-        profile = e.changed_profile(profile, case.effects)
+        profile = e.profile_for(profile, case.effects)
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
         self.problem: str | None = None
@@ -83,7 +84,7 @@ class FaultyFlight:
         source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
         self._clock = clock = FaultyClock(self._link, radio, LONGEST_FLIGHT_S)
         self._switch = OperatorSwitch(listening=True, clock=clock.now)
-        self._edges = edges = Edges(
+        self._edges = edges = FaultRig(
             vehicle, radio, source, clock, self._press, self._switch.land, self
         )
         self._injector = e.Injector(edges, case.effects, case.phase, case.moment_s)
@@ -120,7 +121,7 @@ class FaultyFlight:
 
     def fly(self) -> FaultResult:
         """Fly to the end, wait until the vehicle is at rest, and return the judgement."""
-        self._vehicle.each = self._each
+        self._vehicle.on_sample = self._each
         self._link.connect()
         if self._case.fault.phases == FROM_THE_START:
             self._injector.begin(self._vehicle.t_s)
@@ -143,7 +144,7 @@ class FaultyFlight:
             injector.tick(tick)
 
     def event(self, event: Event) -> None:
-        """Give the claims of a rescue's note to the oracle."""
+        """Give the claims of an event `of_rescue` to the oracle."""
         self._oracle.add_claims(rescue_claims(event), event.t_s)
 
     def _mission(self) -> tuple[str, str, FlightReport | None]:
@@ -167,14 +168,14 @@ class FaultyFlight:
 
     def _each(self, t_s: float) -> None:
         for injector in self._injectors:
-            injector.each(t_s)
+            injector.begin_due(t_s)
         self._edges.call_due(t_s)
         self._facts.begin_s = self._injector.begin_s
         sample = self._sample(t_s)
         self._oracle.update(sample)
         self._facts.update(sample)
         landing = self._injector.flown is Phase.LANDING
-        if landing and sample.floor and not sample.motors_on:
+        if landing and sample.on_floor and not sample.motors_on:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
 
     def _sample(self, t_s: float) -> Sample:
@@ -183,12 +184,12 @@ class FaultyFlight:
         place = (sample.x_m, sample.y_m)
         if not self._scenario.no_target:
             self._place_bound.add_target(world.magnet.target_xy_m)
-        self._place_bound.enter(phase, place)
+        self._place_bound.note_phase(phase, place)
         astray_m = self._place_bound.astray_m(place)
         if begin_s is not None:
             self._descent_bound.begin(begin_s, phase)
             astray_m -= self._drift.update_m(t_s - begin_s, phase)
-            self._touched = self._touched or sample.hanging or world.contact_state()[0] > 0.0
+            self._touched = self._touched or sample.hanging or world.push_n_and_on_floor()[0] > 0.0
         uplink = not self._is_suspended(t_s) and self._radio.uplink_arrives(PROBE, t_s)
         overdue = self._descent_bound.is_overdue(
             t_s,
@@ -258,7 +259,7 @@ def fly_with_fault(
 ) -> FaultResult:
     """Fly a case to its end and judge it by the truth. Errors: NotFound, InvalidValue
     (calibration, log)."""
-    flown_by = e.changed_profile(profile, case.effects)
+    flown_by = e.profile_for(profile, case.effects)
     watcher = None if log is None else LogWatcher.lockstep(log, flown_by, scenario.seed, record)
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
@@ -281,7 +282,7 @@ def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
     if case.first_hold is not None:
         hold_n = case.first_hold * scenario.mass_kg * GRAVITY_MPS2
         scenario = replace(scenario, first_contact_force_n=hold_n)
-    return e.changed_scenario(scenario, case.effects)
+    return e.scenario_for(scenario, case.effects)
 
 
 def _parameters(case: Case) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
-from perchctl.mission import Event, Finding, FlightReport, Outcome, Phase
+from perchctl.mission import Event, FlightReport, Outcome, Phase, RestState
 
 Claim = str
 """One that `Oracle._is_true` knows. A claim of hanging or standing includes that the motors are
@@ -69,11 +69,11 @@ class Sample(NamedTuple):
     y_m: float
     height_m: float
     vz_mps: float
-    up_z: float  # of the body's z axis: 1 level, -1 upside down
+    body_up_z: float  # of the body's z axis: 1 level, -1 upside down
     acc_g: float  # size of the specific force
     motors_on: bool
     pressing: bool  # the motors push against ceiling or floor
-    floor: bool
+    on_floor: bool
     hanging: bool  # the magnet holds the gear
     hold_ratio: float  # of the magnet's hold to the weight
     locked: bool
@@ -88,15 +88,14 @@ class Sample(NamedTuple):
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """Return the height that a slip may cost until it is caught, by the magnet's hold over the
-    weight."""
+    """Return how deep a slip may go until it is caught; `hold_ratio`: magnet's hold over weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
 
 
-def second_press_s(presses_s: Sequence[float]) -> float | None:
-    """Return when the operator's presses amounted to an emergency stop; None if never."""
+def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
+    """Return when presses of Ctrl-C became an emergency stop; None if they never did."""
     run_s = presses_s[0] if presses_s else 0.0
     for before_s, press_s in pairwise(presses_s):
         if press_s - before_s >= SILENCE_S:
@@ -137,7 +136,7 @@ class Oracle:
     `magnet_radius_m` a contact is on the target.
 
     Attributes:
-        flags: with when each was first raised, in that order.
+        flags: those raised, in order, with the time at which each was first raised.
         drop_m: the deepest fall until caught.
         astray_m: the farthest from where it should have been, in the air.
         newest: the last sample.
@@ -189,14 +188,14 @@ class Oracle:
     @property
     def stop_s(self) -> float | None:
         """The time at which the operator asked for the emergency stop, or None."""
-        return second_press_s(self._presses_s)
+        return emergency_stop_s(self._presses_s)
 
     def update(self, s: Sample) -> None:
         """Judge the next sample."""
         self.newest = s
         if s.hanging:
             self._hung = s
-        self._least_up_z = min(self._least_up_z, s.up_z)
+        self._least_up_z = min(self._least_up_z, s.body_up_z)
         self._ended_by_vehicle = self._ended_by_vehicle or s.ended_by_vehicle
         self._watch_unpowered(s)
         self._watch_fall(s)
@@ -245,18 +244,18 @@ class Oracle:
         self.drop_m = max(self.drop_m, drop_m)
         unpowered = s.t_s - self._weak_s <= FROM_HANGING_S
         too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
-        if unpowered and (too_deep or s.floor):
+        if unpowered and (too_deep or s.on_floor):
             self._raise("fell", s.t_s)
         slow_again = fall.slow.update(sinking < FAST_MPS, s.t_s)
         caught = sinking < CAUGHT_MPS or slow_again
-        if s.floor or caught:
+        if s.on_floor or caught:
             self._fall = None
             self._calm_height_m = s.height_m
 
     def _watch_touchdown(self, s: Sample) -> None:
         """Judge a touchdown by the sample before it, whose speed the floor has not yet reduced."""
         before = self._before
-        if before is None or before.floor or not s.floor:
+        if before is None or before.on_floor or not s.on_floor:
             return
         if -before.vz_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)
@@ -300,7 +299,7 @@ class Oracle:
         hangs = s.hanging and not s.motors_on
         off_m = math.hypot(s.miss_m, s.below_m)
         # What lies on its side or its back does not stand.
-        stands = not s.motors_on and not _airborne(s) and s.up_z > self._tilted_up_z
+        stands = not s.motors_on and not _airborne(s) and s.body_up_z > self._tilted_up_z
         truths = {
             "hangs on the target": hangs and s.miss_m <= self._magnet_radius_m,
             "held off the target": hangs and off_m > self._magnet_radius_m,
@@ -329,14 +328,14 @@ class Oracle:
     def _watch_lock(self, s: Sample) -> None:
         """Judge a lock by what came before it; a tumble after the motors were cut is no reason
         for it."""
-        if s.ended_by_vehicle or s.up_z < self._tilted_up_z:
+        if s.ended_by_vehicle or s.body_up_z < self._tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:
             self._raise("locked_needlessly", s.t_s)
 
 
 def _airborne(s: Sample) -> bool:
-    return not s.floor and s.height_m > LOW_M
+    return not s.on_floor and s.height_m > LOW_M
 
 
 # --- What the program says at its end, as claims that are true or false of a vehicle ---
@@ -371,12 +370,12 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
 """The transitions of flights whose end the program does not know: whether the vehicle hangs or
 stands, and whether it came down at all."""
-RESCUE_CLAIMS: dict[Finding, Claims] = {
-    Finding.STANDS: {"stands"},
-    Finding.HANGS: {"hangs"},
-    Finding.HELD: {"held off the target"},
-    Finding.UNKNOWN: {"hangs or stands"},
-    Finding.UNSEEN: {"not seen down"},
+RESCUE_CLAIMS: dict[RestState, Claims] = {
+    RestState.STANDS: {"stands"},
+    RestState.HANGS: {"hangs"},
+    RestState.HELD: {"held off the target"},
+    RestState.UNKNOWN: {"hangs or stands"},
+    RestState.UNSEEN: {"not seen down"},
 }
 """The claims in the note of a rescue, by its finding."""
 REFUSAL_CLAIMS: Claims = {"stands"}
@@ -399,5 +398,5 @@ def rescue_claims(event: Event) -> Claims:
     """Return the claims of a rescue's note; none for any other event."""
     if not event.is_rescue:
         return set()
-    found = next(found for found in Finding if found.value in event.reason)
+    found = next(found for found in RestState if found.value in event.reason)
     return RESCUE_CLAIMS[found]

@@ -26,11 +26,11 @@ ENDS = {
 
 @dataclass(frozen=True)
 class FaultResult(CampaignFlight):
-    """One flight.
+    """Result of one flight with a fault.
 
     Attributes:
         outcome: one of `ENDS`.
-        flags: what went wrong, with when.
+        flags: what went wrong, each with its first time.
         counted: the flags that no expected outcome covers.
         expected: the names of the expected outcomes whose cause came, whether or not a flag was
             raised.
@@ -82,9 +82,9 @@ SHARES = {
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """Return a campaign's figures as a record for JSON.
 
-    Each flag is counted where no expected outcome covers it. `unavoidable` is the number of flights
-    with a covered flag; `expected_outcomes` gives the number of flights with each cause; those of
-    `SHARES` are shares.
+    The count of a flag leaves out flights in which an expected outcome covers it. `unavoidable` is
+    the number of flights with a covered flag, `expected_outcomes` that of flights with each cause;
+    the figures of `SHARES` are shares of all flights.
     """
     return {
         "flights": len(results),

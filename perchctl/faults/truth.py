@@ -31,7 +31,7 @@ PRESSING_RATIO = 1.02
 
 
 class WatchedVehicle(SimulatedVehicle):
-    """A simulated vehicle that calls `each` every `e.SAMPLE_S` of its time."""
+    """A simulated vehicle that calls `on_sample` every `e.SAMPLE_S` of its time."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class WatchedVehicle(SimulatedVehicle):
         capture: CaptureSettings | None = None,
     ) -> None:
         super().__init__(scenario, camera, target, capture)
-        self.each: Callable[[float], None] = lambda t_s: None
+        self.on_sample: Callable[[float], None] = lambda t_s: None
         self._next_s = e.SAMPLE_S
 
     def advance_to(self, t_s: float) -> None:
@@ -49,7 +49,7 @@ class WatchedVehicle(SimulatedVehicle):
             super().advance_to(min(t_s, self._next_s))
             if self.t_s >= self._next_s - CONTROL_PERIOD_S / 2:
                 self._next_s += e.SAMPLE_S
-                self.each(self.t_s)
+                self.on_sample(self.t_s)
 
 
 def true_sample(vehicle: SimulatedVehicle) -> Sample:
@@ -60,7 +60,7 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
     _, qx, qy, _ = world.quaternion
     up_z = 1.0 - 2.0 * (qx * qx + qy * qy)
     target_z_m = vehicle.scenario.ceiling_z_m + vehicle.scenario.target_above_ceiling_m
-    ceiling_n, floor = world.contact_state()
+    ceiling_n, floor = world.push_n_and_on_floor()
     motors_on = max(firmware.motors) > 0.0
     lift_n = sum(world.powertrain.forces_n)
     pushing = motors_on and (
@@ -109,39 +109,38 @@ class Facts:
     """What was true in the flight. Times None: never.
 
     Attributes:
-        effects: what the fault did.
-        begin_s: when it began.
-        cut_s: when the firmware locked the vehicle since nothing of the program had reached it.
-        own_landing: the vehicle's own landing ran as a silence of that length began.
+        effects: those of the fault, which began at `begin_s`.
+        silence_lock_s: when the firmware locked the vehicle, which had received nothing.
+        own_landing: the onboard landing was under way when the silence before such a cut began.
         killed_s: when the program was killed.
         rebooted_s: when the vehicle started again on turning motors, off the floor.
         stop_s: second Ctrl-C.
-        let_go_s: when the magnet let go for good; `watched`: by then the whole weight had hung on
-            it, motors off, for as long as the program is to watch it.
-        slipped_s: when it first came off the magnet with its motors still; `slipped_m`: how high;
-            `toppled`: within `TOPPLES_S` from there it had turned over.
+        magnet_failed_s: when the magnet let go for good; `was_watched`: by then the whole weight
+            had hung on it, motors off, for as long as the program has to watch it.
+        slipped_s: when the vehicle first came off the magnet with its motors still, `slip_height_m`
+            high; `toppled`: it turned over within `TOPPLES_S`.
         weak_s: when battery and motors could first not lift the weight any more.
-        low_s, low_m: when the battery was first low under load, and how high the vehicle was.
+        battery_low_s, battery_low_m: when the battery was first low under load, at which height.
     """
 
     effects: tuple[e.Effect, ...] = ()
     begin_s: float | None = None
-    cut_s: float | None = None
+    silence_lock_s: float | None = None
     own_landing: bool = False
     killed_s: float | None = None
     rebooted_s: float | None = None
     stop_s: float | None = None
-    let_go_s: float | None = None
-    watched: bool = False
+    magnet_failed_s: float | None = None
+    was_watched: bool = False
     slipped_s: float | None = None
-    slipped_m: float = 0.0
+    slip_height_m: float = 0.0
     toppled: bool = False
     weak_s: float | None = None
-    low_s: float | None = None
-    low_m: float = 0.0
+    battery_low_s: float | None = None
+    battery_low_m: float = 0.0
 
     def has_effect(self, act: Callable[..., None]) -> bool:
-        """Return True if that is one of the effects."""
+        """Return True if `act` is one of the effects."""
         return any(effect.func is act for effect in self.effects)
 
 
@@ -168,7 +167,7 @@ class FactsRecorder(Facts):
         self._note_silence(s)
         self._note_hanging(s)
         if self.begin_s is not None:
-            flew = before is not None and before.motors_on and not before.floor
+            flew = before is not None and before.motors_on and not before.on_floor
             if not self._begun and flew and self.has_effect(e.reboots):
                 self.rebooted_s = self.begin_s
             self._begun = True
@@ -181,8 +180,8 @@ class FactsRecorder(Facts):
         locks = s.locked and not (self._before and self._before.locked)
         ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
-        if locks and (long or late) and self.cut_s is None:
-            self.cut_s = s.t_s
+        if locks and (long or late) and self.silence_lock_s is None:
+            self.silence_lock_s = s.t_s
         if s.uplink:
             self._heard_s = s.t_s if long else self._heard_s
             self._silent_s = None
@@ -192,14 +191,14 @@ class FactsRecorder(Facts):
 
     def _note_hanging(self, s: Sample) -> None:
         before = self._before
-        if self.let_go_s is None and self._vehicle.world.magnet.let_go:
-            self.let_go_s = s.t_s
-            self.watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
+        if self.magnet_failed_s is None and self._vehicle.world.magnet.let_go:
+            self.magnet_failed_s = s.t_s
+            self.was_watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
         came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
         if came_off and self.slipped_s is None:
-            self.slipped_s, self.slipped_m = s.t_s, s.height_m
+            self.slipped_s, self.slip_height_m = s.t_s, s.height_m
         if self.slipped_s is not None and s.t_s - self.slipped_s <= TOPPLES_S:
-            self.toppled = self.toppled or s.up_z < TOPPLED_UP_Z
+            self.toppled = self.toppled or s.body_up_z < TOPPLED_UP_Z
         if s.motors_on or not s.hanging:
             self._hangs_s = None
         elif self._hangs_s is None:
@@ -214,8 +213,8 @@ class FactsRecorder(Facts):
         weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
         if self.weak_s is None and lift_n < LEAST_LIFT * weight_n:
             self.weak_s = s.t_s
-        if self.low_s is None and world.battery_v < self._min_load_v:
-            self.low_s, self.low_m = s.t_s, s.height_m
+        if self.battery_low_s is None and world.battery_v < self._min_load_v:
+            self.battery_low_s, self.battery_low_m = s.t_s, s.height_m
 
 
 # --- What a flight is held to -----------------------------------------
@@ -246,12 +245,12 @@ LOW_M = 0.3
 
 
 class PositionBound:
-    """The horizontal places where the vehicle may be, by phase: above its start (or
-    `planner.approach_xy_m`) during take-off; on the way between there and a target in search,
-    estimate, alignment and recovery; under a target in ascent, press and completion; and from the
-    landing on where it should have been when the landing began.
+    """The horizontal places where the vehicle may be, by phase: at its start (or
+    `planner.approach_xy_m`) in take-off; between there and a target in search, estimate, alignment
+    and recovery; under a target in ascent, press and completion; from the landing on where it
+    should have been when the landing began.
 
-    Each target that looks like the own one counts.
+    A target that looks like the vehicle's own counts, too.
     """
 
     def __init__(self, scenario: Scenario, profile: Profile) -> None:
@@ -266,7 +265,7 @@ class PositionBound:
         if place not in self._targets:
             self._targets.append(place)
 
-    def enter(self, phase: Phase | None, place: Place) -> None:
+    def note_phase(self, phase: Phase | None, place: Place) -> None:
         """Note the program's phase and the vehicle's true place; the first one is its start."""
         if self._phase is None:
             self._starts.insert(0, place)
@@ -303,7 +302,7 @@ def _nearest_between(a: Place, b: Place, place: Place) -> Place:
 
 
 def target_places(scenario: Scenario) -> list[Place]:
-    """Return the places of the own target and of those that look like it; none if there is none."""
+    """Return the places of the vehicle's target and of those that look like it, if any."""
     if scenario.no_target:
         return []
     x_m, y_m = scenario.target_xy_m
@@ -365,7 +364,7 @@ class DescentBound:
         """Note when the fault began, and the program's phase then; further calls do nothing."""
         if self._due_s is None:
             phase = phase or Phase.APPROACH
-            limits_s = [land_after_s(effect, self._profile, phase) for effect in self._effects]
+            limits_s = [landing_due_s(effect, self._profile, phase) for effect in self._effects]
             self._due_s = t_s + min(limits_s, default=math.inf)
 
     def is_overdue(
@@ -378,9 +377,10 @@ class DescentBound:
         uplink: bool,
         lands: bool = False,
     ) -> bool:
-        """Return True if it should have come down by now. One at the ceiling in time may hang,
-        one without `uplink` cannot obey. `lands`: by its own landing, whose trajectory starts from
-        rest with each of three orders; a landing that climbs does not count."""
+        """Return True if the vehicle should have come down by now and has not. At the
+        ceiling in time it may hang there, and without `uplink` it cannot obey until it hears
+        again. `lands`: its onboard landing flies, which starts from rest with each of three
+        orders; one that climbs does not count."""
         if self._due_s is None:
             return False
         if touching and t_s < self._due_s + REACTION_S:
@@ -401,9 +401,9 @@ def _for_s(effect: e.Effect) -> float:
     return float(effect.keywords.get("for_s", e.FOR_EVER))
 
 
-def land_after_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
-    """Return how long after it began in that phase an effect makes the program land; infinite if
-    it need not."""
+def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
+    """Return the seconds from an effect's beginning in `phase` until the program has to land;
+    infinite if it need not."""
     safety, values, limit_s = profile.safety, effect.keywords, math.inf
     if effect.func is e.operator:
         limit_s = min(values["presses_s"])

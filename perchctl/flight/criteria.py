@@ -246,14 +246,14 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     )
 
 
-def measurer(profile: Profile) -> str:
+def feed_name(profile: Profile) -> str:
     """Return the source of the external positions, in words."""
     by_target = profile.positioning.by == "target"
     return "the sight of the target" if by_target else "the motion capture"
 
 
 class RestCheck:
-    """Finds a body that moves in the capture while the vehicle stands still: another's."""
+    """Detects that the capture tracks another body, which moves while the vehicle stands still."""
 
     def __init__(self) -> None:
         self._from: ExternalPosition | None = None
@@ -261,9 +261,10 @@ class RestCheck:
     def moved_body_problem(
         self, place: ExternalPosition | None, profile: Profile
     ) -> Problem | None:
-        """Return the problem of a body that has moved while the vehicle stands still.
+        """Return the problem of a body that has moved since the vehicle came to rest.
 
-        For each turn with fresh telemetry and position; `place` None (not still) begins anew."""
+        To be called in each turn with fresh telemetry and a fresh position; `place` is None while
+        the vehicle does not stand still, which restarts the check."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
             return None
@@ -271,13 +272,13 @@ class RestCheck:
         if not way_m > WANDERED_M:
             return None
         return Problem(
-            f"by {measurer(profile)} the vehicle has moved by {way_m:.2f} m, and it stands still",
+            f"by {feed_name(profile)} the vehicle has moved by {way_m:.2f} m, and it stands still",
             "let the target hang still, put down what is carried, or correct positioning.body",
         )
 
 
-def missing(status: FeedStatus, profile: Profile) -> Problem | None:
-    """Return the problem of external positions that do not come."""
+def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
+    """Return the problem of external positions that are not sent, or are too old."""
     if status.problem is not None:
         return Problem(status.problem, "see perchctl check")
     if status.age_s <= profile.positioning.hold_s:
@@ -286,8 +287,8 @@ def missing(status: FeedStatus, profile: Profile) -> Problem | None:
     return Problem(age, "see perchctl check")
 
 
-def apart(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """Return the problem of an estimate at another place, or heading, than the capture's."""
+def estimate_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
+    """Return the problem of a state estimate whose position or heading differs from `place`."""
     away_m = math.dist(place.position_m, telemetry.position_m)
     turned_deg = 0.0
     if place.quaternion is not None:

@@ -51,7 +51,7 @@ class TelemetrySource(Protocol):
 class FlightInputs:
     """Makes the planner's observation of telemetry and at most one frame a tick."""
 
-    SENSED: ClassVar = (
+    SENSED_FIELDS: ClassVar = (
         "telemetry",
         "target",
         "new_frame",
@@ -83,7 +83,7 @@ class FlightInputs:
     sends_sights: bool = True  # until the way down goes on without them
     output: PipelineOutput | None = None  # of this tick's frame, if it was searched
     taken: TurnInputs = field(default_factory=TurnInputs)  # in this tick
-    blind: bool = False
+    is_blind: bool = False
     repeated: bool = False  # this tick's frame is the one before
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
@@ -105,8 +105,8 @@ class FlightInputs:
         samples = self.link.telemetry()
         perception.history = add_samples(self.history, samples, self.profile.safety)
         if positioning is not None:
-            positioning.begin(self.history, now_s, touches=not look)
-        self.output, self.blind, self.repeated = None, not look, False
+            positioning.begin_tick(self.history, now_s, in_contact=not look)
+        self.output, self.is_blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
         seen: FrameRecord | None = None
@@ -121,7 +121,7 @@ class FlightInputs:
             live=self.source.live,
             look=look,
         )
-        used_s = perception.calibration.used_s
+        used_s = perception.calibration.applied_delay_s
         if frame is not None and used_s:
             frame = replace(frame, t_s=frame.t_s - used_s)
         if frame is None:
@@ -165,7 +165,7 @@ class FlightInputs:
             self.last_good_frame_s = now_s  # the picture came: the camera is not gone
 
     def observation(self, now_s: float) -> Observation:
-        """Return the observation with the fields of `SENSED`; the loop adds the others."""
+        """Return the observation with the fields of `SENSED_FIELDS`; the loop adds the others."""
         perception, newest = self.perception, self.history.newest
         assert newest is not None
         return Observation(
@@ -179,7 +179,7 @@ class FlightInputs:
             jumped=self.history.jumped,
             turned_rad=self.history.turned_rad,
             disagreeing_frames=perception.state.disagreeing_frames,
-            delay_s=perception.calibration.used_s,
+            delay_s=perception.calibration.applied_delay_s,
             target_refused=perception.refused,
             imu=self.history.imu,
             felt=perception.motion.motion,
@@ -199,7 +199,7 @@ class FlightInputs:
         if self._positioning is not None:  # else the estimate runs away
             target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
-        if target is not None and (self.blind or stale):
+        if target is not None and (self.is_blind or stale):
             return replace(target, tracked=False)
         return target
 
@@ -244,20 +244,20 @@ class TargetPositioning:
         self.feed = TargetFeed(send, profile, pipeline.pose)
         self._touches = False
 
-    def begin(self, history: History, now_s: float, *, touches: bool) -> None:
-        """Begin a tick, before its picture. `touches`: contact was proven and has not ended."""
+    def begin_tick(self, history: History, now_s: float, *, in_contact: bool) -> None:
+        """Begin a tick, before its picture. `in_contact`: a contact was proven, and lasts."""
         newest = history.newest
-        self._touches = touches
+        self._touches = in_contact
         if newest is None or not is_supported(history, now_s):
             return
         touching_m = self.feed.contact_position(newest.yaw_rad)
         if touching_m is None:
             self.feed.send_origin(now_s)
-        elif touches:
+        elif in_contact:
             self.feed.send_known(touching_m, now_s)
 
     def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
-        """Send the position by a picture, unless the vehicle is pressed or hangs."""
+        """Send the position that a picture gives, unless the vehicle is in contact."""
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
@@ -267,14 +267,14 @@ class TargetPositioning:
     def with_fixed_target(
         self, target: TargetEstimate | None, history: History
     ) -> TargetEstimate | None:
-        """Return the estimate with the target where it stands; as seen until its place is known."""
+        """Return the estimate with the target's known place; unchanged until the place is known."""
         newest = history.newest
         now = None if newest is None else attitude_at(history, newest.t_s)
         return target if target is None or now is None else self.feed.with_fixed_target(target, now)
 
 
 def is_supported(history: History, now_s: float) -> bool:
-    """True if something has carried the vehicle's weight for the last moments, by fresh samples."""
+    """True if fresh samples show that something has carried the weight for `CARRIED_FOR_S`."""
     newest = history.newest
     if newest is None or now_s - newest.t_s + newest.behind_s > CARRIED_FOR_S:
         return False
@@ -290,8 +290,8 @@ def is_supported(history: History, now_s: float) -> bool:
 
 @runtime_checkable
 class TurnWatcher(Watcher, Protocol):
-    """A watcher of all that a log holds: also turns before take-off or decided anew, and what is
-    sent in the loop's place."""
+    """A watcher of all that a flight log holds: also of the turns without a tick, before take-off
+    or decided again, and of the commands that the link sends in the loop's place."""
 
     def turn(self, turn: Turn) -> None: ...
 
@@ -342,14 +342,14 @@ class TurnReporter:
     def note_decision(
         self, obs: Observation, new: PlannerState, command: Command, outside: FeedStatus | None
     ) -> None:
-        """Note that the planner has decided: what fails from now on is not its fault."""
+        """Note that the planner has decided: a later failure is not the planner's."""
         self._open = obs, (new, command, outside)
 
     def report_redone(
         self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
     ) -> None:
-        """Report a turn that is not sent, and decided anew in the next one."""
-        self._report(replace(self.flown(inputs, obs, new, command, None), role="redone"))
+        """Report a turn whose command is not sent, since the next turn decides again."""
+        self._report(replace(self.flown_turn(inputs, obs, new, command, None), role="redone"))
 
     def report_failure(self, inputs: FlightInputs, error: BaseException) -> None:
         """Report the turn in which the flight broke off, with what was observed and decided: the
@@ -358,7 +358,7 @@ class TurnReporter:
             return
         obs, decision = self._open
         if decision is not None:
-            self._report(self.flown(inputs, obs, *decision))
+            self._report(self.flown_turn(inputs, obs, *decision))
         elif isinstance(error, Exception):  # else the planner was only interrupted
             self._open = None
             turn = Turn(
@@ -373,7 +373,7 @@ class TurnReporter:
             )
             self._report(turn)
 
-    def flown(
+    def flown_turn(
         self,
         inputs: FlightInputs,
         obs: Observation,

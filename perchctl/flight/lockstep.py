@@ -90,8 +90,8 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
-class Truth(Watcher):
-    """A watcher of the true vehicle, which the flight cannot see."""
+class TruthWatcher(Watcher):
+    """Watches the true vehicle, which the flight cannot see."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -103,7 +103,7 @@ class Truth(Watcher):
     def tick(self, tick: Tick) -> None:
         world = self._vehicle.world
         on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
-        _, is_down = world.contact_state()
+        _, is_down = world.push_n_and_on_floor()
         if is_down and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
         if is_down and not self._was_down:
@@ -134,7 +134,7 @@ class LockstepFlight:
         return self.miss_m if self.report.phase is Phase.PERCHED and self.hanging else None
 
     @property
-    def end(self) -> Phase:
+    def final_phase(self) -> Phase:
         """The phase in which it ended, ABORTED for one that fell."""
         return Phase.ABORTED if self.fell else self.report.phase
 
@@ -173,7 +173,7 @@ def fly_lockstep(
     link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
     positions = feed_lockstep(link, profile)
     source = lockstep_source(vehicle, profile)
-    truth = Truth(vehicle)
+    truth = TruthWatcher(vehicle)
     watchers = (truth, *watchers)
     if log is not None:
         log.truth = truth.position_and_miss

@@ -17,12 +17,12 @@ from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import RestCheck
 from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
 from perchctl.flight.preflight import (
-    out_of_view,
-    refuse,
-    refuse_forbidden,
+    abort_on,
+    refuse_unfit_vehicle,
     refuse_without_positions,
     refuse_wrong_positions,
     still_waiting_for,
+    view_problem,
 )
 from perchctl.flight.watchdog import Watchdog, rescue
 from perchctl.link import Link
@@ -59,10 +59,10 @@ class PositionSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FlightParts:
-    """The edges of the loop.
+    """The parts that the flight loop works with.
 
-    `positions` gives the external ones, None where decks measure them; `remarks` what is new about
-    things that do not matter to safety, as a recording."""
+    `positions` sends the external positions, None where decks measure them; `remarks` returns new
+    notes on things that do not matter to safety, such as a recording."""
 
     link: Link
     source: FrameSource
@@ -133,7 +133,7 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
 
 
 def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnReporter) -> None:
-    refuse_without_positions(parts.link, parts.profile, positions=parts.positions is not None)
+    refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
     started_s, at_rest = parts.clock.now(), RestCheck()
     while True:
         now_s = parts.clock.now()
@@ -141,7 +141,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
             raise Interrupted("interrupted before take-off: nothing was started")
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
-        refuse_forbidden(newest, parts.profile)
+        refuse_unfit_vehicle(newest, parts.profile)
         outside = _outside(parts, inputs, now_s)
         refuse_wrong_positions(outside, newest, parts.profile, now_s, at_rest)
         turns.report_waiting(inputs, now_s, outside)
@@ -165,7 +165,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
             if newest is not None and positioning is not None and positioning.feed.target:
                 camera, yaw_rad = parts.pipeline.camera, newest.yaw_rad
                 place, start_m = positioning.feed.target, newest.position_m
-                refuse(out_of_view(place, start_m, yaw_rad, parts.profile, camera))
+                abort_on(view_problem(place, start_m, yaw_rad, parts.profile, camera))
             return
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
@@ -219,7 +219,7 @@ def _mission(
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        turn = turns.flown(inputs, obs, state, command, outside)
+        turn = turns.flown_turn(inputs, obs, state, command, outside)
         newest = inputs.perception.calibration.newest
         tick = Tick(
             obs.t_s,

@@ -28,7 +28,7 @@ class OperatorSwitch:
     the signals that ask a program to end: it lands however often it comes, and never stops the
     motors. All methods may be called from any thread.
 
-    Until the flight loop listens there is nothing to land: `leave` raises `Interrupted`.
+    Until the flight loop listens there is nothing to land: `interrupt` raises `Interrupted`.
     """
 
     listening: bool = False
@@ -66,7 +66,7 @@ class OperatorSwitch:
                 self._stopped |= silent_s > DELAY_S + _EPS_S
             self._last_s = now_s
 
-    def leave(self) -> None:
+    def interrupt(self) -> None:
         """Raises `Interrupted` on a signal before the loop listens; called in the main thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")

@@ -12,9 +12,9 @@ from perchctl.flight.criteria import (
     GroundCriteria,
     Problem,
     RestCheck,
-    apart,
-    measurer,
-    missing,
+    estimate_problem,
+    feed_name,
+    unsent_problem,
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
@@ -26,24 +26,25 @@ from perchctl.vehicle import Telemetry
 from perchctl.vision import CameraModel, TargetEstimate
 
 
-def refuse(problem: Problem | None) -> None:
+def abort_on(problem: Problem | None) -> None:
     """Raises SafetyAbort with the problem's sentence, if there is one."""
     if problem is not None:
         raise SafetyAbort(problem.sentence)
 
 
-def refuse_forbidden(telemetry: Telemetry | None, profile: Profile) -> None:
+def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
     """Raises SafetyAbort for a supervisor fault or a low battery, which waiting does not cure."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
-        refuse(criteria.supervisor_fault or criteria.battery_too_low)
+        abort_on(criteria.supervisor_fault or criteria.battery_too_low)
 
 
-def refuse_without_positions(link: Link, profile: Profile, *, positions: bool) -> None:
-    """Raises SafetyAbort without a position source. `positions`: a motion capture's are sent."""
+def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) -> None:
+    """Raises SafetyAbort without any position source. `has_feed`: the positions of a motion
+    capture are being sent."""
     if profile.positioning.by == "deck":
-        refuse(GroundCriteria.no_position_source(link.decks(), profile))
-    elif profile.positioning.by == "mocap" and not positions:
+        abort_on(GroundCriteria.no_position_source(link.decks(), profile))
+    elif profile.positioning.by == "mocap" and not has_feed:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
 
@@ -54,8 +55,8 @@ def refuse_wrong_positions(
     now_s: float,
     at_rest: RestCheck | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body. Nothing
-    tilted, moved or old is judged. `at_rest`: the turns before."""
+    """Raises SafetyAbort for positions in another unit, or of another world or body. A tilted or
+    moved vehicle is not judged, nor old data. `at_rest` remembers the earlier turns."""
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
@@ -68,9 +69,9 @@ def refuse_wrong_positions(
         return
     place = status.measured if stands else None
     if place is not None:
-        refuse(criteria.position_frame_problem(place))
+        abort_on(criteria.position_frame_problem(place))
     if at_rest is not None:
-        refuse(at_rest.moved_body_problem(place, profile))
+        abort_on(at_rest.moved_body_problem(place, profile))
 
 
 def still_waiting_for(
@@ -91,19 +92,19 @@ def still_waiting_for(
     if age_s > profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
     criteria = GroundCriteria(telemetry, profile)
-    unsent = None if outside is None else missing(outside, profile)
+    unsent = None if outside is None else unsent_problem(outside, profile)
     seen = None if outside is None else outside.measured
     waiting = _first(
         {
             "positions of the motion capture": None if by_sight else unsent,
             "the state estimate to settle": criteria.estimate_unsettled,
-            f"the state estimate to agree with {measurer(profile)}": None
+            f"the state estimate to agree with {feed_name(profile)}": None
             if seen is None
-            else apart(seen, telemetry),
+            else estimate_problem(seen, telemetry),
         }
     )
     if not waiting:
-        refuse(criteria.off_ground)
+        abort_on(criteria.off_ground)
         waiting = _first(
             {
                 "the vehicle to stand level": criteria.not_level,
@@ -116,7 +117,7 @@ def still_waiting_for(
         limit_s = profile.camera.start_timeout_s
     waiting = waiting or _first({"a sight of the target, which measures the position": unsent})
     if not waiting:
-        refuse(criteria.target_too_near(target))
+        abort_on(criteria.target_too_near(target))
         return ""
     return _bounded(waiting, waited_s, limit_s)
 
@@ -140,7 +141,7 @@ LEAN_DEG = 5.0  # on its way up, and against a draught
 Start = tuple[float, float, float]  # where it stands, in the world of the target's place
 
 
-def out_of_view(
+def view_problem(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
     """Return the problem of a way up that loses the target: no marker would be wholly in the

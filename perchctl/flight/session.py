@@ -52,7 +52,7 @@ class FlyOptions:
         return self.uri.startswith("sim://")
 
     def require_lift_check(self) -> None:
-        """As the function of this name, for this flight."""
+        """Call the function `require_lift_check` for this flight."""
         require_lift_check(self.profile.positioning, self.uri, simulated=self.simulated)
 
 
@@ -60,7 +60,7 @@ def check_options(options: FlyOptions) -> None:
     """Refuse what can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     if options.profile.positioning.by == "mocap" and not options.simulated:
-        PositionFeed.check_reachable(options.profile.positioning)
+        PositionFeed.check_config(options.profile.positioning)
     elif options.profile.positioning.by == "mocap" and find_spec("motioncapture") is None:
         raise no_motion_capture()  # the simulated room has a capture of its own
     source = parse_source(options.source)
@@ -173,11 +173,11 @@ def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProc
 
 def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
     """Raises SafetyAbort unless somebody has lately compared this vehicle with the motion capture
-    by hand (`perchctl check --lift`): swapped axes do not show at rest. The simulator's room is
-    right."""
+    by hand (`perchctl check --lift`): swapped axes do not show at rest. A simulated
+    vehicle passes."""
     if config.by != "mocap" or simulated:
         return
-    objected = load_comparison(config, vehicle_uri(uri)).flight_objection(
+    objected = load_comparison(config, vehicle_uri(uri)).objection_and_advice(
         datetime.now().astimezone()
     )
     if objected is not None:

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from perchctl.flight.clock import Clock
 from perchctl.link import Link
 from perchctl.mission import (
-    Finding,
     Observation,
     Operator,
     Phase,
     PlannerState,
+    RestState,
     SentCommand,
     VisualInertialMotion,
     rest_text,
@@ -64,11 +64,11 @@ class LastTick:
 class Watchdog:
     """Decides what the link sends while the loop is silent: its `poll` is the link's guard.
 
-    `tick`, `rescuing` and `end` are called by the loop's thread, `poll` by the link's; each writes
-    its own fields.
+    `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's; each
+    thread writes fields of its own.
 
-    `position_age_s` gives the age of the newest external position. `overruled_s` is how late the
-    loop was when a landing was decided for it, else 0.
+    `position_age_s` returns the age of the newest external position at a time. `overruled_s` is how
+    late the loop was when the watchdog began a landing in its place, else 0.
     """
 
     def __init__(
@@ -231,8 +231,8 @@ def rescue(
     state: PlannerState | None,
     history: History,
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
-    told: Callable[[SentCommand], None] = lambda sent: None,
-    felt: VisualInertialMotion | None = None,
+    on_sent: Callable[[SentCommand], None] = lambda sent: None,
+    motion: VisualInertialMotion | None = None,
 ) -> str:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
     Returns where the vehicle came to rest, as a sentence without its end.
@@ -240,23 +240,23 @@ def rescue(
     Args:
         state: the planner's last; None before its first tick.
         history: the telemetry so far.
-        position_age_s: age of the newest external position at a time; by the target none is sent
-            any more.
-        told: called with what was sent.
-        felt: the motion that pictures and accelerometer last agreed on.
+        position_age_s: age of the newest external position at a time; none is sent any more
+            if the target is the positioning system.
+        on_sent: called with each command that was sent.
+        motion: the motion that pictures and accelerometer last agreed on.
     """
 
     def send(command: Command) -> None:
         with suppress(Exception):  # the link may be what failed: the next one goes out all the same
             link.send(command)
-            told(SentCommand(clock.now(), "rescue", command))
+            on_sent(SentCommand(clock.now(), "rescue", command))
 
     by_target = profile.positioning.by == "target"
     start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return Finding.UNSEEN.value
+            return RestState.UNSEEN.value
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         newest = history.newest
@@ -269,7 +269,7 @@ def rescue(
                 turned_rad=history.turned_rad,
                 position_age_s=math.inf if by_target else position_age_s(now_s),
                 imu=history.imu,
-                felt=felt,
+                felt=motion,
             )
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
@@ -278,4 +278,4 @@ def rescue(
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return Finding.UNSEEN.value
+    return RestState.UNSEEN.value

@@ -3,7 +3,7 @@ from .crtp import Packet as Packet
 from .crtp import Port as Port
 from .listening import AttitudeLink as AttitudeLink
 from .listening import ProbeLink as ProbeLink
-from .listening import find_vehicles as find_vehicles
+from .listening import find_uris_and_problem as find_uris_and_problem
 from .mock import MockLink as MockLink
 from .mock import Radio as Radio
 from .protocol import Link as Link

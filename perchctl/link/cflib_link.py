@@ -94,7 +94,7 @@ class CflibLink:
         )
 
     def telemetry(self) -> list[Telemetry]:
-        return self._blocks.take()
+        return self._blocks.take_samples()
 
     def send(self, command: Command) -> None:
         if self._sender is not None and not isinstance(command, Idle):
@@ -187,7 +187,7 @@ class CflibLink:
         """Ask the guard, in the thread of the sender's that never touches cflib."""
         if self._guard is None:
             return None
-        return self._guard(self._clock(), self._blocks.newest, self._blocks.waiting)
+        return self._guard(self._clock(), self._blocks.newest, self._blocks.waiting_samples)
 
     def _hand_over(self, packet: Packet) -> bool:
         """Send a packet, in the sender's thread."""

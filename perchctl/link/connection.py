@@ -77,9 +77,8 @@ class Connection:
     def send(self, packet: Packet) -> bool:
         """Send a packet now, or not at all; return True if the driver has taken it.
 
-        Nothing waits here for cflib's lock, or for the one place in its radio's queue. In
-        cflib's own `send_packet` it would: for 2 s, with the lock held, and then the driver
-        reports its end from inside the call.
+        Unlike cflib's `send_packet` it never waits for cflib's lock or for the one place in its
+        radio's queue: that takes 2 s, after which the driver reports its end inside the call.
         """
         if self.lost is not None:
             return False
@@ -104,10 +103,11 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """Return True if a driver will take nothing any more; to be called repeatedly while it
-        takes nothing, since it has to be seen for `DEAD_S`.
+        """Return True if the driver will never take a packet again. To be called repeatedly, and
+        only while it takes none: True once this has lasted for `DEAD_S`.
 
-        A radio out of reach counts its lost packets and goes on; an unplugged one counts none.
+        A radio out of reach counts its lost packets, and goes on by itself. One whose dongle was
+        pulled out counts nothing (cflib retries that for ever, too).
         """
         now_s, asked_s = time.monotonic(), self._asked_s
         self._asked_s = now_s
@@ -122,10 +122,8 @@ class Connection:
         return not thread.is_alive() or (left is not None and now_s - self._counted_s > DEAD_S)
 
     def reopen(self, cause: str | None = None) -> None:
-        """Open new drivers until one answers, in the place of one that has ended, or that is
-        given up now for this cause. Returns at once; until then the link is `lost`.
-
-        """
+        """Open new drivers until one answers, to replace a driver that has ended or, with `cause`,
+        is given up. Returns at once; until a driver answers the link is `lost`."""
         with self._change:
             if self._left or (self._opener is not None and self._opener.is_alive()):
                 return
@@ -261,8 +259,8 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 
 def init_cflib() -> None:
-    """Register cflib's drivers, keep its radio from giving up early, and silence it: its log
-    repeats what callbacks report, and its radio prints on stdout, which is for results."""
+    """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
+    silence it: it logs what it also reports by callback, and prints on stdout."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 
@@ -345,8 +343,8 @@ def _forget_dead_dongle(uri: str) -> None:
 def lock_vehicle(uri: str) -> contextlib.ExitStack:
     """Lock the vehicle at `uri` for this process until the result is closed.
 
-    Nothing is locked where no lock can be kept (no folder to write to, Windows), which is no reason
-    not to fly. Raises ConnectionFailed if another program has it.
+    Nothing is locked where no lock can be kept (no folder to write to, Windows).
+    Raises ConnectionFailed if another program has it.
     """
     path = user_folder("runtime") / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
     with contextlib.ExitStack() as claim:

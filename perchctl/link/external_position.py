@@ -43,7 +43,8 @@ POLL_S = 0.02
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return the parameters for external positions, set after the user's own; none with decks."""
+    """Return the firmware's parameters for external positions, to be set after the user's own;
+    none with decks."""
     if config.by == "deck":
         return {}
     return {

@@ -130,7 +130,7 @@ _ECHO_MARK = 1  # cflib's own pings begin with 0
 
 
 class ProbeLink(ReadOnlyLink):
-    """A `ReadOnlyLink` that refuses no firmware: what is wrong with it is what is asked for.
+    """A `ReadOnlyLink` that accepts any firmware, since it is there to find what is wrong.
 
     `quality` is the radio's, %: how few of its packets had to be sent again; None without one.
     `missing` names the log variables that perchctl needs and the firmware lacks.
@@ -156,7 +156,7 @@ class ProbeLink(ReadOnlyLink):
         assert self.connection is not None
         return self.connection.cf
 
-    def protocol(self) -> int:
+    def protocol_version(self) -> int:
         """Return the protocol's version; -1 for a vehicle that is too old to have one."""
         return int(self._cf.platform.get_protocol_version())
 
@@ -165,7 +165,7 @@ class ProbeLink(ReadOnlyLink):
         return read_parameters(self._cf)
 
     def age_s(self) -> float:
-        """Return the age of the newest sample, of the older of its parts; infinite without one."""
+        """Return the age of the older part of the newest sample; infinite without a sample."""
         newest = self._blocks.newest
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
@@ -173,8 +173,8 @@ class ProbeLink(ReadOnlyLink):
         """Return why the link is gone, None while it is there."""
         return "it was closed" if self.connection is None else self.connection.lost
 
-    def echoes(self, duration_s: float) -> list[float]:
-        """Send packets to come back for so long, and wait `ANSWER_S` for the last. Returns the time
+    def round_trips_s(self, duration_s: float) -> list[float]:
+        """Send echo packets for `duration_s`, and wait `ANSWER_S` for the last. Returns the time
         after which each came back, s; infinite for one that did not."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
@@ -210,7 +210,7 @@ class ProbeLink(ReadOnlyLink):
 SCAN_TIMEOUT_S = 20.0
 
 
-def find_vehicles(uri: str = "") -> tuple[list[str], str]:
+def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
     packets only. Returns their URIs, and why no radio was asked: empty where one was, else the
     cause and, in lines of its own, what to do.

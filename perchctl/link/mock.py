@@ -49,19 +49,19 @@ class Radio:
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
         """True if the packet arrives at the vehicle."""
-        return self._bursts is None or not self._bursts.lost(now_s)
+        return self._bursts is None or not self._bursts.is_lost(now_s)
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:
         """Return the seconds after which a log block's packet arrives; None when it is lost."""
-        lost = self._bursts is not None and self._bursts.lost(now_s)
+        lost = self._bursts is not None and self._bursts.is_lost(now_s)
         return None if lost else TELEMETRY_DELAY_S
 
 
 class MockLink:
     """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
 
-    `vehicle` is a `perchctl.sim.SimulatedVehicle`, not imported here. Commands reach it as bytes
-    by the simulated link's decoder, telemetry in the same log blocks and assembler as by radio.
+    Commands reach `vehicle`, a `perchctl.sim.SimulatedVehicle`, as bytes, through the simulated
+    link's decoder; its telemetry comes in log blocks through the same assembler as by radio.
     """
 
     FAST_BLOCKS = FAST_BLOCKS

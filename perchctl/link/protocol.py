@@ -53,9 +53,9 @@ class Link(Protocol):
         """Return None while the link works, otherwise one sentence with the cause."""
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
-        """Ask `guard` regularly until the link is closed. `on_sent` gets each command on its way in
-        the loop's place: the guard's, an order repeated over a lost link, the farewell; from the
-        link's own thread where it has one."""
+        """Call `guard` regularly from now on, until the link is closed. `on_sent` is called with
+        each command that the link has sent in the loop's place: the guard's, an order repeated
+        after the link was lost, and the farewell; from the link's own thread if it has one."""
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""
@@ -103,7 +103,7 @@ def check_uri(uri: str) -> str:
 
 
 def vehicle_uri(uri: str) -> str:
-    """Return the URI without what does not tell vehicles apart: a radio's dongle, case, options."""
+    """Return the URI without what does not identify the vehicle: dongle, letter case, options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":

@@ -49,17 +49,16 @@ class _Waiting:
 class Sender:
     """Hands commands to a library, from its creation to `stop`.
 
-    `hand_over` gives one piece to the library and returns False where there was no room for it:
-    it is then offered again. `guard` returns the command to send in the loop's place, None almost
-    always. `on_sent` is called with what the loop did not put in, once it is handed over.
+    `hand_over` gives one piece to the library; after False, for want of room, the piece is offered
+    again. `guard` returns the command to send in the loop's place, mostly None. `on_sent` is called
+    with each such command, once the library has it.
 
-    `pieces` divides a command. `tend` is called as often as the guard is, by the same thread,
-    with `stuck_s` and whether the library is to blame for it: it has held one piece, or raised
-    errors, for longer than `HANGS_S`. It has to see to the link, and must not block. `spare` is
-    called by the first thread when no command waits; it may hand over something of its own, and
-    returns True if it did.
+    `pieces` splits a command. `tend` looks after the link, and must not block: the guard's thread
+    calls it after the guard, with `stuck_s` and with True if the library has held one piece, or
+    raised errors, for longer than `HANGS_S`. `spare` is called by the first thread when no command
+    waits; it may hand over something of its own, and returns True if it did.
 
-    `problem` is what went wrong for good, in one sentence, else None.
+    `problem` is the permanent failure in one sentence, else None.
     """
 
     def __init__(

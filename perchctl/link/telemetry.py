@@ -136,9 +136,9 @@ MOST_CARRIED_S = 0.05
 class SampleAssembler:
     """Puts the newest values of all blocks together.
 
-    A block that stops coming leaves its values behind. The attitude's block makes the sample,
-    so its end is the end of the samples; what the position's block lacks in age is written
-    into the sample (`Telemetry.behind_s`), since frozen numbers look like a vehicle at rest.
+    Only the attitude's block completes a sample; the other values are the last that came. By how
+    much the position's block is older is written into the sample (`Telemetry.behind_s`), since
+    frozen numbers look like a vehicle at rest.
     """
 
     def __init__(self) -> None:
@@ -230,13 +230,13 @@ class LogBlocks:
         if not self._first_sample.wait(FIRST_SAMPLE_TIMEOUT_S):
             raise TimedOut(f"{uri} is connected but sends no telemetry")
 
-    def take(self) -> list[Telemetry]:
+    def take_samples(self) -> list[Telemetry]:
         """Return the samples that arrived since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     @property
-    def waiting(self) -> list[Telemetry]:
-        """Samples that the next `take` returns; may be read from any thread."""
+    def waiting_samples(self) -> list[Telemetry]:
+        """Samples that the next `take_samples` returns; may be read from any thread."""
         return list(self._samples.copy())
 
     def resume(self, send: Callable[[Packet], bool]) -> bool:

@@ -1,5 +1,5 @@
 from .imu import ImuMotion as ImuMotion
-from .lander import Finding as Finding
+from .lander import RestState as RestState
 from .lander import step_landing as step_landing
 from .planner import step_mission as step_mission
 from .records import Event as Event

@@ -56,7 +56,7 @@ def update_energy(
     load = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
-        used=state.used + load * _per_s(battery_mah) * dt_s,
+        used_share=state.used_share + load * _per_s(battery_mah) * dt_s,
         load=_towards(state.load, load, dt_s / LAG_S),
     )
     if load >= LEAST_LOAD:
@@ -66,7 +66,7 @@ def update_energy(
         state = replace(state, unknown_s=state.unknown_s + dt_s)
         if state.rest_v is None:
             return state
-        spent = fit_battery(state)[1] * state.load * _per_s(battery_mah) * dt_s
+        spent = fit_sag_model(state)[1] * state.load * _per_s(battery_mah) * dt_s
         return replace(state, rest_v=rest_v_from_charge(charge_from_rest_v(state.rest_v) - spent))
     state = replace(state, unknown_s=0.0)
     if load == 0.0 and not state.loaded_s:
@@ -77,16 +77,16 @@ def update_energy(
         state = replace(state, ground_v=battery_v + USUAL_SAG_V * state.load)
     if state.load >= LEAST_LOAD:
         fit = _summed(state, dt_s, battery_v)
-        state = replace(state, fit=fit, loaded_s=state.loaded_s + dt_s)
-    now_v = battery_v + fit_battery(state)[0] * state.load
+        state = replace(state, fit_sums=fit, loaded_s=state.loaded_s + dt_s)
+    now_v = battery_v + fit_sag_model(state)[0] * state.load
     rest_v = now_v if state.rest_v is None else _towards(state.rest_v, now_v, dt_s / SMOOTH_S)
     return replace(state, rest_v=rest_v)
 
 
-def fit_battery(state: EnergyState) -> tuple[float, float]:
-    """The voltage sag under full thrust, V, and the factor by which the charge falls faster than
-    counted: a least-squares fit to the readings, regularised and bounded."""
-    a, b, c, p, q = state.fit
+def fit_sag_model(state: EnergyState) -> tuple[float, float]:
+    """The voltage sag under full thrust, V, and the factor (hunger) by which the charge falls
+    faster than counted: a least-squares fit to the readings, regularised and bounded."""
+    a, b, c, p, q = state.fit_sums
     a += SAG_WITHIN_V**-2
     c += HUNGER_WITHIN**-2
     det = a * c - b * b
@@ -113,14 +113,14 @@ def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
 def _summed(
     state: EnergyState, dt_s: float, battery_v: float
 ) -> tuple[float, float, float, float, float]:
-    """`EnergyState.fit` with one more reading, as deviations from the usual values."""
+    """`EnergyState.fit_sums` with one more reading, as deviations from the usual values."""
     assert state.ground_v is not None
     begun = charge_from_rest_v(state.ground_v)
-    counted = max(min(begun, COUNTED_SHARE), begun - state.used)
+    counted = max(min(begun, COUNTED_SHARE), begun - state.used_share)
     spent_v = rest_v_from_charge(begun) - rest_v_from_charge(counted)
     off_v = state.ground_v - battery_v - USUAL_SAG_V * state.load - USUAL_HUNGER * spent_v
     weight, keep = dt_s / READING_V**2, math.exp(-dt_s / FADES_S)
-    a, b, c, p, q = (keep * each for each in state.fit)
+    a, b, c, p, q = (keep * each for each in state.fit_sums)
     return (
         a + weight * state.load * state.load,
         b + weight * state.load * spent_v,
@@ -144,15 +144,15 @@ def _towards(value: float, goal: float, part: float) -> float:
 
 def battery_outlook(c: Context) -> BatteryOutlook:
     """What the battery has left, and for how many attempts that is enough. An unknown charge counts
-    at most as the grace of a vehicle without a reading (fault 7)."""
+    for at most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.state.energy
-    used_mah = energy.used * c.profile.vehicle.battery_mah
+    used_mah = energy.used_share * c.profile.vehicle.battery_mah
     load = (c.state.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
-    counted_s = left_s(energy, c.profile, load)
+    counted_s = hover_left_s(energy, c.profile, load)
     seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
     if c.target_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    enough_s, (attempt_s, again_s, landing_s) = seconds, required_times_s(c)
+    enough_s, (attempt_s, again_s, landing_s) = seconds, attempt_retry_landing_s(c)
     if enough_s is None:
         enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
     spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
@@ -163,8 +163,9 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
-def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
-    """Seconds of hovering on a share of full thrust before `battery-low` fires, None if unknown."""
+def hover_left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
+    """Seconds of hovering with `load`, a share of full thrust, until `battery-low` fires; None if
+    unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     safety, perch = profile.safety, profile.planner.perch
@@ -174,14 +175,15 @@ def left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
     lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
     press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
-    sag_v, hunger = fit_battery(state)
+    sag_v, hunger = fit_sag_model(state)
     end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
     share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
     return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah))
 
 
-def required_times_s(c: Context) -> tuple[float, float, float]:
-    """Seconds for this attempt, each further one and the landing, by a seen target's height."""
+def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
+    """The seconds that this attempt, each retry and the landing take, by the height of a target
+    that was seen."""
     planner = c.planner
     up_m = max(0.0, c.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
@@ -196,14 +198,14 @@ def required_times_s(c: Context) -> tuple[float, float, float]:
 
 
 def is_short_of_charge(c: Context) -> bool:
-    """True if the attempt that would begin now has not enough; without a target none begins."""
+    """True if the charge is not enough for an attempt at a known target."""
     gated = c.safety.energy_gate and c.target_m is not None
     return gated and not c.state.battery.attempts
 
 
 def battery_shortfall(c: Context) -> str:
     """The shortfall with its figures, as a sentence."""
-    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, required_times_s(c)
+    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, attempt_retry_landing_s(c)
     has = "what the battery has left is not known"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"

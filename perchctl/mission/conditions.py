@@ -1,7 +1,7 @@
 """The named conditions that the mission's table debounces.
 
 A condition is true or false in one tick; `PlannerState.since` holds since when it has been
-true without a break, and `Context.held(name)` tells for how long.
+true without a break, and `Context.held_s(name)` tells for how long.
 """
 
 from __future__ import annotations
@@ -72,13 +72,13 @@ def _contact(c: Context) -> bool:
 
 
 def unseen_s(c: Context) -> float:
-    """Seconds since the exposure of the last sight."""
+    """Seconds since the exposure of the last picture with the target."""
     return max(0.0, c.t_s - c.state.reckoning.sight_s)
 
 
 def contact_error(c: Context) -> ContactError:
-    """How far the gear is from the target's axis. By decks the last sight is carried on by an
-    estimate that slides and that the blow on the ceiling shakes."""
+    """How far the gear is from the target's axis. With decks the last sight is carried on by the
+    estimate, which drifts and is shaken by the impact on the ceiling."""
     reckoning = c.state.reckoning
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if c.profile.positioning.by == "deck" and c.placed:
@@ -87,8 +87,8 @@ def contact_error(c: Context) -> ContactError:
 
 
 def last_touch_error(c: Context) -> ContactError | None:
-    """In RECOVER the `contact_error` that was kept from the touch, if any; None with a fresh sight,
-    or once motion capture shows the vehicle away from there."""
+    """The `contact_error` of the last touch, in RECOVER only; None with a fresh sight, or once
+    motion capture shows that the vehicle has left that place."""
     state = c.state
     if state.phase is not Phase.RECOVER or state.contact is None or c.fresh:
         return None
@@ -292,7 +292,7 @@ PROOFS = BY_PLACE | {C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.CARRIED, C.SATURA
 
 
 def update_conditions(c: Context) -> dict[Condition, float]:
-    """`PlannerState.since` of this tick, without what is void in it."""
+    """`PlannerState.since` after this tick: the start of each condition that holds now."""
     old, now_s, void = c.state.since, c.t_s, _void(c)
     return {
         name: old.get(name, now_s)
@@ -327,9 +327,9 @@ def _void(c: Context) -> frozenset[Condition]:
 
 
 def has_slipped(c: Context) -> bool:
-    """True if it has slipped off its contact: debounced, but in free fall at once."""
+    """True if the vehicle has slipped off its contact: debounced, but at once in free fall."""
     tel, complete = c.telemetry, c.planner.complete
     falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and c.imu_proves and c.climb_mps < FALLING_MPS:
         return True
-    return c.held(C.SLIPPING) >= complete.slip_dwell_s
+    return c.held_s(C.SLIPPING) >= complete.slip_dwell_s

@@ -22,20 +22,20 @@ class Context:
 
     Attributes:
         by_sight: the target itself is the positioning system.
-        mismatch: what would bring the target to rest; zero while it rests.
+        mismatch: of latency or mounting, by which the target seems to move; zero while it rests.
         height_m: above the ground that the flight started from.
         attitude_age_s: of attitude, acceleration, thrust and supervisor bits, which come
             together; `imu_proves`: new enough to prove anything.
         variance_m2: of the position; 0 if the firmware reports none, infinite for a NaN.
         thrust_is_known: the thrust that is read follows what is ordered.
-        reads_one_g: so does the accelerometer, as of what something carries.
+        reads_one_g: the accelerometer reads 1 g, as on anything that is supported.
         telemetry_age_s: of its oldest part; a frozen reading is as old as its first one; `proves`:
             new enough.
         position_age_s: of the newest external position that was sent to the vehicle; with decks, of
             the newest correction of its estimate; `position_is_stale`: none is fresh (fault 10).
-        located: the estimated position and speed are believed: positions come, not only just again,
-            and pictures that give them fit the accelerometer; `placed`: and can prove anything,
-            since they are fresh.
+        located: the estimated position and speed are believed: positions have come for a while,
+            and fit the accelerometer if they are from pictures; `placed`: they are fresh, too, and
+            can prove something.
         is_blown: after a blow or gust that only the accelerometer has measured, until a sight
             corrects the estimate: the firmware's estimator ignores sideways forces.
         climb_mps: vertical speed, by the estimate where that is believed and fresh, else by the
@@ -124,7 +124,7 @@ class Context:
         """The same tick with changes of its state."""
         return self.with_state(replace(self.state, **changes))
 
-    def held(self, condition: Condition) -> float:
+    def held_s(self, condition: Condition) -> float:
         """Seconds for which the condition has been true; -1 when it is not."""
         since = self.state.since.get(condition)
         return -1.0 if since is None else self.t_s - since

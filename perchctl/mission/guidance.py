@@ -22,7 +22,7 @@ from perchctl.vehicle import (
     StopMotors,
 )
 
-Acted = tuple[PlannerState, Command]
+Action = tuple[PlannerState, Command]
 
 HEIGHT_GAIN, HEIGHT_RATE_S, HEIGHT_LIMIT_M = 1.5, 0.25, 0.15
 POSITION_GAIN, VELOCITY_GAIN_S = 1.0, 0.3
@@ -56,7 +56,7 @@ def hold_here(c: Context) -> PositionSetpoint:
     return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
 
 
-def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
+def body_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
     """The body's place at which the gear is under the target at that heading."""
     target = c.target_m
     assert target is not None
@@ -67,9 +67,9 @@ def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
 def step_towards(
     c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> PositionSetpoint:
-    """The setpoint one tick later: towards the goal, at limited speeds; wary of a mounting that
-    nothing confirms. What comes down does not turn. Only a search, an ascent, a take-off and the
-    press pass an `up_mps`; a catch climbs in another way."""
+    """The setpoint one tick later: towards the goal, at limited speeds, slower while nothing
+    confirms the camera's mounting. A landing does not turn. Only a search, an ascent, a take-off
+    and the press pass an `up_mps`."""
     old, dt_s, align = c.state.setpoint or hold_here(c), c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if c.state.phase is Phase.LANDING:
@@ -88,8 +88,8 @@ def step_towards(
 
 
 def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """Integral of the gear's position error, m, world axes, limited; it rests while the error is
-    large, and takes away what a steady draught leaves."""
+    """Integral of the gear's position error, m, world axes, limited, and frozen while the error is
+    large; it removes the offset that a steady draught leaves."""
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
@@ -103,9 +103,12 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
     return tx, ty
 
 
-def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
-    """The setpoint to the reference: with learned trim, stiffer near the target; with `lift` a
-    multiple of the height error, as the onboard integrator carries it past a stopped setpoint."""
+def correct_setpoint(
+    c: Context, reference: PositionSetpoint, *, lift: bool = True
+) -> PositionSetpoint:
+    """The setpoint that brings the vehicle to the reference: with the learned trim, a stiffer
+    position loop near the target, and, with `lift`, a multiple of the error in height against
+    the onboard integrator's overshoot."""
     tel = c.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
@@ -141,7 +144,7 @@ def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
-def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """The setpoint inside the fence, under the height limit and above the ground (fault 36), lower
     only in a take-off."""
     ground, safety = c.state.ground_m, c.safety
@@ -192,10 +195,10 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     if tel.velocity_mps[2] < FALLING_MPS:
         below_m = 0.0
     setpoint = PositionSetpoint(x, y, tel.position_m[2] - below_m, state.entry_yaw_rad)
-    return state, limited(c, setpoint)
+    return state, limit_setpoint(c, setpoint)
 
 
-def lower_thrust(c: Context) -> Acted:
+def lower_thrust(c: Context) -> Action:
     """The release's first stage: the setpoint goes down in steps, or the raw thrust of a press."""
     complete, perch, state = c.planner.complete, c.planner.perch, c.state
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
@@ -211,13 +214,13 @@ def lower_thrust(c: Context) -> Acted:
     top = state.entry_m[2] + perch.press_m + slid_m
     low = state.contact_z_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
-    sent = limited(c, corrected(c, setpoint, lift=False))
+    sent = limit_setpoint(c, correct_setpoint(c, setpoint, lift=False))
     return replace(state, setpoint=setpoint), sent
 
 
-def release_by_thrust(c: Context) -> Acted:
+def release_by_thrust(c: Context) -> Action:
     """The release's second stage: raw thrust down to still motors, and the stop when the whole
-    weight has hung long enough. Without fresh telemetry it begins anew; late is enough to land."""
+    weight has hung long enough. Without fresh telemetry it restarts; a landing accepts older."""
     late_s = c.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
         return hold_by_position(c)
@@ -226,7 +229,7 @@ def release_by_thrust(c: Context) -> Acted:
         z_m = c.telemetry.position_m[2]
         state = replace(state, released_s=c.t_s, contact_z_m=state.contact_z_m or z_m)
     assert state.released_s is not None
-    hung_s = c.held(Condition.WEIGHT_HANGS)
+    hung_s = c.held_s(Condition.WEIGHT_HANGS)
     unread_s = UNREAD_S if state.unread_s >= c.t_s - hung_s else 0.0
     if hung_s >= complete.hang_s + unread_s:
         return stop_motors(c)
@@ -236,14 +239,14 @@ def release_by_thrust(c: Context) -> Acted:
     return state, RawThrust(int(start + part * (STILL_THRUST - start)))
 
 
-def hold_by_position(c: Context) -> Acted:
-    """Hold by position while telemetry is old: what hangs stays, what falls unseen is caught."""
+def hold_by_position(c: Context) -> Action:
+    """Hold by position while telemetry is old, to stay in contact or to catch an unseen fall."""
     state, tel = c.state, c.telemetry
     x, y, z_m = tel.position_m
     if state.contact_z_m is not None and c.placed:
         z_m = state.contact_z_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
-    return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)
+    return replace(state, setpoint=setpoint, released_s=None), limit_setpoint(c, setpoint)
 
 
 def motors_are_still(c: Context) -> bool:
@@ -252,8 +255,9 @@ def motors_are_still(c: Context) -> bool:
     return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
 
 
-def stop_motors(c: Context) -> Acted:
-    """Stop and notify, `STOPS` times: one lost notify locks what hangs. Again under thrust."""
+def stop_motors(c: Context) -> Action:
+    """Send stop and notify `STOPS` times, since a lost notify locks a hanging vehicle; more while
+    there is thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
@@ -264,14 +268,14 @@ def stop_motors(c: Context) -> Acted:
     return state, Idle()
 
 
-def catch_above_m(hover_thrust: float, thrust: float) -> float:
-    """Height of the setpoint that stops a fall, above the vehicle."""
+def catch_goal_above_m(hover_thrust: float, thrust: float) -> float:
+    """How far above the vehicle the setpoint has to be that stops its fall."""
     turning = thrust > 0.5 * hover_thrust
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
 
 
-def catch(c: Context) -> Acted | None:
-    """After a slip a setpoint far above; None when it is caught, or its telemetry is old."""
+def catch(c: Context) -> Action | None:
+    """The setpoint far above that stops a slip; None once it is caught, or with old telemetry."""
     state, tel = c.state, c.telemetry
     if state.caught or not c.imu_proves:
         return None
@@ -279,9 +283,9 @@ def catch(c: Context) -> Acted | None:
     if begun or (c.climb_mps < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
         x, y = _braked_place_m(c) if c.is_blown else state.entry_m[:2]
         setpoint = PositionSetpoint(
-            x, y, tel.position_m[2] + state.catch_above_m, state.entry_yaw_rad
+            x, y, tel.position_m[2] + state.catch_goal_above_m, state.entry_yaw_rad
         )
-        return replace(state, setpoint=setpoint), limited(c, setpoint)
+        return replace(state, setpoint=setpoint), limit_setpoint(c, setpoint)
     return None
 
 
@@ -295,7 +299,7 @@ def _braked_place_m(c: Context) -> tuple[float, float]:
 
 
 def clear_contact_below(c: Context, below_m: float) -> Context:
-    """The context without its contact once the vehicle is so far below it."""
+    """The context without its contact once the vehicle is `below_m` under it."""
     contact_z_m = c.state.contact_z_m
     if contact_z_m is None or c.telemetry.position_m[2] >= contact_z_m - below_m:
         return c

@@ -213,10 +213,11 @@ class ImuMotion:
 
     @staticmethod
     def acceleration_mps2(
-        sample: Telemetry, offset_g: Vector, misled_rad: tuple[float, float] = (0.0, 0.0)
+        sample: Telemetry, offset_g: Vector, tilt_off_rad: tuple[float, float] = (0.0, 0.0)
     ) -> Vector:
-        """World acceleration of a sample, less the offset and wrong corrections of its tilt."""
-        roll_rad, pitch_rad = sample.roll_rad - misled_rad[0], sample.pitch_rad - misled_rad[1]
+        """Acceleration in world axes by force and attitude of a sample, less the accelerometer's
+        offset and the error of roll and pitch."""
+        roll_rad, pitch_rad = sample.roll_rad - tilt_off_rad[0], sample.pitch_rad - tilt_off_rad[1]
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
         cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
@@ -363,7 +364,7 @@ def advance_reckoning(
     old: DeadReckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
 ) -> DeadReckoning:
     """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
-    it may be of another axis, and even after a silence the reckoned one is better."""
+    that velocity may be in other axes, and the reckoned one is kept even after a silence."""
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
         carried = not old.imu.t_s < imu.silent_s <= blow.t_s
@@ -444,7 +445,7 @@ def advance_reckoning(
 
 
 def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """The reckoning once wrong positions have turned the attitude."""
+    """The reckoning with the bias of an attitude that wrong positions have tilted."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
@@ -475,7 +476,7 @@ def _position_s(sample: Telemetry) -> float:
 def add_sighting(
     old: DeadReckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> DeadReckoning:
-    """The reckoning with a sight: from the gear to the target's axis, world axes, and up to it."""
+    """The reckoning from a new sight on; `aside_m`: from gear to target axis, world axes."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
     )

@@ -27,14 +27,14 @@ from perchctl.mission.guidance import (
     CATCH_STILL_ABOVE_M,
     STILL_THRUST,
     THRUST_MIN,
-    Acted,
+    Action,
     catch,
-    catch_above_m,
+    catch_goal_above_m,
     clear_contact_below,
     hold_here,
     is_pressing,
     leave_press,
-    limited,
+    limit_setpoint,
     release_by_thrust,
     step_towards,
     stop_motors,
@@ -62,7 +62,7 @@ from perchctl.vehicle import (
 )
 
 
-class Finding(Enum):
+class RestState(Enum):
     """Where a vehicle with its motors off is, as a sentence without its end."""
 
     HANGS = "the vehicle hangs on the magnet, its motors are off"
@@ -114,8 +114,8 @@ AT_REST_S = 0.3
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the way down, begun by the first, without the mission's table, for watchdog
-    and rescue. `state` is None if the planner has none. Returns the new state and command."""
+    """Fly one tick of the way down without the mission's table, for watchdog and rescue; the
+    first call begins it. `state` is None if the planner has none yet."""
     c = Context(state or PlannerState.on_ground(obs), obs, profile)
     c = remember_observation(begin_landing(c))
     state, command = act(c.evolve(since=update_conditions(c)))
@@ -141,7 +141,7 @@ def begin_landing(c: Context) -> Context:
 
 
 def enter_landing(c: Context, old: PlannerState) -> Context:
-    """The tick with what a way down from `old` starts with; it has its entry already."""
+    """The tick with the state in which a way down from `old` starts; its entry is set already."""
     tel, stopped_s = c.telemetry, old.stopped_s
     heard = c.t_s - tel.t_s <= c.safety.proof_age_s
     ordered = heard and tel.has_bit(HL_ACTIVE) and not c.by_sight
@@ -210,21 +210,21 @@ def is_motor_borne(c: Context) -> bool:
     return c.state.released_s is None and c.state.stopped_s is None
 
 
-def rest_finding(c: Context) -> Finding:
+def find_rest_state(c: Context) -> RestState:
     """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
     above, or by the falls that were felt since it came into the magnet's reach."""
     tel, state = c.telemetry, c.state
     if _is_held_elsewhere(c):
-        return Finding.HELD
+        return RestState.HELD
     if c.by_sight or not c.placed:
         if c.tracked and c.far_below_target:
-            return Finding.STANDS
+            return RestState.STANDS
         return _by_fall(c, state.reach_s)
     high = state.entry_m[2] - state.ground_z_m > HIGH_M
     stayed = high and not c.far_below_target and state.entry_m[2] - tel.position_m[2] < STAYED_M
     if stayed or (c.height_m > LOW_M and not c.far_below_target and state.contact_z_m is not None):
-        return Finding.HANGS
-    return Finding.STANDS
+        return RestState.HANGS
+    return RestState.STANDS
 
 
 def _is_held_elsewhere(c: Context) -> bool:
@@ -241,26 +241,26 @@ def _is_held_elsewhere(c: Context) -> bool:
     return below and (c.fresh or by_position)
 
 
-def _by_fall(c: Context, since_s: float | None) -> Finding:
+def _by_fall(c: Context, since_s: float | None) -> RestState:
     """Where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the falls
     since, and the silences that could hide one."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
     unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt
     if since_s is None or down_s > since_s:
-        return Finding.UNKNOWN if unsure else Finding.STANDS
+        return RestState.UNKNOWN if unsure else RestState.STANDS
     came_unheard = unsure and reckoning.unsure_s <= since_s
-    return Finding.UNKNOWN if came_unheard or imu.gap_s > since_s else Finding.HANGS
+    return RestState.UNKNOWN if came_unheard or imu.gap_s > since_s else RestState.HANGS
 
 
 def is_still_hanging(c: Context) -> bool:
-    """True if it is at its contact by a position, or has hung all the time by the accelerometer."""
+    """True if a position shows the vehicle at its contact, or the accelerometer shows no fall."""
     contact_z_m, tel = c.state.contact_z_m, c.telemetry
     if not c.by_sight and c.placed and contact_z_m is not None:
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
             return True
-    return _by_fall(c, c.state.reach_s) is Finding.HANGS
+    return _by_fall(c, c.state.reach_s) is RestState.HANGS
 
 
 def hangs_with_motors_off(c: Context) -> bool:
@@ -365,7 +365,7 @@ def _reckon(c: Context) -> PlannerState:
             new = add_sighting(new, target.measured_s, aside_m, float(ez), sigma_m)
             if seen and target.measured_s > new.stepped_s:
                 new = replace(new, stepped_m=(0.0, 0.0))
-    held_s = c.held(Condition.CARRIED)
+    held_s = c.held_s(Condition.CARRIED)
     flies = state.phase is not Phase.LANDING
     near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
     if near and held_s >= c.planner.perch.contact_dwell_s:
@@ -420,7 +420,7 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
             orders=0,
             ordered_s=None,
             caught=False,
-            catch_above_m=CATCH_STILL_ABOVE_M,
+            catch_goal_above_m=CATCH_STILL_ABOVE_M,
         )
     if setpoint is not None:
         z_m = z if contact_z_m is None else setpoint.z_m + moved_m[2]
@@ -450,8 +450,8 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
 # --- What is commanded ------------------------------------------------
 
 
-def act(c: Context) -> Acted:
-    """The command of one tick: by the two proofs, then by what is known."""
+def act(c: Context) -> Action:
+    """The command of one tick: after proof of a fall or of standing, else by what is known."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
@@ -465,10 +465,10 @@ def act(c: Context) -> Acted:
         return _weight_on_magnet(c)
     if c.state.orders:  # to change a landing of its own costs height
         return _own_landing(c)
-    return release_by_thrust(c) if c.held(Condition.HANGING) >= HANGING_S else _descend(c)
+    return release_by_thrust(c) if c.held_s(Condition.HANGING) >= HANGING_S else _descend(c)
 
 
-def _descend(c: Context) -> Acted:
+def _descend(c: Context) -> Action:
     """Come down level, by thrust, unless the place is known. In the magnet's reach a setpoint below
     takes the thrust to its least, and what that does not move is given to the magnet. Else sink by
     setpoints to the hand-over, and from there by the vehicle's own landing: at once where height,
@@ -505,14 +505,14 @@ def _falls_free(c: Context) -> bool:
 
 def _stands(c: Context) -> bool:
     """True if it is on the floor, by proof."""
-    if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
+    if c.proves and c.held_s(Condition.ON_FLOOR) >= 0.5:
         return True
     level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
     low = c.height_m < STOP_BELOW_M and not is_in_magnet_reach(c)
     return level and low and c.climb_mps > -RESTS_MPS
 
 
-def _caught_again(c: Context) -> Acted:
+def _caught_again(c: Context) -> Action:
     """The landing, begun anew below, with a catch."""
     tel = c.telemetry
     state = replace(
@@ -523,7 +523,7 @@ def _caught_again(c: Context) -> Acted:
         reach_s=None,
         caught=False,
         pressed=False,
-        catch_above_m=catch_above_m(c.state.hover_thrust, tel.thrust),
+        catch_goal_above_m=catch_goal_above_m(c.state.hover_thrust, tel.thrust),
         setpoint=None,
         ordered_s=None,
         orders=0,
@@ -537,12 +537,12 @@ def _caught_again(c: Context) -> Acted:
     return _catch(c) or _descend(c)
 
 
-def _catch(c: Context) -> Acted | None:
+def _catch(c: Context) -> Action | None:
     """A catch by position; None without a heading, or astray."""
     return None if c.state.heading_lost or c.state.astray else catch(c)
 
 
-def _by_setpoints(c: Context) -> Acted:
+def _by_setpoints(c: Context) -> Action:
     """Sink straight down at the landing's speed, from where the landing began."""
     landing, state = c.planner.landing, c.state
     here = hold_here(c)
@@ -554,21 +554,21 @@ def _by_setpoints(c: Context) -> Acted:
     if c.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(clear_contact_below(c, PEELED_M).state, setpoint=setpoint, caught=True)
-    return state, limited(c, setpoint)
+    return state, limit_setpoint(c, setpoint)
 
 
-def own_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
+def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
     """The order for the vehicle's own landing from `z_m`, a quintic from rest to rest.
 
-    It aims below the ground, and the lower the longer the estimate has had to drift, and never
-    above the vehicle: at the trajectory's end the motors stop.
+    It aims below the ground, by more the longer the estimate may have drifted, and never above the
+    vehicle: at the trajectory's end the motors stop.
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
     return Land(aim_m, SETTLING_S + PEAK_OF_MEAN * (z_m - aim_m) / PLANNED_MPS)
 
 
-def _own_landing(c: Context) -> Acted:
+def _own_landing(c: Context) -> Action:
     """The vehicle's own landing, ordered again while it shows no effect."""
     tel = c.telemetry
     state, away = leave_press(c)
@@ -582,12 +582,12 @@ def _own_landing(c: Context) -> Acted:
     seen = state.orders >= LEAST_ORDERS and c.imu_proves and tel.has_bit(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.t_s - state.started_s
-        order = own_landing(c.planner, state.ground_z_m, flown_s, tel.position_m[2])
+        order = onboard_landing(c.planner, state.ground_z_m, flown_s, tel.position_m[2])
         return replace(state, ordered_s=c.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()
 
 
-def _level(c: Context) -> Acted:
+def _level(c: Context) -> Action:
     """Sink level by raw thrust on the vertical speed, tilted against the sideways speed. What does
     not sink gets less and less thrust: it sinks, the magnet lets go, or the floor proves itself."""
     state, tel = c.state, c.telemetry
@@ -657,7 +657,7 @@ def is_landing_over(c: Context) -> bool:
 
 
 def clear_contact_after_fall(c: Context) -> Context:
-    """The context without its contact, once a position shows it below, or it fell."""
+    """The context without its contact, once the vehicle is below it by a position, or fell."""
     if c.placed and c.state.blind_s is None:
         return clear_contact_below(c, PEELED_M)
     reach_s = c.state.reach_s
@@ -725,7 +725,7 @@ def _against(mps: float) -> float:
     return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))
 
 
-def _weight_on_magnet(c: Context) -> Acted:
+def _weight_on_magnet(c: Context) -> Action:
     """Put the whole weight on whatever carries it, and monitor that; without telemetry order what
     carries most of it: what hangs stays, what has fallen does not rise."""
     if c.attitude_age_s <= c.safety.telemetry_hold_s:

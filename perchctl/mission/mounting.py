@@ -34,18 +34,18 @@ _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 @dataclass(frozen=True)
 class MountSample:
-    """Vehicle and target in the plane of the estimate's world, x + iy, in metres. `lean`: from
+    """Vehicle and target in the plane of the estimate's world, x + iy. `lean_m`: from
     the vehicle to where its upward axis meets the target's plane."""
 
     t_s: float
-    vehicle: complex
-    target: complex
-    lean: complex = 0j
+    vehicle_m: complex
+    target_m: complex
+    lean_m: complex = 0j
 
     @property
-    def aim(self) -> complex:
+    def aim_m(self) -> complex:
         """Where the vehicle's upward axis meets the target's plane."""
-        return self.vehicle + self.lean
+        return self.vehicle_m + self.lean_m
 
 
 def mount_sample(t_s: float, telemetry: Telemetry, target_m: Array) -> MountSample:
@@ -62,16 +62,16 @@ class MountingMonitor:
     """The sights since the target came into view, and what they show of the mounting."""
 
     sights: tuple[MountSample, ...] = ()
-    deaf_until_s: float = -math.inf
-    fits: bool = False  # the target has stood still over `PROVEN_M`: the watch is over
+    paused_until_s: float = -math.inf
+    fits: bool = False  # the target has stood still over `PROVEN_M`: the check is over
     still: bool = False  # it has stood still so far
-    against: int = 0  # sights in a row that speak against the mounting
+    doubts: int = 0  # sights in a row that speak against the mounting
     turn_rad: float = 0.0  # the turn that would make the target stand still
 
     @property
     def is_wrong(self) -> bool:
         """True once enough sights in a row speak against the mounting."""
-        return self.against >= SIGHTS_IN_A_ROW
+        return self.doubts >= SIGHTS_IN_A_ROW
 
     @property
     def is_unconfirmed(self) -> bool:
@@ -80,28 +80,28 @@ class MountingMonitor:
 
 
 def update_monitor(old: MountingMonitor, sight: MountSample) -> MountingMonitor:
-    """The watch with one more sight of a measured target."""
+    """The monitor with one more sight of a measured target."""
     if old.fits or old.is_wrong:
         return old
     kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= WINDOW_S)
     if kept and _jumped(kept, sight):
-        return MountingMonitor(deaf_until_s=sight.t_s + SETTLES_S)
-    if sight.t_s < old.deaf_until_s:
+        return MountingMonitor(paused_until_s=sight.t_s + SETTLES_S)
+    if sight.t_s < old.paused_until_s:
         return old
-    new = replace(old, sights=(*kept, sight), still=False, against=0)
-    return new if len(new.sights) < LEAST_SIGHTS else _judged(new, old.against)
+    new = replace(old, sights=(*kept, sight), still=False, doubts=0)
+    return new if len(new.sights) < LEAST_SIGHTS else _judged(new, old.doubts)
 
 
 def _jumped(before: tuple[MountSample, ...], sight: MountSample) -> bool:
     last = before[-1]
     far = ESTIMATE_JUMP_M + FASTEST_MPS * (sight.t_s - last.t_s)
-    if abs(sight.vehicle - last.vehicle) > far:
+    if abs(sight.vehicle_m - last.vehicle_m) > far:
         return True
     for s in reversed(before):
         age_s = sight.t_s - s.t_s
         if age_s > _LONGEST_JUMP_S:
             return False
-        target_m, vehicle_m = abs(sight.target - s.target), abs(sight.aim - s.aim)
+        target_m, vehicle_m = abs(sight.target_m - s.target_m), abs(sight.aim_m - s.aim_m)
         for jump_m, within_s in JUMPS:
             if age_s <= within_s and target_m > jump_m + 2.0 * vehicle_m:
                 return True
@@ -109,7 +109,7 @@ def _jumped(before: tuple[MountSample, ...], sight: MountSample) -> bool:
 
 
 def _judged(watch: MountingMonitor, against: int) -> MountingMonitor:
-    aims, targets = [s.aim for s in watch.sights], [s.target for s in watch.sights]
+    aims, targets = [s.aim_m for s in watch.sights], [s.target_m for s in watch.sights]
     n, first = len(aims), aims[0]
     moved_m = max(abs(aim - first) for aim in aims)
     if moved_m < JUDGED_M:
@@ -129,5 +129,5 @@ def _judged(watch: MountingMonitor, against: int) -> MountingMonitor:
         and spread_m >= LEAST_SPREAD_M
         and unexplained_m <= MOST_UNEXPLAINED * spread_m
     ):
-        return replace(watch, against=against + 1, turn_rad=-cmath.phase(turn))
+        return replace(watch, doubts=against + 1, turn_rad=-cmath.phase(turn))
     return watch

@@ -27,22 +27,22 @@ from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
     FREE_SPEED_MPS,
     LIFTED_M,
-    Acted,
+    Action,
+    body_xy_under_target,
     catch,
-    catch_above_m,
+    catch_goal_above_m,
     clear_contact_below,
-    corrected,
+    correct_setpoint,
     hold_here,
     is_pressing,
     leave_press,
-    limited,
+    limit_setpoint,
     lower_thrust,
     motors_are_still,
     release_by_thrust,
     sink_setpoint,
     step_towards,
     stop_motors,
-    under_target_xy,
     update_integral,
 )
 from perchctl.mission.imu import discount_wrong_positions
@@ -81,8 +81,7 @@ def step_mission(
     profile: Profile,
     table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the mission; `state` is None in the first, on the ground. Returns the new
-    state, and the command to send."""
+    """Fly one tick of the mission; `state` is None in the first, on the ground."""
     c = _remember(Context(state or PlannerState.on_ground(obs), obs, profile))
     row = first_transition(c, table)
     if row is not None:
@@ -197,7 +196,7 @@ def _started_phase(new: Context, c: Context) -> Context:
                 released_s=None,
                 # What the motors carry most of hardly falls.
                 caught=row != "slipped" or c.telemetry.thrust >= CARRIED_RATIO * old.hover_thrust,
-                catch_above_m=catch_above_m(old.hover_thrust, c.telemetry.thrust),
+                catch_goal_above_m=catch_goal_above_m(old.hover_thrust, c.telemetry.thrust),
                 blocked_z_m=z_m if row == "blocked" else old.blocked_z_m,
             )
         case Phase.LANDING:
@@ -227,8 +226,8 @@ def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
         return old.contact
     if old.phase is Phase.RECOVER:  # pressed again before it had left
         return old.contact if old.contact_z_m is not None else None
-    proven = c.held(Condition.CONTACT) >= c.planner.perch.contact_dwell_s
-    carried = proven or c.held(Condition.CARRIED) >= 0.0  # which has that dwell in itself
+    proven = c.held_s(Condition.CONTACT) >= c.planner.perch.contact_dwell_s
+    carried = proven or c.held_s(Condition.CARRIED) >= 0.0  # which has that dwell in itself
     if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_tolerance_m(c):
         return contact_error(c)
     return None
@@ -237,7 +236,7 @@ def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
 # --- What each phase sends --------------------------------------------
 
 
-def act(c: Context) -> Acted:
+def act(c: Context) -> Action:
     """The phase's command for this tick."""
     # A fall is caught and a press ended although the vehicle is held: the setpoint is above.
     leaves = c.state.phase is Phase.RECOVER and (c.state.pressed or not c.state.caught)
@@ -247,13 +246,15 @@ def act(c: Context) -> Acted:
     return ACTIONS[c.state.phase](c)
 
 
-def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Acted:
+def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Action:
     """Remember the reference, and send it corrected; without `lift` at its own height."""
-    return replace(c.state, setpoint=reference), limited(c, corrected(c, reference, lift=lift))
+    return replace(c.state, setpoint=reference), limit_setpoint(
+        c, correct_setpoint(c, reference, lift=lift)
+    )
 
 
-def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
-    """Walk under the target at `z_m`, and learn the trim that keeps the gear there."""
+def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
+    """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
     goal = _target_goal(c, z_m)
     trim = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = c.evolve(integral_m=trim)
@@ -263,11 +264,11 @@ def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Acted:
 def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
     yaw = c.target_yaw_rad
     assert yaw is not None
-    x, y = under_target_xy(c, yaw)
+    x, y = body_xy_under_target(c, yaw)
     return PositionSetpoint(x, y, z_m, yaw)
 
 
-def _approach(c: Context) -> Acted:
+def _approach(c: Context) -> Action:
     """Rise from the ground on position setpoints, without which the firmware levels out."""
     planner, state = c.planner, c.state
     assert state.ground_m is not None
@@ -280,7 +281,7 @@ def _approach(c: Context) -> Acted:
     return _fly_to(c, setpoint, lift=c.height_m > LIFTED_M)
 
 
-def _search(c: Context) -> Acted:
+def _search(c: Context) -> Action:
     """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
     before is looked for from under it."""
     search, state, ground_m = c.planner.search, c.state, c.state.ground_m
@@ -290,7 +291,7 @@ def _search(c: Context) -> Acted:
         c = c.with_state(state)
     x, y, z = state.entry_m
     if c.target_m is not None:
-        there = under_target_xy(c, state.entry_yaw_rad)
+        there = body_xy_under_target(c, state.entry_yaw_rad)
         x, y = _not_far(state.mount, (x, y), there) if state.mount.is_unconfirmed else there
         height = min(z, c.contact_goal_z_m - c.planner.ascend.near_m)
     else:
@@ -308,13 +309,13 @@ def _not_far(
 ) -> tuple[float, float]:
     """The goal, world x and y (m), cut to `WARY_M` from the last sight, else from `start`."""
     if mount.sights:
-        start = (mount.sights[-1].vehicle.real, mount.sights[-1].vehicle.imag)
+        start = (mount.sights[-1].vehicle_m.real, mount.sights[-1].vehicle_m.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]
     part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
 
 
-def _ascend(c: Context) -> Acted:
+def _ascend(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone; slower near the target."""
     ascend = c.planner.ascend
     setpoint = c.state.setpoint or hold_here(c)
@@ -326,7 +327,7 @@ def _ascend(c: Context) -> Acted:
     return _under_target(c, goal_z, up_mps=speed if may_climb and lag < 0.15 else 0.0)
 
 
-def _perch(c: Context) -> Acted:
+def _perch(c: Context) -> Action:
     """Press. Position and trim stay as they are: against the ceiling they would wind up."""
     perch = c.planner.perch
     if perch.mode == "raw":
@@ -337,15 +338,15 @@ def _perch(c: Context) -> Acted:
     return _fly_to(c, step_towards(c, goal, up_mps=perch.climb_mps, down_mps=0.0), lift=False)
 
 
-def _complete(c: Context) -> Acted:
+def _complete(c: Context) -> Action:
     """Release in two stages; stop the motors once the whole weight hangs; watch."""
     if c.state.stopped_s is not None:
         return stop_motors(c)
-    holds = c.held(Condition.MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
+    holds = c.held_s(Condition.MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
     return release_by_thrust(c) if holds or c.state.released_s is not None else lower_thrust(c)
 
 
-def _recover(c: Context) -> Acted:
+def _recover(c: Context) -> Action:
     """Hold in the air `descend_m` below where the attempt ended, in position mode all along."""
     if (caught := catch(c)) is not None:
         return caught
@@ -362,7 +363,7 @@ def _recover(c: Context) -> Acted:
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)
     if c.target_m is not None and c.target_age_s < 3.0:
-        x, y = under_target_xy(c, setpoint.yaw_rad)
+        x, y = body_xy_under_target(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
         goal = replace(setpoint, z_m=z)
@@ -370,7 +371,7 @@ def _recover(c: Context) -> Acted:
     return _fly_to(c, step_towards(c, goal, down_mps=FREE_SPEED_MPS))
 
 
-def _aborted(c: Context) -> Acted:
+def _aborted(c: Context) -> Action:
     """The motor stop, once; what hangs with its motors still would be locked without one."""
     if c.state.orders:
         return c.state, Idle()
@@ -378,7 +379,7 @@ def _aborted(c: Context) -> Acted:
     return replace(c.state, orders=1, ordered_s=c.t_s), c.state.stop or ends
 
 
-ACTIONS: dict[Phase, Callable[[Context], Acted]] = {
+ACTIONS: dict[Phase, Callable[[Context], Action]] = {
     Phase.APPROACH: _approach,
     Phase.SEARCH: _search,
     Phase.ESTIMATE: lambda c: _fly_to(c, c.state.setpoint or hold_here(c)),

@@ -15,7 +15,7 @@ from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Se
 from perchctl.mission.table import position_loss_text
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
-from perchctl.vision import Consistency, PictureKind, PipelineOutput, TargetEstimate
+from perchctl.vision import CameraErrors, PictureKind, PipelineOutput, TargetEstimate
 
 TurnRole = Literal["waiting", "redone", "flown", "failed"]
 RESCUE = " in flight: "
@@ -31,7 +31,7 @@ class EventKind(Enum):
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened. It becomes words only where it is shown."""
+    """Something that happened in a flight, for its log and its displays."""
 
     t_s: float
     kind: EventKind
@@ -176,7 +176,7 @@ class Tick:
     loop_late_s: float
     camera_age_s: float
     telemetry_age_s: float
-    consistency: Consistency | None = None  # of latency and mounting, if worked out in this tick
+    consistency: CameraErrors | None = None  # of latency and mounting, if worked out in this tick
     delay_used_s: float = 0.0  # off the frames' times
     outside: ExternalPositions | None = None  # None where decks measure the position
     turn: Turn | None = None

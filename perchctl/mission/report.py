@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.context import Context
-from perchctl.mission.lander import Finding, rest_finding
+from perchctl.mission.lander import RestState, find_rest_state
 from perchctl.mission.records import Event
 from perchctl.mission.state import (
     Condition,
@@ -21,7 +21,7 @@ from perchctl.mission.state import (
 from perchctl.profile import CameraConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import Consistency
+from perchctl.vision import CameraErrors
 
 HARD_MPS = 0.6  # no way down that goes as it should ends faster
 LATEST_S = 5.0  # from the touchdown to the motors' stop: an earlier blow was no floor
@@ -62,8 +62,8 @@ class Findings:
     advice: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, seen: Consistency, camera: CameraConfig) -> Findings:
-        """The flight's findings. Advised is what is beyond its gate, and surely so."""
+    def of(cls, seen: CameraErrors, camera: CameraConfig) -> Findings:
+        """The flight's findings, with advice on each that is surely beyond its limit."""
         latency_s = camera.start_latency_s + seen.delay_s
         x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
@@ -122,7 +122,7 @@ class FlightReport:
         obs: Observation,
         profile: Profile,
         history: tuple[Event, ...],
-        consistency: Consistency | None,
+        consistency: CameraErrors | None,
     ) -> FlightReport:
         """The report of a mission that is over, by its last tick."""
         hangs, contact = state.phase is Phase.PERCHED, state.contact
@@ -147,10 +147,10 @@ def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: fl
     """Where the vehicle is, as a sentence without its end, once its motors have been seen off for
     `off_s`; None before that. A hard touchdown is told with it."""
     c = Context(state, obs, profile)
-    if c.held(Condition.DOWN) < off_s:
+    if c.held_s(Condition.DOWN) < off_s:
         return None
-    finding, touchdown = rest_finding(c), find_touchdown(c)
-    hangs = finding in (Finding.HANGS, Finding.HELD)
+    finding, touchdown = find_rest_state(c), find_touchdown(c)
+    hangs = finding in (RestState.HANGS, RestState.HELD)
     if hangs or touchdown is None or not touchdown.is_hard:
         return finding.value
     return f"{finding.value}; it {touchdown.text}"

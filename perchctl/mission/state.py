@@ -54,7 +54,7 @@ TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 
 
 class Severity(IntEnum):
-    """How grave a row is. From `LAND` on it only rises until the flight is over."""
+    """How grave a transition is. From `LAND` on it only rises until the flight is over."""
 
     CONTINUE = 0
     HOLD = 1
@@ -79,7 +79,7 @@ class Outcome(Enum):
 
 
 class Condition(Enum):
-    """What the table debounces; `perchctl.mission.conditions` says when each holds."""
+    """The conditions that the table debounces; `perchctl.mission.conditions` evaluates them."""
 
     __hash__ = object.__hash__  # by identity: twenty are looked up in each tick
 
@@ -116,7 +116,7 @@ class ContactError:
     sigma_m: float
 
     def is_within(self, radius_m: float) -> bool:
-        """True if it is known to be so near to the axis."""
+        """True if the gear was surely within `radius_m` of the axis."""
         return self.aside_m + self.sigma_m <= radius_m
 
     @property
@@ -186,14 +186,14 @@ class EnergyState:
     """The battery as fitted so far. Shares are of the full charge, loads of full thrust."""
 
     ground_v: float | None = None  # at rest; from the first reading where that was under load
-    used: float = 0.0  # by the count of the thrust, for a battery as assumed
+    used_share: float = 0.0  # by the count of the thrust, for a battery as assumed
     load: float = 0.0  # as the reading follows it
     mean_load: float = 0.0  # over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
     loaded_s: float = 0.0  # how long there were readings under load
     unknown_s: float = 0.0  # since the last reading
     # Sums of least squares: sag^2, sag * hunger, hunger^2, and the two right sides.
-    fit: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    fit_sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ class PlannerState:
     contact_z_m: float | None = None  # height of the body while it is held by the magnet
     released_s: float | None = None  # begin of the release by raw thrust
     caught: bool = True  # False after a slip, until the fall is stopped
-    catch_above_m: float = 0.0  # how far above it the setpoint is that stops the fall
+    catch_goal_above_m: float = 0.0  # how far above it the setpoint is that stops the fall
     pressed: bool = False  # the way down begins with full thrust against something
     blocked_z_m: float | None = None  # something solid is above
     ordered_s: float | None = None  # last order of a landing or motor stop

@@ -24,10 +24,10 @@ from perchctl.mission.imu import PUSHED_S
 from perchctl.mission.lander import (
     HELD,
     LOOKED_S,
-    Finding,
+    RestState,
+    find_rest_state,
     hangs_with_motors_off,
     is_still_hanging,
-    rest_finding,
 )
 from perchctl.mission.state import (
     BEFORE_CONTACT,
@@ -85,12 +85,12 @@ UNCORRECTED = "the estimate's variance only grows; is the positioning system gon
 
 
 def is_astray(c: Context) -> bool:
-    """True if position control leads away from its setpoint, farther than any draught or in swings:
-    external positions are in other axes, which no vehicle at rest shows (fault 11)."""
+    """True if external positions in other axes than the vehicle's lead position control away from
+    its setpoint (fault 11): farther than any draught carries it, or in swings."""
     setpoint, phase = c.state.setpoint, c.state.phase
     if c.profile.positioning.by == "deck" or not c.placed:
         return False
-    if c.held(C.OTHERWISE) >= OTHERWISE_S or _swings(c):
+    if c.held_s(C.OTHERWISE) >= OTHERWISE_S or _swings(c):
         return True
     if setpoint is None:
         return False
@@ -174,7 +174,7 @@ def latency_reason(c: Context) -> str:
 
 def is_mounting_wrong(c: Context) -> bool:
     """True if the target moves with the vehicle, or seems to lie below it."""
-    below = c.held(C.TARGET_BELOW) >= BELOW_S
+    below = c.held_s(C.TARGET_BELOW) >= BELOW_S
     return c.state.mount.is_wrong or c.mismatch.turn_rad != 0.0 or below
 
 
@@ -205,9 +205,9 @@ def not_found_reason(c: Context) -> str:
 # --- Whether something holds or blocks the vehicle, or its thrust is too weak ---
 
 
-def is_caught(c: Context) -> bool:
-    """True if the target's magnet holds it already."""
-    if c.held(C.HANGING) < HANGING_S:
+def is_held(c: Context) -> bool:
+    """True if the target's magnet holds the vehicle already."""
+    if c.held_s(C.HANGING) < HANGING_S:
         return False
     touched, radius_m = last_touch_error(c), c.planner.perch.contact_xy_m
     near = touched is not None and max(touched.aside_m, touched.sigma_m) <= radius_m
@@ -215,21 +215,21 @@ def is_caught(c: Context) -> bool:
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """True if something else than the target's magnet holds it: at another height, or beside."""
+    """True if something holds the vehicle at another height than the target's, or beside it."""
     touched = last_touch_error(c)
     error = touched or contact_error(c)
     at_its_height = touched is not None or abs(c.error_z_m) <= contact_tolerance_m(c)
     beside = error.aside_m - 2.0 * error.sigma_m > c.planner.perch.contact_xy_m
-    return c.held(C.HANGING) >= HELD_S and (beside or not at_its_height)
+    return c.held_s(C.HANGING) >= HELD_S and (beside or not at_its_height)
 
 
 def is_blocked(c: Context) -> bool:
-    """True if it has been pressed against something for long enough."""
-    return c.held(C.BLOCKED) >= c.safety.blocked_s
+    """True if the vehicle has pressed against something for `safety.blocked_s`."""
+    return c.held_s(C.BLOCKED) >= c.safety.blocked_s
 
 
 def is_blocked_off_target(c: Context) -> bool:
-    """True if it is blocked, and in the press too far from the target to prove a contact."""
+    """True if the vehicle is blocked, and not where a press would prove the contact."""
     pressing = c.state.phase is P.PERCH
     return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_tolerance_m(c))
 
@@ -238,9 +238,9 @@ def lacks_press_thrust(c: Context) -> bool:
     """True if no thrust is left to press with: seen at full thrust, or known before the press."""
     if c.state.pressed:
         return False
-    if c.held(C.SATURATED) >= WEAK_S:
+    if c.held_s(C.SATURATED) >= WEAK_S:
         return True
-    near = c.state.phase is P.ASCEND and c.held(C.NEAR_STANDOFF) >= 0.0
+    near = c.state.phase is P.ASCEND and c.held_s(C.NEAR_STANDOFF) >= 0.0
     return near and c.state.hover_thrust > SATURATED * max_press_thrust(c.profile)
 
 
@@ -248,24 +248,24 @@ def lacks_press_thrust(c: Context) -> bool:
 
 
 def is_aligned(c: Context) -> bool:
-    return c.held(C.ALIGNED) >= c.planner.align.dwell_s
+    return c.held_s(C.ALIGNED) >= c.planner.align.dwell_s
 
 
 def has_recovered(c: Context) -> bool:
-    """True if it has been steady for long enough, away from what it touched."""
+    """True if the vehicle has been steady for long enough, away from its contact."""
     dwell_s = c.planner.recover.dwell_s
-    steady = c.held(C.STEADY) >= dwell_s and c.in_phase_s >= dwell_s
+    steady = c.held_s(C.STEADY) >= dwell_s and c.in_phase_s >= dwell_s
     return steady and c.state.contact_z_m is None
 
 
 def lacks_charge_to_begin(c: Context) -> bool:
-    """True if an attempt would begin, or begin anew, and the battery has not enough for it."""
+    """True if an attempt or a retry is due, and the battery has not enough charge for it."""
     begins = is_aligned(c) if c.state.phase is P.ALIGN else has_recovered(c)
     return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
 
 
 def is_in_contact(c: Context) -> bool:
-    return c.held(C.CONTACT) >= c.planner.perch.contact_dwell_s
+    return c.held_s(C.CONTACT) >= c.planner.perch.contact_dwell_s
 
 
 def contact_reason(c: Context) -> str:
@@ -282,12 +282,12 @@ def stopped_for_s(c: Context) -> float:
 
 def release_monitored(c: Context) -> bool:
     """True if the motors have been off for as long as a perched vehicle is monitored."""
-    return stopped_for_s(c) >= c.planner.complete.watch_s and c.held(C.DOWN) >= 0.1
+    return stopped_for_s(c) >= c.planner.complete.watch_s and c.held_s(C.DOWN) >= 0.1
 
 
-def motors_off_as(finding: Finding) -> Predicate:
-    """The predicate that the motors are off, and that the vehicle is found to hang or stand so."""
-    return lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is finding
+def rests_as(state: RestState) -> Predicate:
+    """The predicate that the motors are off and the vehicle is in this rest state."""
+    return lambda c: c.held_s(C.DOWN) >= 0.1 and find_rest_state(c) is state
 
 
 # --- Why the vehicle is held in place ---------------------------------
@@ -317,7 +317,7 @@ def no_picture_reason(c: Context) -> str:
     return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
 
 
-def why_unconfirmed(c: Context) -> str:
+def unconfirmed_reason(c: Context) -> str:
     cause = "by its telemetry the vehicle still flies"
     if c.attitude_age_s > FRESH_S:
         cause = f"nothing was heard from the vehicle for {c.attitude_age_s:.1f} s"
@@ -379,7 +379,7 @@ TABLE: tuple[Transition, ...] = (
     end_row("crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"),
     cut_row(
         "tilted",
-        lambda c: c.held(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
+        lambda c: c.held_s(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
         "tilted beyond the limit: motors cut",
     ),
     land_row(
@@ -423,7 +423,7 @@ TABLE: tuple[Transition, ...] = (
     land_row(
         "estimate-unsure",
         IN_THE_OPEN,
-        lambda c: c.held(C.UNSURE) >= c.safety.variance_land_s,
+        lambda c: c.held_s(C.UNSURE) >= c.safety.variance_land_s,
         lambda c: (
             f"the position's variance is {c.variance_m2:.2g} m^2, at most "
             f"{c.safety.flight_variance_m2:g} allowed: is the positioning system gone?"
@@ -432,7 +432,7 @@ TABLE: tuple[Transition, ...] = (
     land_row(
         "battery-low",
         BEFORE_CONTACT,
-        lambda c: c.held(C.BATTERY_LOW) >= c.safety.battery_debounce_s,
+        lambda c: c.held_s(C.BATTERY_LOW) >= c.safety.battery_debounce_s,
         lambda c: f"battery at {c.telemetry.battery_v:.2f} V under load",
     ),
     land_row(
@@ -483,14 +483,14 @@ TABLE: tuple[Transition, ...] = (
         O.ATTEMPTS_USED_UP,
     ),
     # --- the magnet may catch early ---------------------------------------------
-    Transition("caught", BEFORE_COMPLETION, is_caught, P.COMPLETE, "hanging on the magnet already"),
+    Transition("caught", BEFORE_COMPLETION, is_held, P.COMPLETE, "hanging on the magnet already"),
     land_row(
         HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"
     ),
     land_row(
         "hangs-at-contact",
         BEFORE_COMPLETION,
-        lambda c: c.held(C.HANGING) >= HELD_S,
+        lambda c: c.held_s(C.HANGING) >= HELD_S,
         lambda c: (
             f"it hangs at the target's height, {(last_touch_error(c) or contact_error(c)).text}: "
             f"that may be its magnet"
@@ -523,7 +523,7 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "approached",
         {P.APPROACH},
-        lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3,
+        lambda c: c.held_s(C.AT_TAKEOFF_HEIGHT) >= 0.3,
         P.SEARCH,
         "hovering in the perching area",
     ),
@@ -552,7 +552,7 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "estimate-lost",
         {P.ESTIMATE},
-        lambda c: c.held(C.UNTRACKED) > 1.0 or c.in_phase_s > c.planner.estimate.timeout_s,
+        lambda c: c.held_s(C.UNTRACKED) > 1.0 or c.in_phase_s > c.planner.estimate.timeout_s,
         P.SEARCH,
         "the target's pose does not settle",
         S.HOLD,
@@ -560,7 +560,7 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "estimated",
         {P.ESTIMATE},
-        lambda c: c.held(C.ESTIMATED) >= c.planner.estimate.dwell_s,
+        lambda c: c.held_s(C.ESTIMATED) >= c.planner.estimate.dwell_s,
         P.ALIGN,
         "pose is steady",
     ),
@@ -596,14 +596,14 @@ TABLE: tuple[Transition, ...] = (
         {P.ASCEND},
         lambda c: (
             c.in_phase_s > c.planner.ascend.timeout_s
-            or c.held(C.NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s
+            or c.held_s(C.NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s
         ),
         "does not settle under the target",
     ),
     Transition(
         "settled",
         {P.ASCEND},
-        lambda c: c.held(C.SETTLED) >= c.planner.ascend.settle_dwell_s,
+        lambda c: c.held_s(C.SETTLED) >= c.planner.ascend.settle_dwell_s,
         P.PERCH,
         "settled at the stand-off",
     ),
@@ -625,7 +625,7 @@ TABLE: tuple[Transition, ...] = (
     back_off_row(
         "knocked-aside",
         {P.PERCH},
-        lambda c: c.held(C.KNOCKED) >= KNOCKED_S,
+        lambda c: c.held_s(C.KNOCKED) >= KNOCKED_S,
         "pushed aside under the target",
     ),
     back_off_row(
@@ -690,14 +690,14 @@ TABLE: tuple[Transition, ...] = (
     Transition(
         "hung",
         {P.LANDING},
-        motors_off_as(Finding.HANGS),
+        rests_as(RestState.HANGS),
         P.PERCHED,
         "hanging with the motors off",
     ),
     Transition(
         "landed",
         {P.LANDING},
-        motors_off_as(Finding.STANDS),
+        rests_as(RestState.STANDS),
         P.LANDED,
         lambda c: (
             "motors off"
@@ -706,19 +706,19 @@ TABLE: tuple[Transition, ...] = (
     ),
     give_up_row(
         "held-elsewhere",
-        motors_off_as(Finding.HELD),
+        rests_as(RestState.HELD),
         "motors off; something holds it where its estimate has no target: look before you touch it",
     ),
     give_up_row(
         "hangs-or-stands",
-        lambda c: c.held(C.DOWN) >= LOOKED_S,
+        lambda c: c.held_s(C.DOWN) >= LOOKED_S,
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it",
     ),
     give_up_row(
         "landing-timeout",
         lambda c: c.in_phase_s > c.planner.landing.timeout_s,
-        why_unconfirmed,
+        unconfirmed_reason,
     ),
 )
 

@@ -106,7 +106,7 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """The velocity in world axes from `t_s` on, or the newest; else zero."""
+    """The first velocity from `t_s` on, else the newest, else zero; world axes."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
@@ -162,7 +162,7 @@ def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
 
 
 def is_finite(s: Telemetry) -> bool:
-    """True if all that a flight is steered by is a number."""
+    """True if all values of a sample that steer a flight are finite."""
     attitude = s.roll_rad, s.pitch_rad, s.yaw_rad
     forces = s.acc_x_g, s.acc_y_g, s.acc_z_g, s.thrust
     return _is_placed(s) and all(map(math.isfinite, (*attitude, *forces)))

@@ -17,7 +17,7 @@ from perchctl.geometry import Array, finite, wrap_rad
 from perchctl.perception.history import History, attitude_at, velocity_at
 from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.values import replace
-from perchctl.vision import Attitude, Consistency, MarkerPose, PoseSetup
+from perchctl.vision import Attitude, CameraErrors, MarkerPose, PoseSetup
 
 SOLVE_EVERY_S = 1.0
 LIKELY_S = 0.02
@@ -33,15 +33,15 @@ LONGEST_STEP_S = 0.1
 class OnlineCalibration:
     """Estimate of the camera's latency and mounting from pictures and telemetry.
 
-    `newest` is the solution of `sums` at `solved_s`; `used_s` is subtracted from the pictures'
-    times beyond the profile's latency, since the picture of `seen_s`.
+    `newest` is the solution of `sums` at `solved_s`; `applied_delay_s` is the latency beyond the
+    profile's that is subtracted from the pictures' times, since the one of `last_picture_s`.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
-    newest: Consistency | None = None
+    newest: CameraErrors | None = None
     solved_s: float = -math.inf
-    used_s: float = 0.0
-    seen_s: float = -math.inf
+    applied_delay_s: float = 0.0
+    last_picture_s: float = -math.inf
 
 
 def update_calibration(
@@ -53,8 +53,9 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture in its sums, solved once a second. `t_s`: arrival
-    less the profile's latency. Poses not finite, too near or without attitude teach nothing."""
+    """Return the estimate with one more picture in its sums, and once a second with their solution.
+    `t_s` is its arrival less the profile's latency. A pose that is not finite, too near, or without
+    the attitude of its time is ignored."""
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
@@ -63,20 +64,20 @@ def update_calibration(
     is_measured = pose.cov is not None and finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
     if is_measured and before is not None and after is not None:
         velocity_mps = velocity_at(history, t_s - delay_s)
-        moment = consistency_rows(pose, before, after, velocity_mps, delay_s, setup)
+        moment = rows_variance_range(pose, before, after, velocity_mps, delay_s, setup)
         new = replace(old, sums=add_rows(old.sums, t_s, *moment))
         if t_s - old.solved_s >= SOLVE_EVERY_S:
             newest = solve_consistency(new.sums, attitude_sigma_rad)
             new = replace(new, newest=newest, solved_s=t_s)
     if camera.latency_s != "measured":
         return new
-    used_s = new.used_s
+    used_s = new.applied_delay_s
     if new.newest is not None and new.newest.delay_sigma_s <= USED_SIGMA_S:
         (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
         goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
-        step_s = SLEW * max(0.0, min(t_s - old.seen_s, LONGEST_STEP_S))
+        step_s = SLEW * max(0.0, min(t_s - old.last_picture_s, LONGEST_STEP_S))
         used_s += max(-step_s, min(step_s, goal_s - used_s))
-    return replace(new, seen_s=t_s, used_s=used_s)
+    return replace(new, last_picture_s=t_s, applied_delay_s=used_s)
 
 
 # --- What a flight tells about the latency and the mounting -----------
@@ -121,17 +122,17 @@ LEAST_FRAMES = 30
 @dataclass(frozen=True, eq=False)
 class ConsistencySums:
     """A flight's memory: `level` (3, 8) and its `variance` (3,) as the newest frame left them,
-    None before the first; `information` (8, 8) of the innovations; `rows` that they are of."""
+    None before the first; `information` (8, 8) of the innovations; `row_count` of their rows."""
 
     t_s: float = -math.inf
     began_s: float = 0.0
     level: Array | None = None
     variance: Array = field(default_factory=lambda: np.zeros(3))
     information: Array = field(default_factory=lambda: np.zeros((8, 8)))
-    rows: int = 0
+    row_count: int = 0
 
 
-def consistency_rows(
+def rows_variance_range(
     pose: MarkerPose,
     before: Attitude,
     after: Attitude,
@@ -197,7 +198,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """Return the sums with one frame more, by its `consistency_rows`. After a gap, or a jump,
+    """Return the sums with one frame more, by its `rows_variance_range`. After a gap, or a jump,
     changes are counted anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
@@ -222,16 +223,16 @@ def add_rows(
         old.level + gain[:, None] * change,
         (1.0 - gain) * predicted,
         old.information + change.T @ (change / spread[:, None]),
-        old.rows + 3,
+        old.row_count + 3,
     )
 
 
-def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consistency | None:
+def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
     """Return what the flight shows so far; None after less than a second of frames.
 
     `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
     """
-    if sums.rows < 3 * LEAST_FRAMES:
+    if sums.row_count < 3 * LEAST_FRAMES:
         return None
     information = sums.information[1:, 1:] + np.diag(1.0 / _PRIOR**2)
     moved = sums.information[1:, PLACE]
@@ -239,13 +240,13 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consi
     found = covariance @ moved
     left = float(sums.information[PLACE, PLACE] - found @ moved)
     # More scatter than claimed widens what is claimed, less of it narrows nothing.
-    covariance *= max(1.0, left / sums.rows)
+    covariance *= max(1.0, left / sums.row_count)
     sigma = np.sqrt(np.diagonal(covariance))
     tilt_x, tilt_y = (
         math.hypot(sigma[column - 1], attitude_sigma_rad) for column in (TILT_X, TILT_Y)
     )
     turn = math.atan2(found[TURN - 1], 1.0 - found[SCALE - 1])
-    return Consistency(
+    return CameraErrors(
         delay_s=float(found[DELAY - 1]),
         delay_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
         turn_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),

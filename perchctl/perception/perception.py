@@ -25,7 +25,7 @@ from perchctl.perception.visual_inertial import (
 )
 from perchctl.profile import Profile
 from perchctl.vision import (
-    Consistency,
+    CameraErrors,
     Frame,
     Pipeline,
     PipelineOutput,
@@ -44,7 +44,7 @@ class Perception:
     """The session that turns one stream's frames into the target's place.
 
     Attributes:
-        stills: each frame is searched for itself, thoroughly, and nothing is remembered.
+        stills: each frame is searched thoroughly, without memory of others.
         history: the vehicle's telemetry; empty where there is no vehicle.
         state: the pipeline's memory.
         calibration, motion: what pictures and telemetry tell of latency and mounting, and of the
@@ -96,7 +96,7 @@ class Perception:
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
-    def consistency(self) -> Consistency | None:
+    def consistency(self) -> CameraErrors | None:
         """Latency and mounting by all pictures so far; None if there were too few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 

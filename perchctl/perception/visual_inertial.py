@@ -40,20 +40,20 @@ class VisualInertialWindow:
 
     sights: tuple[tuple[float, Vector], ...] = ()  # time, way from body to target, body axes, m
     judged_s: float = -math.inf
-    found: Mismatch | None = None  # the newest judgement; once enough agree, it stays
-    found_s: float = -math.inf
-    agreed: int = 0  # judgements in a row that say the same
+    latest: Mismatch | None = None  # the newest judgement; once enough agree, it stays
+    latest_s: float = -math.inf
+    agree_count: int = 0  # judgements in a row that say the same
     motion: VisualInertialMotion | None = None  # the newest in which the sum wandered by at most
     motion_within_m: float = WANDERS_M  # ... this
 
     @property
     def mismatch(self) -> Mismatch | None:
         """The newest judgement, once enough in a row agree; None before that."""
-        return self.found if self.agreed >= AGREED else None
+        return self.latest if self.agree_count >= AGREED else None
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window without the sights from before, and content with a rougher speed."""
+    """The window without its sights, which from now on accepts a rougher motion."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -64,8 +64,8 @@ def estimate_motion(
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
 ) -> VisualInertialWindow:
-    """The window with one more sight, by the telemetry of the last 2 s, oldest first; `offset_g` is
-    what the accelerometer reads too much."""
+    """The window with one more sight, `way_m` from body to target in body axes, by the telemetry of
+    the last 2 s, oldest first; `offset_g` is what the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, way_m)))
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
@@ -73,15 +73,15 @@ def estimate_motion(
         return new
     wanders_m, velocity_mps, bias_mps2 = fit_hypotheses(new.sights, samples, offset_g)
     if old.mismatch is None:  # else it stays
-        found, before = _found(wanders_m), old.found
+        found, before = _found(wanders_m), old.latest
         agreed = 0 if found is None else 1
         if found is not None and before is not None and found.turn_rad == before.turn_rad:
-            agreed += old.agreed if abs(found.later_s - before.later_s) <= ALIKE_S else 0
-        new = replace(new, found=found, found_s=t_s, agreed=agreed)
+            agreed += old.agree_count if abs(found.later_s - before.later_s) <= ALIKE_S else 0
+        new = replace(new, latest=found, latest_s=t_s, agree_count=agreed)
     i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
-        climb_mps = vz if t_s - new.found_s <= WINDOW_S else None
+        climb_mps = vz if t_s - new.latest_s <= WINDOW_S else None
         new = replace(
             new, motion=VisualInertialMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps)
         )

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from perchctl.children import Channel, connect_back, end, spawn
+from perchctl.children import Channel, connect_to_parent, spawn, wait_or_kill
 from perchctl.errors import ConnectionFailed, broken_motion_capture
 from perchctl.positioning.feed import BodyPose, CaptureFrame, PositionFeed
 from perchctl.profile import PositioningConfig
@@ -38,12 +38,12 @@ _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """What the child connects to. `partial`: a frame without a body is no frame, since the
-    library's loop turns by its own clock, whether or not anything has arrived."""
+    """What the child connects to. `skip_empty`: a frame without a body is no frame, since the
+    library returns frames by its own clock, whether or not anything has arrived."""
 
     kind: str
     options: dict[str, str] = field(default_factory=dict)
-    partial: bool = False
+    skip_empty: bool = False
     timeout_s: float = 5.0
 
 
@@ -56,7 +56,8 @@ class CaptureFailure:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return what the child connects to: Vicon and VRPN take the port with the name."""
+    """Return what the child connects to: Vicon and VRPN take a port in the host's name, the others
+    as an option of its own."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -72,7 +73,7 @@ def open_capture(
     Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
     without an answer in `config.connect_timeout_s`.
     """
-    PositionFeed.check_reachable(config)
+    PositionFeed.check_config(config)
     return MotionCapture(capture_setup(config), config.label, config.body, clock)
 
 
@@ -121,7 +122,7 @@ class MotionCapture:
         silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
         if silent_s <= SILENT_S:
             return None
-        what = "no body" if self._setup.partial else "no frame"
+        what = "no body" if self._setup.skip_empty else "no frame"
         return f"{self._who} has sent {what} for {silent_s:.1f} s"
 
     def close(self) -> None:
@@ -129,7 +130,7 @@ class MotionCapture:
         self._closed = True
         if self._child.poll() is None:
             self._child.kill()
-        end(self._child, _END_TIMEOUT_S)
+        wait_or_kill(self._child, _END_TIMEOUT_S)
         for thread in self._threads:
             thread.join(_END_TIMEOUT_S)
         self._channel.close()
@@ -174,7 +175,7 @@ class MotionCapture:
                 self._framed_s = now_s
                 self._settled.set()
         if self._ended is None and not self._closed:
-            end(self._child, _END_TIMEOUT_S)
+            wait_or_kill(self._child, _END_TIMEOUT_S)
             self._threads[0].join(_END_TIMEOUT_S)
             code = self._child.poll()
             how = "" if code is None else f" with code {code}"
@@ -213,7 +214,7 @@ Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, 
 def serve_parent() -> None:
     """Send frames until the parent is gone, or the library gives up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = connect_back()
+    channel = connect_to_parent()
     setup = channel.receive(START_TIMEOUT_S)
     is_loaded = False
     # A library that lets no thread have a turn outlives a parent that was killed, but not this.
@@ -227,7 +228,7 @@ def serve_parent() -> None:
         client = motioncapture.connect(setup.kind, options)
         faulthandler.cancel_dump_traceback_later()
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
-        _pass_on(client, channel, setup.partial)
+        _pass_on(client, channel, setup.skip_empty)
     except Exception as error:  # whatever the library, or the loading of its own modules, raises
         with contextlib.suppress(OSError):  # the parent may be gone, and have caused it
             channel.send(CaptureFailure(str(error) or type(error).__name__, is_loaded))

@@ -41,9 +41,9 @@ class CaptureComparison(BaseModel):
     passed: bool = False
     found: str = ""
 
-    def flight_objection(self, now: datetime) -> tuple[str, str] | None:
-        """Say why no flight may rely on it: what was found, and what to do. None where it passed,
-        at most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
+    def objection_and_advice(self, now: datetime) -> tuple[str, str] | None:
+        """Return why no flight may rely on this comparison, and what to do; None if it passed, at
+        most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
             return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
         when, age_s = self.text(now), (now - self.at).total_seconds()
@@ -56,7 +56,7 @@ class CaptureComparison(BaseModel):
         return None
 
     def text(self, now: datetime) -> str:
-        """Say when it was made."""
+        """Return the comparison's date in words."""
         assert self.at is not None
         return f"compared by hand on {self.at.astimezone(now.tzinfo):%d %b %Y %H:%M}"
 
@@ -72,7 +72,7 @@ def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """Return what is known of this vehicle in this set-up; an unreadable file counts as none."""
+    """Return the vehicle's comparison in this set-up; an unmade one if no file can be read."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())
@@ -84,8 +84,9 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureCompariso
 def save_comparison(
     config: PositioningConfig, vehicle: str, at: datetime, passed: bool, found: str
 ) -> str | None:
-    """Write a comparison over this set-up's last; `at` has a time zone. Returns None, or why that
-    failed: an old one that passed must not stand then, and is deleted if it can be."""
+    """Write a comparison in the place of the last one of this vehicle in this set-up. `at` has a
+    time zone. Returns None, or why it could not be written; then the last one is deleted if the
+    new one did not pass."""
     path = comparison_path(config, vehicle)
     record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)
     try:

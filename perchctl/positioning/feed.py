@@ -101,9 +101,9 @@ class SendingRate:
         """Return whether a position may be sent now."""
         return now_s >= self._due_s - 1e-6
 
-    def sent(self, now_s: float) -> None:
-        """Note that one was sent. A turn that comes late must not slow the next ones down, and none
-        makes up for it."""
+    def note_sent(self, now_s: float) -> None:
+        """Note that a position was sent. A late turn does not delay the following positions, and
+        is not made up for."""
         self._due_s = max(self._due_s + self.period_s, now_s)
         self.count += 1
         self._times_s.append(now_s)
@@ -114,7 +114,7 @@ class SendingRate:
         """Return the seconds since the newest was sent; infinite before the first."""
         return now_s - self._times_s[-1] if self._times_s else math.inf
 
-    def hz(self, now_s: float) -> float:
+    def sent_hz(self, now_s: float) -> float:
         """Return how many were sent in the last second."""
         return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
 
@@ -144,8 +144,8 @@ class PositionFeed:
         self._closed = threading.Event()
 
     @staticmethod
-    def check_reachable(config: PositioningConfig) -> None:
-        """Raise InvalidValue or UsageError for what can be refused before anything is opened."""
+    def check_config(config: PositioningConfig) -> None:
+        """Raise InvalidValue without a host, UsageError without the library; opens nothing."""
         if not config.host.strip():
             raise InvalidValue(
                 "positioning.host, the computer of the motion capture, is not given: write it into "
@@ -157,8 +157,8 @@ class PositionFeed:
             raise no_motion_capture()
 
     def start(self, clock: Callable[[], float]) -> None:
-        """Turn by a thread from now on. `clock`: the flight loop's, s. A turn may hang in the
-        library of the link; then `status` says so."""
+        """Call `turn` in a thread from now on. `clock`: the flight loop's. A turn may hang in the
+        link's library; then `status` says so."""
 
         def run() -> None:
             due_s = clock()
@@ -171,7 +171,7 @@ class PositionFeed:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop turning: no position is sent any more. Does not wait for long."""
+        """End the thread: no position is sent any more. Does not wait for long."""
         self._closed.set()
         if self._thread is not None:
             self._thread.join(END_TIMEOUT_S)
@@ -181,8 +181,8 @@ class PositionFeed:
         self._stopped = True
 
     def turn(self, now_s: float) -> None:
-        """Poll, judge, send one position at most. Raises nothing: what goes wrong shows as an
-        age that grows, with the cause."""
+        """Poll the source, and send its position if it is plausible and due. Raises nothing: after
+        a failure the age in `status` grows, with the cause."""
         try:
             problem = STOPPED if self._stopped else self._one(now_s)
         except Exception as error:  # of a source or a link: the flight is ended by the age
@@ -191,7 +191,7 @@ class PositionFeed:
             self._turned_s, self._problem = now_s, problem
 
     def place(self) -> VehiclePose | None:
-        """Return the newest handed to the link, with attitude even if only position was sent."""
+        """Return the newest pose of which the link was given the position, or all of it."""
         return self._placed
 
     def status(self, now_s: float) -> FeedStatus:
@@ -202,8 +202,8 @@ class PositionFeed:
                 problem=self._why(now_s) if quiet else None,
                 sent=self._rate.count,
                 pose=self._pose,
-                rate_hz=self._rate.hz(now_s),
-                measured=None if self._placed is None else self._placed.to_external(pose=True),
+                rate_hz=self._rate.sent_hz(now_s),
+                measured=None if self._placed is None else self._placed.to_external(attitude=True),
             )
 
     def _one(self, now_s: float) -> str | None:
@@ -216,12 +216,12 @@ class PositionFeed:
         placed = self._judge.validate(frame, now_s)
         if placed is None or not self._rate.is_due(now_s):
             return trouble or self._judge.problem
-        place = placed.to_external(pose=self._config.send == "pose")
+        place = placed.to_external(attitude=self._config.send == "pose")
         if self._send(place) is False:
             return BUSY
         with self._lock:
             self._placed, self._exposed_s, self._pose = placed, placed.t_s, place
-            self._rate.sent(now_s)
+            self._rate.note_sent(now_s)
         return None
 
     def _why(self, now_s: float) -> str:
@@ -257,7 +257,7 @@ HELD_MPS, HELD_RADPS = 0.5, 1.0
 
 @dataclass(frozen=True, eq=False)
 class VehiclePose:
-    """A body of the vehicle's axes in the capture's world: (3,) and (3, 3), at `t_s`."""
+    """The vehicle's position (3,) and rotation (3, 3) in the capture's world at `t_s`."""
 
     t_s: float
     position_m: Array
@@ -273,9 +273,9 @@ class VehiclePose:
         R = rotation_from_quaternion((w, x, y, z)) @ rotation_from_rpy(roll, pitch, yaw).T
         return cls(t_s, np.asarray(pose.position_m) - R @ np.asarray(config.body_position_m), R)
 
-    def to_external(self, *, pose: bool) -> ExternalPosition:
+    def to_external(self, *, attitude: bool) -> ExternalPosition:
         x, y, z = (float(part) for part in self.position_m)
-        return ExternalPosition((x, y, z), quaternion_from_rotation(self.R) if pose else None)
+        return ExternalPosition((x, y, z), quaternion_from_rotation(self.R) if attitude else None)
 
 
 class PoseValidator:

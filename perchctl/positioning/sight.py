@@ -61,8 +61,7 @@ class TargetFeed:
     """Sends places by sights; it has no thread and no clock, and the flight loop calls it.
 
     `target` is None until it was seen from the ground. `off`: by how much the body is beside its
-    estimate by the sights, learned slowly, so that the noise of neither side steers: an
-    estimator that is told late places, by biased sensors, stays behind them.
+    estimate by the sights, learned slowly against noise: the estimator lags behind late places.
     """
 
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
@@ -96,8 +95,8 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
-        """Return what is seen, with the still target's place once that is known: the body is beside
-        its estimate now as it was of late (`off`)."""
+        """Return the estimate with the target's known place, as the state estimate has it by its
+        learned offset `off`; unchanged until the place is known."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
@@ -110,7 +109,8 @@ class TargetFeed:
     def add_pose(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
-        """Take a pose of this turn's picture; `then`: attitude and position at its exposure."""
+        """Take a pose of this turn's picture; `then`: the vehicle's attitude and estimated position
+        at the exposure."""
         if pose.t_s <= self._seen_s:
             return
         # A known place may be newer than a picture that is still on its way.
@@ -135,7 +135,7 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the state; a target not yet seen from the ground is a problem, too."""
+        """Return the feed's status; a target not seen from the ground is a problem, too."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None
@@ -144,7 +144,7 @@ class TargetFeed:
             problem=problem,
             sent=self._rate.count,
             pose=self._pose,
-            rate_hz=self._rate.hz(now_s),
+            rate_hz=self._rate.sent_hz(now_s),
             measured=self._pose,
         )
 
@@ -186,5 +186,5 @@ class TargetFeed:
         """Send a place; `placed_s`: when the body was there. What comes too soon waits for nothing:
         the next one is newer."""
         if self._rate.is_due(now_s) and self._send(place) is not False:
-            self._rate.sent(now_s)
+            self._rate.note_sent(now_s)
             self._placed_s, self._pose = placed_s, place

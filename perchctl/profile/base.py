@@ -15,8 +15,8 @@ BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
 def key(default: Any, meaning: str, **constraints: Any) -> Any:
-    """Return a key of a section: pydantic's `Field`, with the meaning that people read about it.
-    The default ... means that the key must be given."""
+    """Return the pydantic `Field` of a profile key, with the description that users read. A
+    default of ... makes the key required."""
     return Field(default, description=meaning, **constraints)
 
 
@@ -102,12 +102,12 @@ def key_unit(path: str) -> str:
 # --- Keys that have become constants of their section ------------------
 
 
-def drop_constant_keys(
+def split_constant_keys(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return the values of a profile without keys that are constants by now: class variables of
-    `model`, or of a model within it. Return also a note for each of these keys, and a sentence for
-    each whose value would be lost, as it is another one than the constant.
+    """Return a profile's values without the keys that have become constants (class variables of
+    `model` or of its nested models); a note for each such key with the constant's value; and an
+    error sentence for each with another value.
     """
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
@@ -121,6 +121,6 @@ def drop_constant_keys(
             else:
                 lost.append(f"{now}, and {value} here; remove it")
         elif isinstance(value, dict) and isinstance(kind, type) and issubclass(kind, BaseModel):
-            result[key], more, gone = drop_constant_keys(value, kind, f"{path}{key}.")
+            result[key], more, gone = split_constant_keys(value, kind, f"{path}{key}.")
             notes, lost = notes + more, lost + gone
     return result, notes, lost

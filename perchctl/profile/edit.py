@@ -22,16 +22,16 @@ from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_writable, file_mode, write_files
 from perchctl.places import data_folder
 from perchctl.plain_yaml import clip_text, parse_yaml
-from perchctl.profile.base import drop_constant_keys
-from perchctl.profile.load import check_profile, find_profile, first_invalid_key
+from perchctl.profile.base import split_constant_keys
+from perchctl.profile.load import check_profile, find_profile, key_and_reason
 from perchctl.profile.schema import Profile
 
 # --- Keys of a loaded profile -----------------------------------------
 
 
-def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
-    """Return the profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as
-    in a profile's file. `option` is where they were given.
+def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
+    """Return the profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; values in
+    YAML. `option`, for messages, is where they were given.
 
     Raises:
         UsageError: a setting has another form.
@@ -45,12 +45,12 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
-        _, notes, lost = drop_constant_keys(values, Profile)
+        _, notes, lost = split_constant_keys(values, Profile)
         if notes or lost:
             raise InvalidValue(f"{option}: {(notes + lost)[0]}")
         return Profile.model_validate(values)
     except ValidationError as error:
-        key, why = first_invalid_key(error)
+        key, why = key_and_reason(error)
         raise InvalidValue(f"{option}: {key or 'profile'}: {why}") from None
 
 
@@ -66,7 +66,7 @@ def _parsed(setting: str, option: str) -> tuple[str, str]:
 
 
 def profile_value(profile: Profile, dotted: str) -> Any:
-    """Return what the profile has at that key, in JSON's types; None where it has none."""
+    """Return the value at a dotted key, in JSON types; None if there is no such key."""
     value: Any = profile.model_dump(mode="json")
     for name in dotted.split("."):
         value = value.get(name) if isinstance(value, dict) else None
@@ -116,8 +116,8 @@ def writable_profile(name: str) -> Path:
 
 
 def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
-    """Put the values into the file, by their dotted keys; returns the file that keeps the old
-    text, beside it, for the same eyes only.
+    """Write the values under their dotted keys into the file; return the path of the backup
+    beside it, which has the same permissions.
 
     Raises:
         InvalidValue: the layout does not allow it, the profile would not load with them, or the

@@ -124,7 +124,7 @@ def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
             break_long_words=False,
             break_on_hyphens=False,
         )
-        lines.append(f"{margin}{name}: {scalar_text(key.default)}")
+        lines.append(f"{margin}{name}: {yaml_scalar(key.default)}")
     return "\n".join(lines) + "\n"
 
 
@@ -135,14 +135,14 @@ def _comment(key: Key) -> str:
     return f"{meaning} ({limits})" if limits else meaning
 
 
-def scalar_text(value: Any) -> str:
+def yaml_scalar(value: Any) -> str:
     """Return the value in YAML, on one line."""
     plain = list(value) if isinstance(value, tuple) else value
     text: str = yaml.safe_dump([plain], default_flow_style=True, width=10**9, allow_unicode=True)
     return text.strip()[1:-1]
 
 
-def editor_schema() -> dict[str, Any]:
+def json_schema() -> dict[str, Any]:
     """Return the JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
     schema = Profile.model_json_schema()
     for section in (schema, *schema["$defs"].values()):

@@ -30,11 +30,11 @@ class Limit:
 
     Attributes:
         relation: in Python's own words, as in ``kalman.k1 + 0.1 < kalman.k2``.
-        because: what happens otherwise.
+        consequence: what happens if it is broken.
     """
 
     relation: str
-    because: str
+    consequence: str
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -46,14 +46,14 @@ class Limit:
         # The relations are those of this module, and name keys and numbers only.
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
-    def sentence(self, profile: Any) -> str:
-        """Return the relation with the value of each key, and what happens as it does not hold."""
+    def violation_text(self, profile: Any) -> str:
+        """Return a sentence: the broken relation with each key's value, and the consequence."""
 
         def shown(found: re.Match[str]) -> str:
             value = eval(_read(found), {"profile": profile})
             return f"{found[0]} ({f'{value:g} {key_unit(found[0])}'.strip()})"
 
-        return f"{_KEY.sub(shown, self.relation)} does not hold: {self.because}"
+        return f"{_KEY.sub(shown, self.relation)} does not hold: {self.consequence}"
 
 
 def _read(found: re.Match[str]) -> str:

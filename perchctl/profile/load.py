@@ -20,7 +20,7 @@ from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_texts
 from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
 from perchctl.plain_yaml import clip_text, parse_yaml
-from perchctl.profile.base import drop_constant_keys
+from perchctl.profile.base import split_constant_keys
 from perchctl.profile.schema import Profile
 from perchctl.profile.vision import MergeConfig, WeightsConfig
 
@@ -54,8 +54,8 @@ def find_profile(name: str) -> Path:
 def load_profile(name: str, *, with_weights: bool = True) -> Profile:
     """Read, resolve `extends` and check a profile.
 
-    With `with_weights` the weights of its `merge.weights_file` take the place of `merge.weights`. A
-    key that is a constant by now is left out, with a `ProfileNote` as warning.
+    `with_weights`: `merge.weights` are read from `merge.weights_file`. Keys that have become
+    constants are dropped with a `ProfileNote` as warning.
 
     Errors: NotFound, InvalidValue.
     """
@@ -117,8 +117,7 @@ def _read_weights(name: str) -> WeightsConfig:
 
 
 def find_calibration(name: str) -> Path:
-    """Return a calibration file by its path, or by its name in `calib/`. (A loaded profile names
-    its own by the whole path.)"""
+    """Return a calibration file by its path, or by its name in `calib/`."""
     given = Path(name).expanduser()
     if given.is_file():
         return given
@@ -210,7 +209,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
 
 
 def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
-    values, notes, lost = drop_constant_keys(values, Profile)
+    values, notes, lost = split_constant_keys(values, Profile)
     if lost:
         raise InvalidValue(f"{path}: {lost[0]}")
     for note in notes:
@@ -268,13 +267,13 @@ _BOUNDS = ("less_than_equal", "greater_than_equal")
 
 
 def _one_sentence(path: Path, error: ValidationError) -> str:
-    key, text = first_invalid_key(error)
+    key, text = key_and_reason(error)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return f"{path}: {key or 'profile'}: {text}{more}"
 
 
-def first_invalid_key(error: ValidationError) -> tuple[str, str]:
-    """Return the key of the first fault, empty where it is of no single one, and what is wrong."""
+def key_and_reason(error: ValidationError) -> tuple[str, str]:
+    """Return the key of the first error, empty if it concerns several keys, and its reason."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":

@@ -107,10 +107,10 @@ class PerchConfig(Section):
 class CompleteConfig(Section):
     """Phase 7. The thrust is released in two stages, before the motors stop.
 
-    By position setpoints in `steps` over `release_s`, as far as the onboard controller
-    goes: the magnet must hold for `hold_dwell_s` with the thrust below `hold_ratio` of the
-    hover thrust. Then by raw thrust over `ramp_s` down to where the motors stand still with
-    the stream alive: the whole weight must hang for `hang_s`. `watch_s` after the stop.
+    First by lowered position setpoints, `steps` in `release_s`: the magnet must hold for
+    `hold_dwell_s` with the thrust below `hold_ratio` of the hover thrust. Then by raw thrust,
+    in `ramp_s` down to standing motors while setpoints continue: the whole weight must hang
+    for `hang_s`. The vehicle is monitored for `watch_s` after the stop.
     """
 
     steps: ClassVar[int] = 5
@@ -151,9 +151,9 @@ OVERDUE_SHARE = 0.5
 
 
 class LandingConfig(Section):
-    """Down by position setpoints at `speed_mps` to `handover_m`, the rest by the vehicle's
-    own landing, which goes to `undershoot_m` below the ground of the estimate, and by
-    `drift_mps` of the flight's time lower, so that a drifted height still ends on the floor."""
+    """Position setpoints at `speed_mps` down to `handover_m`, then the firmware's landing. Its
+    goal is `undershoot_m` plus `drift_mps` times the flight's time below the estimated ground,
+    so that it ends on the floor in spite of drift."""
 
     speed_mps: float = key(0.3, "descent speed of the landing", gt=0, le=1)
     handover_m: float = key(
@@ -165,7 +165,7 @@ class LandingConfig(Section):
 
     @property
     def setpoint_time_s(self) -> float:
-        """The time for which the landing goes by setpoints; then the vehicle lands by itself."""
+        """Longest time of the landing by setpoints; then the firmware's own landing begins."""
         return OVERDUE_SHARE * self.timeout_s
 
 

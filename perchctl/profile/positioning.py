@@ -21,9 +21,9 @@ BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s":
 
 
 class PositioningConfig(Section):
-    """`deck`: the vehicle's own decks do it, and nothing is sent. `mocap`: a motion-capture
-    system measures a rigid body on the vehicle, and its place is sent by the link. `target`: the
-    printed target does, by the camera, and what it says is sent.
+    """The source of the vehicle's position. `deck`: its own decks. `mocap`: a motion-capture
+    system measures a rigid body on the vehicle, and its position is sent to it. `target`: the
+    position measured from the printed target by the camera is sent.
 
     The body's frame, as the system defines it, is turned by `body_rpy_deg` and lies at
     `body_position_m`, both in the vehicle's body axes.
@@ -60,7 +60,7 @@ class PositioningConfig(Section):
 
     @property
     def label(self) -> str:
-        """Name in a sentence the motion capture, or what else knows where the vehicle is."""
+        """Name of the position source in messages."""
         if self.by == "target":
             return "the sight of the target"
         return f"motion capture at {self.system}:{self.host}"

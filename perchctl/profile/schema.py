@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from perchctl.profile.base import Section, drop_constant_keys, key
+from perchctl.profile.base import Section, key, split_constant_keys
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.positioning import PositioningConfig
@@ -73,9 +73,9 @@ class Profile(Section):
     log: LogConfig = LogConfig()
 
     @classmethod
-    def lost_values(cls, values: dict[str, Any]) -> list[str]:
-        """Return a sentence for each key of another value than the constant that it is now."""
-        return drop_constant_keys(values, cls)[2]
+    def lost_texts(cls, values: dict[str, Any]) -> list[str]:
+        """Return a sentence for each key that has become a constant, if its value differs."""
+        return split_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")
     def _neighbours_can_be_printed(self) -> Profile:
@@ -93,5 +93,5 @@ class Profile(Section):
     def _limits_fit(self) -> Profile:
         for limit in IMPOSSIBLE:
             if not limit.holds(self):
-                raise ValueError(limit.sentence(self))
+                raise ValueError(limit.violation_text(self))
         return self

@@ -38,8 +38,8 @@ def dictionary_size(name: str) -> int:
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 
-def is_same_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
-    """Return whether both are the same black and white cells, at any turn: ``DICT_4X4_50`` holds
+def have_same_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
+    """Return whether two markers have the same cells, in any rotation, as ``DICT_4X4_50`` has
     the first ids of ``DICT_4X4_1000``."""
     one, two = aruco_dictionary(name), aruco_dictionary(other)
     if one.markerSize != two.markerSize:
@@ -153,7 +153,7 @@ class CameraConfig(Section):
 
     @property
     def start_latency_s(self) -> float:
-        """The time taken off a picture's arrival until a flight has measured it."""
+        """The assumed camera latency until the flight has measured it."""
         return START_LATENCY_S if isinstance(self.latency_s, str) else self.latency_s
 
 
@@ -185,11 +185,11 @@ _InARoom = Annotated[float, Field(ge=-FARTHEST_IN_A_ROOM_M, le=FARTHEST_IN_A_ROO
 
 
 class TargetConfig(Section):
-    """The printed target, and how true it is, standard deviations.
+    """The printed target, and standard deviations of the print.
 
-    `size_sigma`: by which share the printed sizes may all be off together. Printers err by some
-    0.3 %, so it is 0.5 % until they are measured. `curl_per_m`: a place r from the centre of the
-    sheet is off its plane by this times r^2; the corners of a 150 mm marker by 0.3 mm.
+    `size_sigma`: common relative error of all printed sizes; printers err by some 0.3 %, so it
+    is 0.5 % until they are measured. `curl_per_m`: a point at r from the sheet's centre is off
+    its plane by this times r^2, the corners of a 150 mm marker by 0.3 mm.
     """
 
     large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
@@ -224,7 +224,7 @@ class TargetConfig(Section):
     @model_validator(mode="after")
     def _markers_differ(self) -> TargetConfig:
         large, small = self.large, self.small
-        if is_same_pattern(large.dictionary, large.id, small.dictionary, small.id):
+        if have_same_pattern(large.dictionary, large.id, small.dictionary, small.id):
             both = dict.fromkeys(f"{m.dictionary}/{m.id}" for m in (large, small))
             raise ValueError(
                 f"large and small are the same marker, {' and '.join(both)}, which cannot be told "
@@ -265,11 +265,11 @@ class PoseConfig(Section):
 
 
 class KalmanConfig(Section):
-    """The paper's filter, and what its noise is.
+    """The paper's filter, and its noise.
 
     `noise`: ``fixed`` takes k1 for every measurement and k2 for every step, as the paper does:
     variances in cm^2 and deg^2, as its error vector is in centimetres and degrees.
-    ``measured`` takes the covariance of the very pose, and for the motion accelerations: in
+    ``measured`` takes each pose's own covariance, and accelerations as process noise: in
     the level frame `acceleration_mps2` of the camera or target and `turn_radps2` of the
     camera's attitude and heading, in the world `drift_mps2` of the state estimate. A constant
     error of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens what is claimed.

@@ -4,8 +4,8 @@ from .exact import to_exact_json as to_exact_json
 from .header import camera_record as camera_record
 from .read import FlightLog as FlightLog
 from .read import PhaseSpan as PhaseSpan
-from .read import log_values as log_values
 from .read import read_log as read_log
+from .read import wrap_log_errors as wrap_log_errors
 from .recorded import recorded_pictures as recorded_pictures
 from .summary import FlightSummary as FlightSummary
 from .write import LogWatcher as LogWatcher

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class DiskFile:
-    """A file that holds whole records only: a write that fails leaves nothing of itself."""
+    """A file of whole records only: a failed write leaves no partial record."""
 
     def __init__(self, path: Path, sync: bool = True) -> None:
         """Create the file; `sync`: what is flushed is on the disk, not only with the system.
@@ -45,7 +45,7 @@ class DiskFile:
         return self._good_bytes
 
     def flush(self) -> None:
-        """Bring what was written to the disk, where `sync` asks for that. Raises OSError."""
+        """Flush to the disk (fsync), if `sync` was set. Raises OSError."""
         if self._sync:
             os.fsync(self._fd)
 
@@ -60,11 +60,12 @@ class DiskFile:
             os.close(fd)
 
 
-def create_file(path: Path, sync: bool, begun: Callable[[DiskFile], T]) -> T:
-    """Create a file, return what `begun` makes of it; its error leaves no file. Raises OSError."""
+def create_file(path: Path, sync: bool, build: Callable[[DiskFile], T]) -> T:
+    """Create a file and return the object that `build` makes with it; if that raises, the file is
+    deleted. Raises OSError as `DiskFile` does."""
     file = DiskFile(path, sync)
     try:
-        return begun(file)
+        return build(file)
     except BaseException:
         file.close()
         path.unlink(missing_ok=True)
@@ -72,17 +73,17 @@ def create_file(path: Path, sync: bool, begun: Callable[[DiskFile], T]) -> T:
 
 
 class BackgroundWriter:
-    """Does jobs in their order: at once, or `live` by a thread of its own, out of a bounded queue.
+    """Runs jobs in order: at once, or if `live` in a thread, from a bounded queue.
 
-    What a job raises is dropped: it has to remember itself what failed.
+    Exceptions of a job are dropped: the job itself has to record failures.
 
     Attributes:
-        refused: how many jobs were not taken.
+        refused_jobs: number of jobs refused because the queue was full.
     """
 
     def __init__(self, most: int, name: str, live: bool) -> None:
         """Begin with room for jobs that weigh `most` together; `name` is the thread's."""
-        self.refused = 0
+        self.refused_jobs = 0
         self._most = most
         self._jobs: SimpleQueue[tuple[Job, int] | None] = SimpleQueue()
         self._counting = threading.Lock()
@@ -93,13 +94,13 @@ class BackgroundWriter:
             self._thread.start()
 
     def put(self, job: Job, weight: int = 1) -> bool:
-        """Hand over a job from any thread; False where the full queue does not take it."""
+        """Queue a job, from any thread; False if the queue is full and the job is refused."""
         if self._thread is None:
             _do(job)
             return True
         with self._counting:
             if self._weight + weight > self._most:
-                self.refused += 1
+                self.refused_jobs += 1
                 return False
             self._weight += weight
             self._left += 1
@@ -107,8 +108,7 @@ class BackgroundWriter:
         return True
 
     def finish(self, job: Job, timeout_s: float) -> int:
-        """Hand over the last job and wait for it. Return how many jobs were not done by then; 0 is
-        all done. The thread goes on with them, should the disk ever answer."""
+        """Queue the last job and wait for it; return the number of jobs not done by then."""
         if self._thread is None:
             _do(job)
             return 0

@@ -85,7 +85,7 @@ def _members(hint: Any) -> tuple[Any, ...]:
 def from_exact_json(kind: type[T], data: Any) -> T:
     """Return the value of `kind` that `to_exact_json` wrote. A missing field has its default.
 
-    Raises ValueError, with the way to it, for data that is none.
+    Raises ValueError, which names the field, for data of another form.
     """
     try:
         return typing.cast(T, _from_exact(kind, data))
@@ -175,7 +175,7 @@ def to_rounded_json(value: Any) -> Any:
     return to_exact_json(value)
 
 
-def encode(record: Mapping[str, Any]) -> bytes:
+def encode_line(record: Mapping[str, Any]) -> bytes:
     """Return the record as one line, keys in the record's own order, ended by a newline.
 
     Top-level keys whose value is None are left out.
@@ -183,9 +183,9 @@ def encode(record: Mapping[str, Any]) -> bytes:
     return json_line({k: v for k, v in to_rounded_json(record).items() if v is not None})
 
 
-def json_line(plain: Mapping[str, Any]) -> bytes:
-    """Return JSON's own types as one line of UTF-8 with its newline; no number is rounded."""
-    text = json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+def json_line(values: Mapping[str, Any]) -> bytes:
+    """Return values of JSON types as one UTF-8 line with its newline, without rounding."""
+    text = json.dumps(values, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.encode("utf-8", errors="backslashreplace") + b"\n"
 
 

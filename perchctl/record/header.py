@@ -38,8 +38,8 @@ def make_header(
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Return a log's first record; without `started` it depends only on its arguments and the files
-    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
+    """Return a log's first record. Without `started` it depends only on its arguments and the
+    files that the profile names. `t0_s` is the loop's time at the log's beginning."""
     return {
         "kind": "header",
         "format": FORMAT,
@@ -59,8 +59,8 @@ def make_header(
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:
-    """Return ``camera``, the calibration, and ``mask``, what the gear covers in it. A file that
-    cannot be read is left out: the flight says so."""
+    """Return the calibration, ``camera``, and the mask of the pixels that the gear covers,
+    ``mask``. An unreadable file is left out."""
     with contextlib.suppress(PerchError):
         camera = profile_camera(profile.camera)
         record = {"camera": to_exact_json(camera)}
@@ -71,7 +71,7 @@ def camera_record(profile: Profile) -> dict[str, Any]:
 
 
 def computer_record() -> dict[str, Any]:
-    """Return ``computer``: what the last bits of a sum may depend on."""
+    """Return ``computer``: the hardware and libraries that rounding may depend on."""
     return {
         "computer": {
             "system": platform.system(),
@@ -98,8 +98,8 @@ _SIDES = (2, 3, 4, 6, 8, 12)
 
 @cache
 def arithmetic_fingerprint() -> str:
-    """Return eight hexadecimal digits. Where they are the same, with the same libraries,
-    single-threaded results are the same to the bit."""
+    """Return eight hexadecimal digits for the processor's arithmetic. If they and the libraries
+    are the same, single-threaded results are bit-identical."""
     bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
     for part in (_libm_probe(), *_numpy_probes(), *_opencv_probes()):
         bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)

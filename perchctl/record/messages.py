@@ -49,7 +49,7 @@ def image_message(ns: int, frame: Frame) -> CompressedImage:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]
         data = png.tobytes()
     form = "png" if data.startswith(b"\x89PNG") else "jpeg"
-    return CompressedImage(timestamp=stamp(ns), frame_id=CAMERA, data=data, format=form)
+    return CompressedImage(timestamp=to_stamp(ns), frame_id=CAMERA, data=data, format=form)
 
 
 _TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
@@ -78,18 +78,19 @@ TICK_SCHEMA = {
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
 
-def stamp(ns: int) -> Timestamp:
+def to_stamp(ns: int) -> Timestamp:
     """Return nanoseconds since 1970 as protobuf's time stamp."""
     return Timestamp(seconds=ns // NS, nanos=ns % NS)
 
 
 def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
-    """Return a tick's marker outlines; none without the target, so that no old one stays."""
+    """Return the markers' outlines in the frame of a tick's record; empty for
+    a frame without the target, which clears the previous ones."""
     return ImageAnnotations(
-        timestamp=stamp(ns),
+        timestamp=to_stamp(ns),
         points=[
             PointsAnnotation(
-                timestamp=stamp(ns),
+                timestamp=to_stamp(ns),
                 type=PointsAnnotation.LINE_LOOP,
                 points=[Point2(x=x, y=y) for x, y in zip(px[::2], px[1::2], strict=True)],
                 outline_color=_OUTLINE,
@@ -102,7 +103,7 @@ def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
 
 
 def fixed_transforms(profile: Profile) -> list[FrameTransform]:
-    """Return the transforms of what does not move against the body: camera and gear."""
+    """Return the transforms from the body to camera and gear, which are fixed."""
     T_body_cam, gear_m = profile.camera.mount.T_body_cam, profile.vehicle.gear_body_m
     q = quaternion_from_rotation(T_body_cam[:3, :3])
     level = (1.0, 0.0, 0.0, 0.0)
@@ -135,7 +136,7 @@ def _transform(
 ) -> FrameTransform:
     (x, y, z), (w, qx, qy, qz) = t_m, q
     return FrameTransform(
-        timestamp=stamp(ns),
+        timestamp=to_stamp(ns),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=Vector3(x=x, y=y, z=z),

@@ -25,7 +25,7 @@ from perchctl.errors import InvalidValue, Note, NotFound
 from perchctl.files import file_kind
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand, Turn
-from perchctl.profile import Profile, first_invalid_key
+from perchctl.profile import Profile, key_and_reason
 from perchctl.record.exact import decode_line, from_exact_json
 from perchctl.record.fields import FIELDS, FORMAT, READABLE_VERSIONS, SCHEMA_VERSION
 from perchctl.record.header import computer_record
@@ -42,11 +42,12 @@ _GZIP = b"\x1f\x8b"
 
 @dataclass(frozen=True)
 class PhaseSpan:
-    """One stay in a phase; times since the flight's first turn, `end_s` that of the next stay.
+    """A period in one phase; times since the flight's first turn, `end_s` the next phase's start.
 
     Attributes:
-        reason: why the phase was entered; `row`: the row of the mission's table that led there,
-            `severity` and `simulated` as in the log's event. Empty where the log has none.
+        reason: why the phase was entered.
+        row: the row of the mission's transition table that led there.
+        severity, simulated: as in the log's event. Empty where the log has none.
     """
 
     phase: str
@@ -91,7 +92,7 @@ class FlightLog:
 
     @cached_property
     def sent(self) -> list[SentCommand]:
-        """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
+        """Commands that no loop turn decided; empty before version 4. Errors: InvalidValue."""
         return [parse_exact(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
@@ -111,8 +112,8 @@ class FlightLog:
 
     @cached_property
     def phases(self) -> tuple[PhaseSpan, ...]:
-        """The phases in the order in which they were entered, with the rows that led there where
-        the log has its events; also an end that no tick followed."""
+        """The phases in the order in which they were entered, with the transition's row if the log
+        has events; a final phase without ticks is included."""
         spans: list[PhaseSpan] = []
         for record in self.records:
             t_s, phase = self.to_flight_s(float(record["t_s"])), str(record.get("phase") or "")
@@ -152,7 +153,7 @@ class FlightLog:
 
     @property
     def start_s(self) -> float:
-        """The loop's time of the first flown turn, which every output takes for 0; 0 without."""
+        """Loop time of the first flown turn, the zero of all outputs; 0 if none was flown."""
         flown = (r for r in self.turn_records if r.get("role") == "flown")
         first = self.records[0] if self.records else next(flown, None)
         return 0.0 if first is None else float(first["t_s"])
@@ -172,11 +173,11 @@ class FlightLog:
         return self.to_flight_s(float(self.records[-1]["t_s"])) if self.records else 0.0
 
     def index_at(self, t_s: float) -> int:
-        """Return the index of the newest tick at that time since the first turn."""
+        """Return the index of the last tick up to `t_s`, counted from the first turn."""
         return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
 
     def tick_slice(self, start_s: float, end_s: float) -> slice:
-        """Return the ticks from one time since the first turn up to another, without that."""
+        """Return the ticks in [start_s, end_s), times since the first turn."""
         first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
         return slice(int(first), int(last))
 
@@ -197,16 +198,16 @@ class FlightLog:
 
     @property
     def flown_profile(self) -> Profile:
-        """The profile that was flown, but for passwords. A `Note` names each key that was flown
-        with another value than the constant that it is now. Errors: InvalidValue."""
+        """The flown profile, without passwords. A `Note` warns of each key that has become a
+        constant and was flown with another value. Errors: InvalidValue."""
         values = self.header.get("profile")
-        for sentence in Profile.lost_values(values) if isinstance(values, dict) else ():
+        for sentence in Profile.lost_texts(values) if isinstance(values, dict) else ():
             said = sentence.removesuffix("; remove it")
             warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
         try:
             return Profile.model_validate(values, extra="ignore")
         except ValidationError as error:
-            key, text = first_invalid_key(error)
+            key, text = key_and_reason(error)
             raise InvalidValue(
                 f"the log's profile cannot be used by this version of perchctl: "
                 f"{key or 'profile'}: {text}"
@@ -237,7 +238,8 @@ class FlightLog:
 
     @property
     def computer_differences(self) -> str:
-        """In what the flight's computer differed from this, in words; empty if none is known."""
+        """How the flight's computer differed from this one, in words; empty if it did not, or if
+        the log does not record it."""
         was, here = self.header.get("computer"), computer_record()["computer"]
         if not isinstance(was, dict):
             return ""
@@ -296,8 +298,8 @@ def read_log(path: Path | str) -> FlightLog:
 
 
 @contextlib.contextmanager
-def log_values(path: Path) -> Iterator[None]:
-    """Raise InvalidValue where the code within meets a value of the log that no flight writes."""
+def wrap_log_errors(path: Path) -> Iterator[None]:
+    """Context manager: turns errors by damaged log values into InvalidValue."""
     try:
         yield
     except OSError:
@@ -378,8 +380,7 @@ def parse_turn(record: dict[str, Any]) -> Turn:
 
 
 def parse_exact(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
-    """Return the turn, or the command that was sent in the loop's place, of a record, to the same
-    bits. Errors: InvalidValue."""
+    """Return the `Turn` or `SentCommand` of a record, bit-identical. Errors: InvalidValue."""
     try:
         return from_exact_json(kind, _without_kind(record))
     except ValueError as error:

@@ -28,15 +28,18 @@ _TORN = (McapError, ValueError, RuntimeError, struct.error, ZstdError)
 """What the libraries raise for a record that is cut or damaged; lz4's errors among them."""
 
 
-class Picture(NamedTuple):
-    """One frame: number, exposure on the loop's clock, and the pipeline's grey (height, width)."""
+class RecordedPicture(NamedTuple):
+    """One frame: its number and time of exposure on the loop's clock, as the source gave
+    them, and the grey picture (height, width) that the pipeline saw."""
 
     number: int
     t_s: float
     image: NDArray[np.uint8]
 
 
-def recorded_pictures(path: Path | str, numbers: Container[int] | None = None) -> Iterator[Picture]:
+def recorded_pictures(
+    path: Path | str, numbers: Container[int] | None = None
+) -> Iterator[RecordedPicture]:
     """Yield the pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it
     lies beside; of one that was cut off, those that are whole.
 
@@ -51,11 +54,11 @@ def recorded_pictures(path: Path | str, numbers: Container[int] | None = None) -
             grey = decode_picture(message.data)
         except ValueError as error:
             raise InvalidValue(f"{path}: picture {frame['number']} {error}") from None
-        yield Picture(frame["number"], frame["t_s"], grey)
+        yield RecordedPicture(frame["number"], frame["t_s"], grey)
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Yield what is said of each frame of a recording, with its picture where it was kept.
+    """Yield the record of each frame of a recording, with its picture if that was stored.
 
     Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
     """

@@ -25,7 +25,7 @@ import perchctl
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile
 from perchctl.record.disk import BackgroundWriter, DiskFile, Job, create_file
-from perchctl.record.exact import encode
+from perchctl.record.exact import encode_line
 from perchctl.record.messages import (
     CORNERS,
     FRAME,
@@ -38,7 +38,7 @@ from perchctl.record.messages import (
     fixed_transforms,
     image_message,
     moving_transforms,
-    stamp,
+    to_stamp,
 )
 from perchctl.record.summary import RecordingEnd
 from perchctl.vision import Frame
@@ -58,8 +58,8 @@ class Recorder:
     """Writes one flight's recording. Only `open` raises. `frame` and `tick` are called by the
     loop, and cost it no more than a place in a queue.
 
-    Live, a turn is handed over at its end, with its frame: the thread works while the loop
-    sleeps. Otherwise (lockstep) everything is written at once, and nothing is ever dropped.
+    Live, a thread writes each turn at its end, while the loop sleeps. In lockstep everything is
+    written at once, and nothing is dropped.
 
     Attributes:
         problem: None, or one sentence about the first thing that the recording lacks.
@@ -107,22 +107,22 @@ class Recorder:
                 f"place, or fly with --no-record"
             ) from None
 
-    def frame(self, frame: Frame) -> None:
-        """Record a frame that the source gave. Never raises."""
+    def write_frame(self, frame: Frame) -> None:
+        """Record a frame of the source. Never raises."""
         self._hand_over()  # before take-off no tick does
         self._pictures += not frame.repeated
         self._turn.append(partial(self._write_frame, frame))
         # A frame that repeats holds its picture too.
         self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
 
-    def tick(self, record: Mapping[str, Any]) -> None:
+    def write_tick(self, record: Mapping[str, Any]) -> None:
         """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises."""
         self._turn.append(partial(self._write_tick, record))
         self._hand_over()
 
     def close(self) -> RecordingEnd:
-        """End the file and return what became of it; a second call only returns that. Waits for a
-        disk that hangs, but for `CLOSE_TIMEOUT_S` at most. Never raises."""
+        """End the file and return its summary; a second call only returns that. Waits at most
+        `CLOSE_TIMEOUT_S` for a disk that hangs. Never raises."""
         if not self._closed:
             self._hand_over()
             self._closed = True
@@ -176,7 +176,7 @@ class Recorder:
         self._newest_s, ns = t_s, self._ns(t_s)
         first_s = self._first_s = t_s if self._first_s is None else self._first_s
         for mount in self._mounts:
-            mount.timestamp.CopyFrom(stamp(ns))
+            mount.timestamp.CopyFrom(to_stamp(ns))
         sampled_ns = self._ns(t_s - (record.get("tel_age_s") or 0.0))
         transforms = [*self._mounts, *moving_transforms(ns, sampled_ns, record)]
         self._add(TF, ns, FrameTransforms(transforms=transforms))
@@ -184,7 +184,7 @@ class Recorder:
         if exposed_s is not None:
             self._add(CORNERS, ns, corners_message(self._ns(exposed_s), record))
             shown["frame_t_s"] = exposed_s - first_s
-        self._add(TICK, ns, encode(shown)[:-1])
+        self._add(TICK, ns, encode_line(shown)[:-1])
 
     def _flush(self) -> None:
         if self._newest_s - self._flushed_s < FLUSH_PERIOD_S:

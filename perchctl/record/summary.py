@@ -15,7 +15,8 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 class RecordingEnd(NamedTuple):
-    """A recording's end: file, how many pictures it has and lacks, and the first reason why."""
+    """Summary of a recording: the file's name, the numbers of stored and of missing pictures, and
+    the first reason for a loss."""
 
     recording: str
     pictures: int
@@ -24,7 +25,7 @@ class RecordingEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The same in words."""
+        """The summary in words."""
         missing = f", {self.pictures_missing} missing" if self.pictures_missing else ""
         why = f" ({self.recording_problem})" if self.recording_problem else ""
         return f"{self.pictures} pictures in {self.recording}{missing}{why}"
@@ -39,10 +40,10 @@ class FlightSummary:
             that ends without its summary.
         cause: what decided it, such as ``target not found``.
         miss_m: None where no truth is known.
-        contact: the program's own error, of what hangs.
-        touchdown: how the floor was met, as far as that was felt.
-        lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
-        recording: what became of it; None of a flight without one, and of one that is read back.
+        contact: estimated error of the contact; None unless the vehicle hangs.
+        touchdown: how the vehicle met the floor, as far as telemetry shows it.
+        lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
+        recording: its summary; None without a recording, and in a log that is read back.
     """
 
     outcome: str
@@ -62,7 +63,7 @@ class FlightSummary:
     recording: RecordingEnd | None = None
 
     @classmethod
-    def of(cls, log: FlightLog) -> FlightSummary:
+    def from_log(cls, log: FlightLog) -> FlightSummary:
         """Return the summary by the log's record; by its ticks where that is missing."""
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]

@@ -24,7 +24,7 @@ from perchctl.errors import InvalidValue
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
 from perchctl.record.disk import BackgroundWriter, DiskFile, create_file
-from perchctl.record.exact import encode, json_line, to_exact_json
+from perchctl.record.exact import encode_line, json_line, to_exact_json
 from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
 from perchctl.record.summary import FlightSummary, RecordingEnd
@@ -45,16 +45,16 @@ Truth = tuple[tuple[float, float, float], float]
 
 
 class LogWatcher:
-    """Writes every turn and event of one flight, and its recording where one is wanted. Only
-    opening it raises; afterwards look at `problem`, or for the recording at `remarks`.
+    """Writes the log of one flight, and its recording if wanted. Only opening it raises; later
+    failures are in `problem`, those of the recording in `remarks`.
 
     Attributes:
         path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
         problem: None, or one sentence about the first failure of the disk.
-        formless: None, or one sentence about the first record that no line could be made of. It
-            alone is lost: the disk is well, and nothing lands for it.
-        truth: gives what is true at the time of a tick, where a simulation sets it.
-        recorder: of the pictures that come through `watched`; None without a recording.
+        unencodable: None, or one sentence about the first record that could not be encoded. Only
+            that record is lost, and the flight goes on.
+        truth: returns the true state at a tick; set by a simulation.
+        recorder: records the frames of the `watched` source; None without a recording.
     """
 
     def __init__(self, path: Path, header_line: bytes, live: bool, file: DiskFile) -> None:
@@ -62,7 +62,7 @@ class LogWatcher:
         file.write(header_line)
         self.path = path
         self.problem: str | None = None
-        self.formless: str | None = None
+        self.unencodable: str | None = None
         self.truth: Callable[[], Truth] | None = None
         self.recorder: Recorder | None = None
         self._battery_min_v: float | None = None
@@ -79,19 +79,19 @@ class LogWatcher:
     @property
     def lost_records(self) -> int:
         """How many records could not be written."""
-        return self._writer.refused + self._failed + self._unfinished
+        return self._writer.refused_jobs + self._failed + self._unfinished
 
     @property
     def loss_reason(self) -> str | None:
-        """One sentence why the log is not whole, the disk first; None for a whole one."""
-        return self.problem or self.formless
+        """One sentence why the log is incomplete, a disk failure first; None if complete."""
+        return self.problem or self.unencodable
 
     @classmethod
     def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> LogWatcher:
         """Create the file and its folder and write the header.
 
-        `live`: a thread of its own writes, and brings the records to the disk about once a second;
-        otherwise each record is in the file at once. Raises InvalidValue, before the flight.
+        `live`: a background thread writes, and syncs about once a second; otherwise each record is
+        written at once. Raises InvalidValue, before the flight.
         """
         # A replay flies by the profile in the header, so no number of it is rounded.
         line = json_line(to_exact_json({k: v for k, v in header.items() if v is not None}))
@@ -146,11 +146,11 @@ class LogWatcher:
         return log
 
     def watched(self, source: FrameSource) -> FrameSource:
-        """Return the same source; the frames that it gives are recorded, where that is wanted."""
-        return source if self.recorder is None else WrappedSource(source, self.recorder.frame)
+        """Return the source, wrapped so that its frames are recorded if there is a recorder."""
+        return source if self.recorder is None else WrappedSource(source, self.recorder.write_frame)
 
     def remarks(self) -> list[str]:
-        """Return what is new about the recording, a sentence, once a flight."""
+        """Return the recording's problem, a sentence, at the first call after it occurred."""
         problem = None if self.recorder is None else self.recorder.problem
         if problem is None or self._has_remarked:
             return []
@@ -174,30 +174,29 @@ class LogWatcher:
         if tick.turn is not None:
             self.turn(tick.turn)
         if self.recorder is not None:
-            self.recorder.tick(record)
+            self.recorder.write_tick(record)
 
     def write(self, record: Mapping[str, Any]) -> None:
         """Append one tick record (`perchctl.record.fields.tick_record`). Never raises."""
-        self._put(partial(encode, {"kind": "tick", **record}), record["t_s"])
+        self._put(partial(encode_line, {"kind": "tick", **record}), record["t_s"])
 
     def turn(self, turn: Turn) -> None:
         """Append a whole turn, exactly (`turn_line`). Never raises."""
         self._put(partial(turn_line, turn), turn.t_s)
 
     def sent(self, sent: SentCommand) -> None:
-        """Append what was sent in the loop's place, exactly; from any thread. Never raises."""
+        """Append a command that no turn decided, exactly; from any thread. Never raises."""
         self._put(partial(sent_line, sent), sent.t_s)
 
     def event(self, event: Event) -> None:
         """Append an event (`perchctl.record.fields.event_record`). Never raises."""
-        self._put(partial(encode, {"kind": "event", **event_record(event)}), event.t_s)
+        self._put(partial(encode_line, {"kind": "event", **event_record(event)}), event.t_s)
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
-        """Write, return the summary and close; without a report (the flight raised) only close.
-
-        The log comes first: a recording's disk that hangs holds up its own end only."""
+        """Write the summary and close; without a report (the flight raised) only close. Return the
+        summary."""
         if report is None:
             self.end()
             self._ended_recording()
@@ -239,7 +238,7 @@ class LogWatcher:
     def end(self, summary: Mapping[str, Any] | None = None) -> None:
         """Append the summary, if any, and close. Never raises; a second call does nothing.
 
-        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most."""
+        Waits at most `CLOSE_TIMEOUT_S` for the disk."""
         if self._closed:
             return
         self._closed = True
@@ -270,15 +269,15 @@ class LogWatcher:
         except Exception as error:  # whatever it is: the thread outlives its record
             self._failed += 1
             why = str(error) or type(error).__name__
-            self.formless = self.formless or f"a record has no form in the flight log: {why}"
+            self.unencodable = self.unencodable or f"a record has no form in the flight log: {why}"
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
             # What was waited for in vain is in the file by now.
             problem = None if self.problem == NO_ANSWER else self.problem
-            lost_records = self._writer.refused + self._failed
-            lost = {"lost_records": lost_records, "problem": problem or self.formless}
-            self._store(partial(encode, {"kind": "summary", **summary, **lost}))
+            lost_records = self._writer.refused_jobs + self._failed
+            lost = {"lost_records": lost_records, "problem": problem or self.unencodable}
+            self._store(partial(encode_line, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
         with suppress(OSError):
             self._file.close()
@@ -294,7 +293,7 @@ class LogWatcher:
 
 
 def sent_line(sent: SentCommand) -> bytes:
-    """Return what was sent in the loop's place as one line of the log, exact."""
+    """Return a command that no turn decided as one exact line of the log."""
     return json_line({"kind": "sent", **to_exact_json(sent)})
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.sim.optics import Picture
-from perchctl.sim.renderer import Renderer, Shot
+from perchctl.sim.renderer import Exposure, Renderer
 from perchctl.sim.scenario import Scenario
 
 SCHEDULE_STREAM, STREAM = 411, 412
@@ -38,7 +38,7 @@ class SimCamera:
     """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes.
 
     Each exposure draws the same random numbers whether or not it is lost, and a
-    frame's noise hangs on its index, so neither faults nor the steps of
+    frame's noise depends on its index, so neither faults nor the steps of
     `advance` change any other frame.
 
     - lost: with `camera_drop_rate`, and `camera_burst` = (start, n): the n
@@ -54,7 +54,7 @@ class SimCamera:
         self._T_body_cam = np.array(scenario.T_body_cam_true, np.float64)
         self._rng = np.random.default_rng([scenario.seed, SCHEDULE_STREAM])
         self._shutter = Shutter(scenario)
-        self._half_s = self._shutter.half_s
+        self._half_s = self._shutter.half_frame_s
         self._first_s = self._half_s + float(self._rng.random()) / scenario.camera_rate_hz
         self._index = 0
         self._burst_left = scenario.camera_burst[1] if scenario.camera_burst else 0
@@ -102,8 +102,8 @@ class SimCamera:
         return given_out
 
     def take_newest(self, count: int) -> list[DeliveredFrame]:
-        """Return of the frames that `take` gives the last `count` exposures, each as it first came
-        and as it came last."""
+        """Take the frames; return the first and last copy of each of the newest `count`
+        exposures, since a receiver may repeat them."""
         frames = self.take()
         last = sorted({frame.index for frame in frames})[-count:]
         ends = [[frame for frame in frames if frame.index == index] for index in last]
@@ -151,7 +151,7 @@ PUMPING_HZ = (0.4, 2.0)
 class Shutter:
     """The scenario's shutter; same seed, same light.
 
-    `half_s`: half the time from the first light on the frame to the last.
+    `half_frame_s`: half the time from the first light on the frame to the last.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -164,7 +164,7 @@ class Shutter:
         self._apart_s = 0.0
         if scenario.camera_fields != "progressive":
             self._apart_s = 0.5 / scenario.camera_rate_hz
-        self.half_s = half_exposure_s + scenario.camera_readout_s / 2.0 + self._apart_s / 2.0
+        self.half_frame_s = half_exposure_s + scenario.camera_readout_s / 2.0 + self._apart_s / 2.0
         rng = np.random.default_rng([scenario.seed, STREAM])
         self._lamp_phase, self._hunt_phase = rng.uniform(0.0, 2.0 * math.pi, size=2)
         self._hunt_hz = float(rng.uniform(*PUMPING_HZ))
@@ -172,13 +172,13 @@ class Shutter:
         swing = float(np.sinc(FLICKER_HZ * 2.0 * half_exposure_s))
         self._flicker = scenario.camera_flicker * swing
 
-    def shots(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> list[Shot]:
-        """Return the frame's pictures in their order of time: two fields, or one."""
+    def shots(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> list[Exposure]:
+        """Return the frame's exposures in time order: two fields, or one whole frame."""
         half_s = self._apart_s / 2.0
         moments = (middle_s - half_s, middle_s + half_s) if half_s else (middle_s,)
         return [self._shot(moment_s, T_world_cam_at, height) for moment_s in moments]
 
-    def _shot(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> Shot:
+    def _shot(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> Exposure:
         readout_s = self._s.camera_readout_s
         delays_s = [0.0]
         if readout_s:
@@ -188,7 +188,7 @@ class Shutter:
             for delay_s in delays_s
         )
         row_times = middle_s + readout_s * (np.arange(height) / (height - 1) - 0.5)
-        return Shot(rows, self._light(row_times))
+        return Exposure(rows, self._light(row_times))
 
     def _light(self, t_s: Array) -> Array | None:
         s = self._s

@@ -36,17 +36,17 @@ TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class CaptureFault:
-    """What is wrong for a time; as it stands, nothing.
+    """A temporary fault of the motion capture; the defaults are no fault.
 
     Attributes:
         occluded: the vehicle's body is not seen.
         frozen: all bodies stay where they were seen last, to the last digit.
         gone: no frame is sent.
         swapped: the vehicle's body and the first other one have changed names.
-        scale: of all positions; 1000 is millimetres.
+        scale: factor on all positions; 1000 is millimetres.
         mirrored: positions with y's sign turned, as a left-handed program sends them.
-        axes: rows (3, 3) of the turn from the world's axes to the capture's.
-        late_s: more than the settings' delay.
+        axes: rows (3, 3) of the rotation from the world's axes to the capture's.
+        late_s: delay in addition to `CaptureSettings.delay_s`.
     """
 
     occluded: bool = False
@@ -61,16 +61,16 @@ class CaptureFault:
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """A motion-capture system as a lab has it; SI, its world that of the state estimate.
+    """A simulated motion-capture system and its faults; SI units.
 
     Attributes:
         body: the vehicle's rigid body, `body_*` its axes and origin in the vehicle's axes.
         others: rigid bodies that stand still, by name and place.
         rate_hz: of its cameras.
-        delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
+        delay_s, jitter_s: from an exposure to the frame's arrival, mean and one sigma.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
-        heading_rad, origin_m: of the simulator's world in the capture's.
-        faults: (from s, to s, what), on the simulation's clock.
+        heading_rad, origin_m: pose of the simulator's world in the capture's.
+        faults: (start s, end s, fault), on the simulation's clock.
     """
 
     body: str = "crazyflie"
@@ -245,8 +245,7 @@ class MotionCaptureServer:
         threading.Thread(target=self._answer, name="capture-server", daemon=True).start()
 
     def publish(self, seen: CaptureFrame) -> None:
-        """Send a frame; nothing is sent while nobody is connected. A client that has gone, and a
-        full buffer, lose a frame, as on any network."""
+        """Send a frame to the client, if there is one; it may be lost, as on any network."""
         self._count += 1
         if self._client is not None:
             with contextlib.suppress(OSError):

@@ -49,8 +49,8 @@ _SETPOINTS = {
 """Port 7: the mode and the numbers of each type, as cflib sends them since protocol 11."""
 
 
-def execute(firmware: Firmware, packet: Packet) -> bytes | None:
-    """Let the firmware do what a packet commands; the answer's data, None for no answer.
+def execute_packet(firmware: Firmware, packet: Packet) -> bytes | None:
+    """Let the firmware execute a packet; return the answer's data, None for no answer.
 
     Raises struct.error for one that is too short for its command.
     """
@@ -127,7 +127,7 @@ def _plan(firmware: Firmware, data: bytes) -> int:
             return ENOEXEC
     is_finite = all(math.isfinite(value) for value in values if value is not None)
     if is_finite and data[1:2] == b"\0":  # for all groups; this vehicle is in none
-        firmware.give_order(order, *values)
+        firmware.command_planner(order, *values)
     return OK
 
 
@@ -267,8 +267,8 @@ class CrtpServer:
         self._param_toc = Toc(Port.PARAM, param_codes)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet, at most one. What is too short for its command is
-        passed over, as the firmware does."""
+        """Return the answers to one packet, at most one. A packet too short for its
+        command is ignored, as by the firmware."""
         try:
             answer = self._answer(packet)
         except struct.error:
@@ -337,7 +337,7 @@ class CrtpServer:
             case Port.SUPERVISOR, _ if self._version < PROTOCOL_VERSION:
                 return None
             case _:
-                return execute(self._firmware, packet)
+                return execute_packet(self._firmware, packet)
 
     # Log blocks ---------------------------------------------------------------------
 

@@ -74,8 +74,8 @@ class VehicleHost:
         self._truth = None if truth_file is None else truth_file.open("w", encoding="utf-8")
 
     @property
-    def addresses(self) -> tuple[str, str, tuple[str, str] | None]:
-        """As the attributes `uri`, `stream_url` and `capture` of a `SimProcess`."""
+    def uri_stream_capture(self) -> tuple[str, str, tuple[str, str] | None]:
+        """The attributes of these names of `SimProcess`."""
         stream_url = "" if self.stream is None else self.stream.url
         positions = self.positions
         capture = None if positions is None else (SimCapture.SYSTEM, positions.host)
@@ -119,13 +119,13 @@ class VehicleHost:
             self._truth.flush()
 
     def advance(self, dt_s: float) -> float:
-        """Let `dt_s` pass; the simulated time since the start."""
+        """Step for `dt_s`; return the simulated time since the start."""
         for _ in range(round(dt_s / CONTROL_PERIOD_S)):
             self.step()
         return self.elapsed_s
 
-    def answer(self, name: str, *arguments: Any, **named: Any) -> Any:
-        """Call a method of this host, its server, world, battery or motion capture."""
+    def call_method(self, name: str, *arguments: Any, **named: Any) -> Any:
+        """Call the method `name` of this host, its server, world, battery or motion capture."""
         world = self.vehicle.world
         parts = (self, self.server, world, world.powertrain.cell, self.vehicle.capture)
         of = next((part for part in parts if hasattr(part, name)), self)
@@ -138,7 +138,7 @@ class VehicleHost:
     def truth(self) -> dict[str, Any]:
         """Return the true state, SI and radians, and firmware outputs: no Crazyflie reports it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
-        ceiling_n, floor = world.contact_state()
+        ceiling_n, floor = world.push_n_and_on_floor()
         return {
             "t_s": self.elapsed_s,
             "position_m": (world.x_m, world.y_m, world.z_m),
@@ -176,7 +176,7 @@ class VehicleHost:
         t_s = self.elapsed_s + _EPS_S
         if self._silent_s[0] <= t_s < self._silent_s[1]:
             return False
-        return self._bursts is None or not self._bursts.lost(self.elapsed_s)
+        return self._bursts is None or not self._bursts.is_lost(self.elapsed_s)
 
 
 # --- The child process: runs the vehicle that the parent describes ----
@@ -189,14 +189,14 @@ LOOP_PATIENCE_S = 2.0
 def serve_parent(
     channel: Connection, shared: SharedTime, pace: str, scenario: Scenario, settings: dict[str, Any]
 ) -> None:
-    """Run the vehicle until the parent closes the channel or is gone. It is sent `addresses`
-    first; a text is why the vehicle has ended."""
+    """Run the vehicle until the parent closes the channel or is gone. Send it
+    the host's addresses first, and if the vehicle fails, the error as text."""
     os.setsid()  # away from the terminal
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     try:
         with contextlib.closing(VehicleHost(scenario, **settings)) as host:
-            channel.send(host.addresses)
+            channel.send(host.uri_stream_capture)
             HostRunner(host, channel, realtime=pace == "realtime", shared=shared).run()
     except Exception as error:
         with contextlib.suppress(OSError):
@@ -249,7 +249,7 @@ class HostRunner:
                     self._channel.send(self._answer(*self._channel.recv()))
 
     def catch_up(self) -> float:
-        """Step up to now, some steps at most at once; how long to wait for the next step."""
+        """Step up to now, in limited batches; return the time to wait for the next step, s."""
         now_s = self._clock() - self._origin_s
         max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else SharedTime.MARGIN_S
         if now_s - self._host.elapsed_s > max_lag_s:
@@ -279,7 +279,7 @@ class HostRunner:
 
     def _answer(self, name: str, arguments: Any, named: Any) -> tuple[bool, Any]:
         try:
-            return True, self._host.answer(name, *arguments, **named)
+            return True, self._host.call_method(name, *arguments, **named)
         except Exception as error:
             return False, f"{type(error).__name__}: {error}"
 
@@ -307,7 +307,7 @@ class MjpegServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True).start()
 
     def publish(self, image: Picture) -> None:
-        """Publish a picture, grey uint8 (h, w). It costs nothing while nobody watches."""
+        """Publish a picture, grey uint8 (h, w)."""
         with self._changed:
             self._newest = self._newest[0] + 1, image
             self._changed.notify_all()

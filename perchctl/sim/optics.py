@@ -30,16 +30,16 @@ LEAST_RISE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Undistorted rays (x, y, 1) at nodes `stride` px apart, with one node around where they are
-    further apart than one pixel.
+    """Undistorted rays (x, y, 1) at nodes `stride` px apart. If that is more than one pixel, a
+    margin of one node surrounds the picture.
 
     Node (j, i) then sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
     cv2.resize by `stride` puts its sample centres.
     """
 
     xy: NDArray[np.float32]  # (rows, cols, 2)
-    down: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
-    outline: NDArray[np.float32]  # (n, 2), rays around all of them
+    row_share: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
+    boundary_xy: NDArray[np.float32]  # (n, 2), the outermost rays
 
 
 def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
@@ -59,8 +59,8 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
 
 
 def ray_to_plane_map(T_target_cam: Array) -> Array:
-    """Return what maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (...,
-    3, 3) of poses (..., 4, 4).
+    """Return the homographies (..., 3, 3) from rays (x, y, 1) to homogeneous points (X w, Y w, w)
+    of the target's plane, for poses (..., 4, 4).
 
     From X = t + s R r with X_z = 0. A camera above the plane sees nothing of it
     (w is made negative).
@@ -82,13 +82,13 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
     if to_plane.ndim == 2:
         # The rise is linear over the rays, so it is least on the outline.
         rise = to_plane[2].astype(np.float32)
-        if grid.outline.dot(rise[:2]).min() + rise[2] >= LEAST_RISE:
+        if grid.boundary_xy.dot(rise[:2]).min() + rise[2] >= LEAST_RISE:
             points = cv2.perspectiveTransform(grid.xy, to_plane)
             return np.asarray(points, np.float32), np.zeros(x.shape, np.bool_)
         rays = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
         q = (to_plane.astype(np.float32) @ rays).reshape(3, *x.shape)
     else:
-        at = np.clip(grid.down, 0.0, 1.0) * (len(to_plane) - 1)
+        at = np.clip(grid.row_share, 0.0, 1.0) * (len(to_plane) - 1)
         low = np.minimum(at.astype(int), len(to_plane) - 2)
         share = (at - low)[:, None, None]
         H = (1.0 - share) * to_plane[low] + share * to_plane[low + 1]  # (rows, 3, 3)
@@ -119,14 +119,14 @@ VIGNETTING_EXPONENT = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """`coarse` the rays of every eighth pixel, `pixels` of all of them; `shade` the relative light
-    (height, width), 255 for all of it; `places` rays (3, 5) to the picture's middle and into its
-    quarters; `focal_px` the mean of both directions."""
+    """`coarse` holds the rays of every eighth pixel, `pixels` those of all; `shade` is the
+    vignetting (height, width), 255 for no loss; `sample_rays` (3, 5) go through the picture's
+    middle and its quarters; `focal_px` is the mean focal length of x and y."""
 
     coarse: RayGrid
     pixels: RayGrid
     shade: Picture
-    places: Array
+    sample_rays: Array
     focal_px: float
 
 
@@ -146,8 +146,8 @@ def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
         return np.asarray(pixels[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX], np.float32)
 
     xy = finer(fine.xy)
-    down = np.arange(len(xy)) * ((fine.down[2] - fine.down[1]) / FINE_PX)
-    pixels = RayGrid(xy, np.asarray(down, np.float32), fine.outline)
+    down = np.arange(len(xy)) * ((fine.row_share[2] - fine.row_share[1]) / FINE_PX)
+    pixels = RayGrid(xy, np.asarray(down, np.float32), fine.boundary_xy)
     r2 = (fine.xy[..., 0] ** 2) + (fine.xy[..., 1] ** 2)
     light = finer((255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32))
     shade = np.asarray(np.rint(light[: size_px[1], : size_px[0]]), np.uint8)

@@ -32,7 +32,7 @@ def _serve_parent(*arguments: Any) -> None:
 
 class SimProcess:
     """Handle of a running simulated vehicle; a context manager. It has the methods that the child's
-    `perchctl.sim.host.VehicleHost` calls in `answer`.
+    `perchctl.sim.host.VehicleHost.call_method` finds.
 
     From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
     does not answer, `InvalidValue` when it refuses.

@@ -35,7 +35,7 @@ from perchctl.sim.sheets import (
     SAMPLING_SIGMA_PX,
     TILE_M,
     Box,
-    Ceiling,
+    CeilingTexture,
     PlacedSheet,
     SheetView,
     neighbour_sheet,
@@ -59,18 +59,18 @@ _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class Exposure:
     """One field, or a whole frame.
 
     Attributes:
-        rows: camera poses T_world_cam (4, 4) over the exposure, at equal steps from its
-            beginning to its end; of rows at equal distances from the first to the last.
-            A single entry: all rows at once.
-        light: factor of each row's brightness (height,); None for an even 1.
+        row_poses: for rows at equal distances from the first to the last, the camera poses
+            T_world_cam (4, 4) at equal steps over their exposure. A single entry: all rows at
+            once (global shutter).
+        row_brightness: factor of each row's brightness (height,); None: 1 for all.
     """
 
-    rows: tuple[tuple[Array, ...], ...]
-    light: Array | None = None
+    row_poses: tuple[tuple[Array, ...], ...]
+    row_brightness: Array | None = None
 
 
 class Renderer:
@@ -102,10 +102,10 @@ class Renderer:
         own = () if scenario.no_target else (PlacedSheet(printed_sheet(printed.model_dump_json())),)
         self._sheets = (*own, *(neighbour_sheet(n, printed) for n in scenario.neighbours))
         self.move_target(scenario.target_xy_m)
-        self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
+        self._ceiling = CeilingTexture(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = shared_lens(camera)
         self._coarse, self._pixels, self._shade = lens.coarse, lens.pixels, lens.shade
-        self._places, self._focal_px = lens.places, lens.focal_px
+        self._places, self._focal_px = lens.sample_rays, lens.focal_px
         self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
         self._noise: NDArray[np.int16] | None = None
         if scenario.camera_noise_sigma > 0.0:
@@ -136,14 +136,14 @@ class Renderer:
 
         Returns: uint8, shape (height, width).
         """
-        shot = Shot((tuple(T_world_cam_samples),))
+        shot = Exposure((tuple(T_world_cam_samples),))
         return self.expose([shot], frame_index=frame_index, defocus_px=defocus_px)
 
     def expose(
-        self, shots: Sequence[Shot], frame_index: int = 0, defocus_px: float | None = None
+        self, shots: Sequence[Exposure], frame_index: int = 0, defocus_px: float | None = None
     ) -> Picture:
-        """Return the frame of one shot, or of two fields in their order of time; which rows are
-        the first one's is the scenario's. Otherwise as `render`."""
+        """Return the frame of one exposure, or of two fields, the earlier first; its rows are by
+        the scenario's `camera_fields`. Otherwise as `render`."""
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
         picture = exposed[0]
         if len(shots) > 1:
@@ -159,19 +159,19 @@ class Renderer:
             picture = add_analogue_faults(picture, self._analogue, rng)
         return picture
 
-    def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
+    def _exposed(self, shot: Exposure, defocus_px: float | None) -> Picture:
         """Return what falls onto the sensor in one shot, before noise."""
-        rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
+        rows = [self._T_target_world @ np.array(poses) for poses in shot.row_poses]
         motion_px = self._paths_px(rows[len(rows) // 2])
-        length_px = path_length_px(motion_px)
+        length_px = longest_path_px(motion_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         if length_px < STILL_PX and len(rows) == 1:
-            rows = [rounded(rows[0][len(rows[0]) // 2])[None]]
+            rows = [round_pose(rows[0][len(rows[0]) // 2])[None]]
             motion_px, length_px = np.zeros((5, 1, 2)), 0.0
         picture = self._projected(rows, motion_px, length_px, sigma)
-        if shot.light is None:
+        if shot.row_brightness is None:
             return picture
-        factor = np.broadcast_to(shot.light.astype(np.float32)[:, None], picture.shape)
+        factor = np.broadcast_to(shot.row_brightness.astype(np.float32)[:, None], picture.shape)
         lit = cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U)
         return np.asarray(lit, np.uint8)
 
@@ -182,7 +182,7 @@ class Renderer:
     ) -> Picture:
         """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = blur_sample_count(length_px)
-        by_row = [ray_to_plane_map(spread(poses, count)) for poses in rows]
+        by_row = [ray_to_plane_map(resample_poses(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         middle = maps[count // 2]
         if count % 2 == 0:
@@ -214,7 +214,7 @@ class Renderer:
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
         step = self._ceiling_px
-        texture, texels_per_m = self._ceiling.texture(px_per_m / step)
+        texture, texels_per_m = self._ceiling.tile_and_texels_per_m(px_per_m / step)
         # Whole tiles, to have the view in the middle of the texture.
         tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
         texels = nodes * np.float32(texels_per_m)
@@ -238,7 +238,7 @@ class Renderer:
         rows, cols = pixel_slices(view.box)
         pixels = self._pixels
         here = np.ascontiguousarray(pixels.xy[rows, cols])
-        rays = RayGrid(here, pixels.down[rows], pixels.outline)
+        rays = RayGrid(here, pixels.row_share[rows], pixels.boundary_xy)
         texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
         seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
         alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
@@ -288,7 +288,7 @@ def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONST
 
 
 def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
-    """Blur the blocks of `box`, and what is so near to them that it shows a part of their blur."""
+    """Blur the blocks of `box` in place, with the margin that their blur reaches."""
     reach = math.ceil(3.0 * sigma_px) + 1
     near, far = pixel_slices(box, reach), pixel_slices(box, 2 * reach)
     blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)
@@ -307,8 +307,8 @@ STEP = 2.0**-17
 """Steps of the directions, and of the place in parts of its distance: below 0.01 px."""
 
 
-def rounded(T_target_cam: Array) -> Array:
-    """Return the pose (4, 4) of a still camera."""
+def round_pose(T_target_cam: Array) -> Array:
+    """Return the pose (4, 4) of a still camera, rounded."""
     steps = np.full((3, 4), STEP)
     steps[:, 3] *= 2.0 ** np.floor(np.log2(max(abs(float(T_target_cam[2, 3])), 1e-3)))
     T = np.eye(4)
@@ -328,7 +328,7 @@ MAX_SAMPLES = 16
 MAX_KERNEL_REACH_PX = 12
 
 
-def path_length_px(motion_px: Array) -> float:
+def longest_path_px(motion_px: Array) -> float:
     """Return the longest path of any of the places, `motion_px` (places, times, 2)."""
     steps = motion_px[:, 1:] - motion_px[:, :-1]
     return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
@@ -341,7 +341,7 @@ def blur_sample_count(length_px: float) -> int:
     return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
 
 
-def spread(poses: Array, count: int) -> Array:
+def resample_poses(poses: Array, count: int) -> Array:
     """Return `count` poses (count, 4, 4) at the middles of equal parts of the exposure.
 
     Linear in the matrices of `poses` (n, 4, 4): within an exposure the turn is so small

@@ -53,14 +53,14 @@ class Scenario:
         first_contact_force_n: pull at the first contact; None means the same.
         camera_freeze_at_s: from then on it gives its last picture; None means never.
         parameters: the firmware's, where they differ from its release at boot.
-        gyro_bias_radps, acc_bias_mps2: what the gyroscope, after the firmware has taken out what it
-            found on the ground, and the accelerometer, before the firmware scales it to 1 g, read
-            too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
+        gyro_bias_radps, acc_bias_mps2: biases in body axes, of the gyroscope after and of the
+            accelerometer before the firmware's calibration on the ground; only for a vehicle
+            without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
-        neighbours: other vehicles' targets. What these vehicles do to the air is in the draught.
+        neighbours: other vehicles' targets; their downwash is in the draught.
     """
 
     seed: int = 0
@@ -116,9 +116,11 @@ class Scenario:
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
 
-    def radio_bursts(self) -> Bursts | None:
+    def radio_bursts(self) -> RadioBursts | None:
         """Return the times at which the flight's radio is silent; None where it loses nothing."""
-        return Bursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
+        return (
+            RadioBursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
+        )
 
 
 # --- From a profile's ranges and a seed to a scenario -----------------
@@ -271,14 +273,14 @@ CONNECTED_S = 4.0
 """Before that nothing is lost: what is sent until the take-off is repeated until it is answered."""
 
 
-class Bursts:
-    """Gilbert's model of a channel with two states, in continuous time: both last as long as an
-    exponential distribution says. So a share of the time is lost, in pieces of a given mean
-    length, whatever the packets' rate; both directions suffer together, as from a Wi-Fi nearby or
-    a body in the way. `lost` is asked with times that never go back; same seed, same bursts.
+class RadioBursts:
+    """Gilbert's two-state channel in continuous time: good and bad times have exponentially
+    distributed lengths, whatever the packets' rate. Both directions are lost together, as by
+    a Wi-Fi nearby or a body in the way. The times given to `is_lost` must not decrease; same
+    seed, same bursts.
 
     Args:
-        share: of the time that is lost, above 0 and below 1.
+        share: lost share of the time, above 0 and below 1.
         mean_s: a burst's mean length.
     """
 
@@ -289,7 +291,7 @@ class Bursts:
         self._bad = False
         self._until_s = CONNECTED_S + float(self._rng.exponential(self._good_s))
 
-    def lost(self, t_s: float) -> bool:
+    def is_lost(self, t_s: float) -> bool:
         """True if a packet sent at that time is lost."""
         while t_s >= self._until_s:
             self._bad = not self._bad

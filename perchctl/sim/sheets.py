@@ -99,7 +99,7 @@ class Sheet:
         return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0)
 
 
-class Ceiling:
+class CeilingTexture:
     """A seeded, seamless grey texture with detail from 2 mm to half a metre."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -116,9 +116,9 @@ class Ceiling:
             self._tiles.append(np.asarray(half, np.float32))
         self._levels: dict[int, Picture] = {}
 
-    def texture(self, image_px_per_m: float) -> tuple[Picture, float]:
-        """Return a piece, `CEILING_TEXTURE_PX` square, that repeats without a seam, and its texels
-        a metre: 1 to 2 a pixel, or the nearest there is."""
+    def tile_and_texels_per_m(self, image_px_per_m: float) -> tuple[Picture, float]:
+        """Return a seamless square tile of `CEILING_TEXTURE_PX`, and its texels per metre: 1 to 2
+        per image pixel, or the nearest level."""
         finest = TILE_FINEST_PX / TILE_M
         level = math.floor(math.log2(finest / max(image_px_per_m, 1.0)))
         level = min(max(level, 0), len(self._tiles) - 1)
@@ -147,8 +147,8 @@ Box = tuple[slice, slice]
 
 
 class SheetView(NamedTuple):
-    """A sheet in one exposure: in the picture's `box`; `to_texels` (3, 3) maps the own target's
-    plane to the texture's columns and rows."""
+    """A sheet in one exposure: `box` is its part of the picture, `to_texels` (3, 3) maps the plane
+    of the vehicle's own target to the texture's columns and rows."""
 
     texture: SheetTexture
     box: Box
@@ -157,16 +157,17 @@ class SheetView(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlacedSheet:
-    """A sheet, and how (3, 3) the own target's plane maps to its."""
+    """A sheet, and the map (3, 3) from the plane of the vehicle's own target to the sheet's."""
 
     sheet: Sheet
-    plane: Array | None = None  # the own
+    to_sheet: Array | None = None  # None: the same plane
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
-        """Return where the sheet is at the coarse nodes (rows, columns, 2), own target's axes; None
-        if out of view. `length_px`: the picture's longest way within the exposure."""
-        if self.plane is not None:
-            turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
+        """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
+        target's axes; None where it is out of view. `length_px` is the longest way of the picture
+        within the exposure."""
+        if self.to_sheet is not None:
+            turn, shift = self.to_sheet[:2, :2].T, self.to_sheet[:2, 2]
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
         x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
         # How far each block's centre is from the sheet's, along the axis along which it is farther,
@@ -183,8 +184,8 @@ class PlacedSheet:
         texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
         scale, centre = texture.px_per_m, texture.center_px
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
-        if self.plane is not None:
-            to_texels = to_texels @ self.plane
+        if self.to_sheet is not None:
+            to_texels = to_texels @ self.to_sheet
         return SheetView(texture, (rows, cols), to_texels)
 
 
@@ -203,7 +204,7 @@ def union_box(boxes: Sequence[Box]) -> Box:
 
 
 def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
-    """Return the rows and columns of pixels in a box, and so many around it."""
+    """Return the rows and columns of pixels in a box with a margin around it."""
     rows, cols = (
         slice(max(COARSE_PX * each.start - margin_px, 0), COARSE_PX * each.stop + margin_px)
         for each in box
@@ -212,7 +213,7 @@ def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
 
 
 def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
-    """Return another vehicle's target; what the neighbour leaves open is as on the own."""
+    """Return another vehicle's target; an id that is None is that of the own target."""
     large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
     small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
     target = TargetConfig(

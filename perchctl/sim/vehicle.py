@@ -10,7 +10,7 @@ from perchctl.link import Packet
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture import CaptureSettings, SimCapture
-from perchctl.sim.crtp import execute
+from perchctl.sim.crtp import execute_packet
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -54,7 +54,7 @@ class SimulatedVehicle:
 
     def receive(self, packet: Packet) -> None:
         """Take a packet as it comes from the radio."""
-        execute(self.firmware, packet)
+        execute_packet(self.firmware, packet)
 
     def step(self) -> None:
         """Advance by one control period, with the exposures that fall into it."""

@@ -169,20 +169,20 @@ class World:
         No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
         """
         self._hand = World._stay if hold else None
-        self.place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
+        self.set_state(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
 
-    def carry(self, hand: Callable[[World], None]) -> None:
-        """Call `hand` each period until `let_go`; it sets the state of the held vehicle."""
+    def move_by_hand(self, hand: Callable[[World], None]) -> None:
+        """Call `hand` every period, to set the held vehicle's state, until `let_go`."""
         self._hand = hand
 
     def let_go(self) -> None:
-        """End what `set_pose(..., hold=True)` or `carry` began."""
+        """Release the vehicle from `set_pose(..., hold=True)` or `move_by_hand`."""
         self._hand = None
 
     def _stay(self) -> None:
         self.set_acceleration(0.0, 0.0, 0.0)
 
-    def place(
+    def set_state(
         self,
         position_m: Sequence[float] | Array,
         R: Array,
@@ -218,7 +218,7 @@ class World:
             a * ax + b * ay + c * az for a, b, c in zip(*self._R, strict=True)
         )
 
-    def contact_state(self) -> tuple[float, bool]:
+    def push_n_and_on_floor(self) -> tuple[float, bool]:
         """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
         wrench = np.zeros(6)

@@ -25,7 +25,7 @@ from perchctl.profile import MarkerConfig, dictionary_size
 from perchctl.target.drawing import (
     Rectangle,
     marker_cells,
-    merge_rectangles,
+    merge_black_cells,
     mm_text,
     parse_length,
     print_scale,
@@ -50,7 +50,7 @@ class Board:
         columns, rows: of inner corners on a chessboard, of squares on a charuco board.
         square_m: side of the squares whose corners meet.
         marker_m, dictionary: of charuco's markers.
-        scale: of the print as measured to the print as meant, along width and height.
+        scale: measured over nominal size of the print, along width and height.
     """
 
     kind: BoardKind
@@ -125,19 +125,19 @@ class Board:
             marker_m = parse_length(found["marker"], f"board {text}: marker")
             board = cls("charuco", columns, rows, square_m, marker_m, found["dictionary"])
             _check_markers(board, text)
-        return board.with_sides(measured)[0] if measured else board
+        return board.with_measured_sides(measured)[0] if measured else board
 
-    def with_sides(self, text: str) -> tuple[Board, list[str]]:
-        """Return the same board with its black area's sides as measured, ``249.3x174.6mm``, and
-        what to say of them. Raises InvalidValue."""
+    def with_measured_sides(self, text: str) -> tuple[Board, list[str]]:
+        """Return the same board with the measured sides of its black area, ``249.3x174.6mm``, and
+        notes for the user. Raises InvalidValue."""
         sides = re.fullmatch(r"([\d.]+)x([\d.]+)(mm)?", text)
         if sides is None:
             raise InvalidValue(f"{text!r} is not WIDTHxHEIGHT in mm, as in 249.3x174.6mm")
         width_m, height_m = (parse_length(f"{s}mm", "the board's side") for s in sides.groups()[:2])
         given = (("width", width_m), ("height", height_m))
         (across, first), (down, second) = (
-            print_scale(name, f"the board's {name}", is_m, meant_m, self.notation())
-            for (name, is_m), meant_m in zip(given, self.size_m, strict=True)
+            print_scale(name, f"the board's {name}", is_m, spec_m, self.notation())
+            for (name, is_m), spec_m in zip(given, self.size_m, strict=True)
         )
         return replace(self, scale=(across, down)), first + second
 
@@ -192,7 +192,7 @@ def board_rectangles(board: Board) -> list[Rectangle]:
         at = np.linspace(-board.marker_m / 2, board.marker_m / 2, len(cells) + 1)
         x = (column + 0.5) * board.square_m - width / 2
         y = height / 2 - (row + 0.5) * board.square_m
-        found += merge_rectangles(cells, x + at, y - at)
+        found += merge_black_cells(cells, x + at, y - at)
     return found
 
 

@@ -20,29 +20,28 @@ from perchctl.target.sight import (
     FieldOfView,
     blind_range,
     circle_outline,
-    gear_in_camera,
-    min_side_px,
+    rotation_and_gear,
     square_outline,
+    sure_side_px,
 )
 from perchctl.vision import MARKERS, CameraModel
 
 
 @dataclass(frozen=True)
 class TargetDesign:
-    """A target, a camera and a profile, and what follows from them. Ranges are from the camera's
-    centre to a target on its axis, straight on, m; None where the marker is never read.
+    """The ranges in which a camera detects a target, for a profile. Ranges are from the camera's
+    centre to a target on its axis, facing it, m; None where the marker is never detected.
 
     Attributes:
         blur_px: sigma of the picture's blur.
-        large_px, small_px: the smallest sides that are read through it, found by trial.
+        large_px, small_px: smallest sides, px, detected through that blur, found by trial.
         z1_m, z2_m: farthest range of the large and of the small marker, at any turn.
         z3_m: nearest of the whole large marker, at any turn; z3_upright_m where its sides
             are parallel to the picture's.
         small_nearest_m: nearest range from the gear's tip to the target at which the small marker
             is whole at any turn, the gear right under the target's centre.
         start_range_m: from the camera to the target at the start of the search, at the height
-            `start_height_m`, where the ceiling's height is known; on the ground the target has to
-            be seen surely.
+            `start_height_m` (0: on the ground); None if the ceiling's height is unknown.
     """
 
     target: TargetConfig
@@ -69,7 +68,7 @@ class TargetDesign:
         if far_m is None or self.z2_m is None or self.z3_m is None:
             return ("a marker is never read through this blur: a sharper picture is needed",)
         if self.start_height_m == 0.0:
-            sure_px = min_side_px(self.large_px)
+            sure_px = sure_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
         if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
             found.append(
@@ -117,7 +116,7 @@ class TargetDesign:
             f"{_cm(self.z3_upright_m)} where it is upright",
             "at gear": f"{_cm(self.small_nearest_m):<9} whole small marker down to here between "
             f"gear and target",
-            "mounting": self.blind.words,
+            "mounting": self.blind.text,
         }
         if self.start_range_m is not None:
             rows["search"] = (
@@ -149,8 +148,8 @@ def make_design(
     profile: Profile,
     ceiling_m: float | None = None,
 ) -> TargetDesign:
-    """Return the ranges, by trial through the detector (far) and by geometry (near), and what is
-    wrong for a flight of that profile under a ceiling of that height (None: unknown)."""
+    """Return the design for a profile and a ceiling at `ceiling_m` over the floor (None: unknown):
+    far ranges by trials of the detector, near ones by geometry."""
     f = focal_px(camera)
     view = FieldOfView(camera)
     ahead = (np.eye(3), np.zeros(3))
@@ -175,7 +174,7 @@ def make_design(
         z2_m=None if small_px is None else f * small / small_px,
         z3_m=view.nearest_m(circle_outline(large), *ahead),
         z3_upright_m=view.nearest_m(square_outline(large), *ahead),
-        small_nearest_m=view.nearest_m(circle_outline(small), *gear_in_camera(profile)),
+        small_nearest_m=view.nearest_m(circle_outline(small), *rotation_and_gear(profile)),
         blind=blind_range(target, camera, profile),
         start_range_m=start_m,
         start_height_m=height_m,

@@ -83,7 +83,7 @@ class TargetDrawing:
 
     def rectangles(self) -> list[Rectangle]:
         """Return the black area as few, large, non-overlapping rectangles (for a PDF)."""
-        return merge_rectangles(self.black, self.edges_m, -self.edges_m)
+        return merge_black_cells(self.black, self.edges_m, -self.edges_m)
 
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
@@ -179,7 +179,7 @@ def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: floa
     return np.diff(below, axis=1) / window_px
 
 
-def merge_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
+def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
     """Return the black cells of a grid as few, large, non-overlapping rectangles.
 
     `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. Few and
@@ -244,7 +244,7 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
 
 
 def print_scale(
-    name: str, option: str, measured_m: float, meant_m: float, source: str
+    name: str, option: str, measured_m: float, spec_m: float, source: str
 ) -> tuple[float, list[str]]:
     """Return a print's measured length over the length that it was meant to have by `source`, and
     what to say of it; `name` and `option` name the length.
@@ -252,14 +252,14 @@ def print_scale(
     Raises InvalidValue for a scale that no printer makes: the length was not measured in the unit
     that was meant.
     """
-    scale = measured_m / meant_m
+    scale = measured_m / spec_m
     off = scale - 1.0
     if abs(off) > MAX_SCALE_ERROR:
         raise InvalidValue(
-            f"{option}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the {mm_text(meant_m)} "
+            f"{option}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the {mm_text(spec_m)} "
             f"mm of {source}: measure what is black, in mm"
         )
-    notes = [f"{name}: {mm_text(measured_m)} mm, {100 * off:+.2f} % against {mm_text(meant_m)} mm"]
+    notes = [f"{name}: {mm_text(measured_m)} mm, {100 * off:+.2f} % against {mm_text(spec_m)} mm"]
     if abs(off) > NOTABLE_SCALE_ERROR:
         notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
     return scale, notes

@@ -25,8 +25,8 @@ MEASURED_SIGMA = 0.001
 def measured_target(
     nominal: TargetConfig, sides_m: Mapping[str, float]
 ) -> tuple[TargetConfig, list[str]]:
-    """Return the target with the sides of ``large`` and ``small``, as far as they were measured,
-    and what to say of the print. Both together make its sizes count as measured.
+    """Return the target with the measured sides of ``large`` and ``small``, and notes for the
+    user. If both are given, its sizes count as measured.
 
     Raises InvalidValue for a size that cannot be this marker's.
     """
@@ -108,13 +108,14 @@ class PrintCheck:
             self._ratios.append(ratio)
 
     @property
-    def judged(self) -> bool:
+    def has_enough_frames(self) -> bool:
         """True when enough frames showed both markers."""
         return len(self._ratios) >= MIN_FRAMES
 
-    def verdict(self) -> tuple[bool, str]:
-        """Return whether the median frame errs beyond noise and bias, and a sentence."""
-        if not self.judged:
+    def error_and_text(self) -> tuple[bool, str]:
+        """Return whether the median ratio shows a print error beyond noise and bias, and a
+        sentence."""
+        if not self.has_enough_frames:
             return False, (
                 f"print not judged: both markers were seen in {len(self._ratios)} frames, "
                 f"{MIN_FRAMES} needed"

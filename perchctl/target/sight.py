@@ -94,17 +94,18 @@ LEAST_UP = 0.2
 """Of the view's upward part: a camera that looks farther aside sees no target over it."""
 
 
-def min_side_px(plain_px: float | None = None) -> float:
-    """Return the side in px from which on the ground's search finds the large marker surely.
-    `plain_px`: what a plain one reads through the camera's own blur, where that was measured."""
-    return SURE_PX if plain_px is None else max(SURE_PX, BLURRED * plain_px)
+def sure_side_px(detected_px: float | None = None) -> float:
+    """Return the smallest side, px, of a large marker that the search on the ground finds surely.
+    `detected_px`: the smallest detected through the camera's blur, if that was measured."""
+    return SURE_PX if detected_px is None else max(SURE_PX, BLURRED * detected_px)
 
 
 def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) -> str:
-    """Return in words where the large marker is surely found from the ground, up and aside."""
+    """Return in words where a camera on the ground finds the large marker surely: up to which
+    height, and how far from the camera's axis at some heights."""
     side_m = target.large.side_m
     view = mount.T_body_cam[:3, 2]
-    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / min_side_px()
+    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / sure_side_px()
     lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
     axis = _directions(lean, STRAIGHT_DEG, ".0f", "deg")
     axis = f"leans {axis}" if axis else "points straight up"
@@ -151,8 +152,8 @@ class TargetView:
         whole: whether one of its markers is wholly in the picture.
         height_m: above the camera.
         aside_m: from the camera's axis, forward and left; NaN for a camera that does not look up.
-        reach_m: how far aside a large marker may be there at any turn; None where it cannot be
-            whole in the picture at all.
+        reach_m: largest distance from the axis at which the large marker is wholly in the
+            picture in any rotation; None if there is none.
     """
 
     whole: bool
@@ -218,14 +219,15 @@ _STEP_M = 0.0005
 
 @dataclass(frozen=True)
 class BlindRange:
-    """Ranges from the gear's tip within which nothing of the target is measured, m: by whole
-    markers, and by what is left of them. 0: down to contact; None: all of the last 10 cm."""
+    """Ranges from gear tip to target, m, below which the target is not measured any more: by
+    whole markers, `whole_m`, and by parts of them too, `left_m`. 0: measured down to contact;
+    None: not at all in the last 10 cm."""
 
     whole_m: float | None
     left_m: float | None
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Both ranges in words."""
         left, whole = (_blind_words(range_m) for range_m in (self.left_m, self.whole_m))
         return f"{left} (by whole markers alone: {whole}), the gear under the target's centre"
@@ -238,8 +240,8 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
-    """Return from where on the profile's camera mount and gear see too little."""
-    R, offset = gear_in_camera(profile)
+    """Return the blind range of the profile's `camera.mount` and `vehicle.gear_body_m`."""
+    R, offset = rotation_and_gear(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
@@ -264,13 +266,14 @@ def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
 
 
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
-    """True if the small marker is wholly in view from a gear's tip so far under it."""
-    R, gear = gear_in_camera(profile)
+    """Return true if the whole small marker is in the picture with the gear's tip `range_m` below
+    it."""
+    R, gear = rotation_and_gear(profile)
     outline = outline_at_height(square_outline(profile.target.small.side_m), range_m)
     return FieldOfView(camera).contains(outline @ R.T + gear)
 
 
-def gear_in_camera(profile: Profile) -> tuple[Array, Array]:
+def rotation_and_gear(profile: Profile) -> tuple[Array, Array]:
     """Return the rotation from body to camera axes, and the gear's tip in the camera's, m."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T

@@ -16,8 +16,8 @@ from .target_selection import to_level as to_level
 from .target_selection import to_world as to_world
 from .types import MARKERS as MARKERS
 from .types import Attitude as Attitude
+from .types import CameraErrors as CameraErrors
 from .types import CameraModel as CameraModel
-from .types import Consistency as Consistency
 from .types import Frame as Frame
 from .types import MarkerPose as MarkerPose
 from .types import PictureKind as PictureKind

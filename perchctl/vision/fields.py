@@ -68,10 +68,10 @@ def split_fields(image: Grey) -> tuple[Grey, ...]:
     """Return the top and bottom field, each (h, w), of a combed picture, else the picture."""
     if not is_combed(image):
         return (image,)
-    return field_picture(image, 0), field_picture(image, 1)
+    return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
-def field_picture(image: Grey, first_row: int) -> Grey:
+def interpolate_field(image: Grey, first_row: int) -> Grey:
     """Return one field at full height: its own rows stay, those between are interpolated."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
@@ -100,8 +100,8 @@ def classify_fields(frame: Frame) -> Frame:
 def field_frames(frame: Frame) -> tuple[Frame, Frame]:
     """Return the top and the bottom field, both at the frame's time."""
     return (
-        replace(frame, image=field_picture(frame.image, 0), fields="top", encoded=None),
-        replace(frame, image=field_picture(frame.image, 1), fields="bottom", encoded=None),
+        replace(frame, image=interpolate_field(frame.image, 0), fields="top", encoded=None),
+        replace(frame, image=interpolate_field(frame.image, 1), fields="bottom", encoded=None),
     )
 
 

@@ -50,13 +50,13 @@ _HEADING_RADPS2 = 0.1  # of the state estimate's heading
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Accelerations of a tracked target, standard deviations: along each axis, of its heading, and
-    of the frame's own turning about level axes."""
+    """Standard deviations of accelerations: of a tracked target along each axis, of its heading,
+    and of the frame's rotation about level axes."""
 
     acceleration_mps2: float
     heading_radps2: float
     turn_radps2: float = 0.0
-    wanders: bool = False
+    is_drifting: bool = False
 
     @cached_property
     def rate_variance(self) -> Array:
@@ -104,7 +104,7 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     process = None
     if measured:
         process = (
-            ProcessNoise(config.drift_mps2, _HEADING_RADPS2, wanders=True)
+            ProcessNoise(config.drift_mps2, _HEADING_RADPS2, is_drifting=True)
             if in_world
             else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
         )
@@ -121,12 +121,12 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
 
 
 def tilt_jacobian(way_m: Array) -> Array:
-    """Return the change of a way (3,) with a turn about the level x and y axes, m/rad, (3, 2)."""
+    """Return the Jacobian (3, 2), m/rad, of a vector (3,) by rotation about level x and y."""
     x, y, z = way_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
-def transition(dt_s: float) -> Array:
+def transition_matrix(dt_s: float) -> Array:
     """Return the state transition matrix F (8, 8) of the paper's equation 1, over `dt_s`."""
     return _STILL + dt_s * _MOVES
 
@@ -140,7 +140,7 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
     # Of a value and its rate, which follow each other in the state.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
-    if noise.wanders:
+    if noise.is_drifting:
         Q[MEASURED, MEASURED] += _WANDER * dt_s
     return Q
 
@@ -182,8 +182,8 @@ def step_track(
 
     Args:
         track: the track so far, None before the first sight.
-        measured: None where nothing was seen. A measurement that is not finite counts as
-            nothing seen.
+        measured: None, or not finite, where nothing was seen.
+        t_s: the frame's time.
 
     Returns None when there is nothing (left) to track: never seen, or unseen for more
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
@@ -206,7 +206,7 @@ def step_track(
         x = track.x.copy()
         x[RATES] *= setup.alpha  # equation 3
         return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
-    F, Q = transition(dt_s), process_noise(dt_s, track.x[POSITION], setup)
+    F, Q = transition_matrix(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
     x, P, gain = _updated(x, P, measured.z, setup.R if measured.R is None else measured.R)
     bias = F.dot(track.bias)
@@ -233,13 +233,13 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
 ) -> MarkerTrack:
-    """Return the track later, without a measurement; without `spread` its covariance stays."""
+    """Return the track predicted to `t_s`; its covariance is predicted only with `spread`."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
     if spread:
         return _moved(track, track.x, dt_s, t_s, track.unseen, setup)
-    x = transition(dt_s).dot(_drifting(track.x, setup))
+    x = transition_matrix(dt_s).dot(_drifting(track.x, setup))
     x[YAW] = wrap_rad(float(x[YAW]))
     return replace(track, t_s=t_s, x=x)
 
@@ -259,7 +259,7 @@ def _moved(
 ) -> MarkerTrack:
     """The track at `t_s`, its state being x, without a measurement."""
     x = _drifting(x, setup)
-    F = transition(dt_s)
+    F = transition_matrix(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
     x[YAW] = wrap_rad(float(x[YAW]))
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=unseen, bias=F @ track.bias)

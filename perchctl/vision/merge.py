@@ -34,7 +34,8 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """Target in the tracks' frame: (x, y, z, yaw), velocity, covariances; bias (3, 4) of place."""
+    """The target in the tracks' frame: `vector` (x, y, z, yaw), velocity, covariances; `bias_m`
+    (3, 4) of the position."""
 
     vector: Array
     velocity_mps: Array
@@ -55,8 +56,8 @@ def measure_markers(
 ) -> MeasuredMarkers:
     """Solve the poses of what a frame shows, and choose the tracks that they feed.
 
-    `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,)
-    the target's normal at that last pose, in the camera's axes of then.
+    `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,) is
+    the target's normal in the last pose, in the camera's axes at that time.
     """
     seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
     joint = None
@@ -99,8 +100,8 @@ def measure_markers(
 def merge_tracks(
     tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
 ) -> MergedTarget | None:
-    """Return the target by the tracks that this frame `fed`, or else by those unseen for the
-    shortest time, merged by W (equations 5, 8, 12); None without a track."""
+    """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
+    `fed` update, or else from those measured last; None if none."""
     if not tracks:
         return None
     least = min(track.unseen for track in tracks.values())
@@ -184,7 +185,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 # --- Merging the two markers into the one pose of the target (paper, section II-A.2) ---
 
 
-def stage_of(large: bool, small: bool) -> Stage:
+def detected_stage(large: bool, small: bool) -> Stage:
     """Return the stage that follows from which markers were detected."""
     if large:
         return Stage.BOTH if small else Stage.LARGE

@@ -22,7 +22,7 @@ from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
-from perchctl.vision.merge import MergedTarget, measure_markers, merge_tracks, stage_of
+from perchctl.vision.merge import MergedTarget, detected_stage, measure_markers, merge_tracks
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
@@ -84,7 +84,7 @@ def make_pipeline(
         mask = read_mask(profile.camera.mask, camera.size_px) if covered is None else covered
         mask = mask[:, ::-1] if profile.camera.mirrored else mask
     detector = make_aruco_detector(profile.detector, profile.target, mask)
-    if detector.by_lines:
+    if detector.fits_lines:
         prepare_cut_markers(detector.patterns, camera)
     target = profile.target
     own = OwnTargetPlace(profile.planner.approach_xy_m)  # where the vehicle is sent to look for it
@@ -98,8 +98,8 @@ def make_pipeline(
             level=make_filter(profile.kalman, in_world=False),
             world=make_filter(profile.kalman, in_world=True),
             pose=pose,
-            gate=profile.kalman.gate,
-            own=own,
+            has_gate=profile.kalman.gate,
+            own_place=own,
         ),
         kalman=profile.kalman,
         camera=camera,
@@ -107,8 +107,8 @@ def make_pipeline(
 
 
 def camera_profile(profile: Profile) -> Profile:
-    """Return the profile with the camera in the place of vehicle and gear, and with each marker's
-    pose: for the target's pose in the camera frame, without a vehicle."""
+    """Return the profile for tracking by a camera alone: without mounting and gear, so that poses
+    are in the camera frame, and with a pose of each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
         update={
@@ -122,7 +122,8 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
-    """Return memory and a frame's pictures, each for its own `step`: one, or two fields by time."""
+    """Return the new state, and the pictures of a frame, each for its own `step`: one, or the two
+    fields of an interlaced camera in time order."""
     fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
@@ -139,9 +140,9 @@ def step(
     frame = classify_fields(frame)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is searched by all means.
-    first = state.last is None and state.stranger is None and state.empty_frames == 0
+    first = state.last is None and state.rival is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
-    own = partial(marker_offset_m, pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
+    own = partial(marker_offset_m, pipeline.tracks.own_place, frame.t_s, attitude, pipeline.pose)
     detections = detect_markers(
         frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
     )
@@ -156,7 +157,7 @@ def step_detections(
     near: PoseCandidate | None = None,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Do what `step` does from the corners on; `near` is the pose that is expected."""
+    """Run the part of `step` after detection; `near` is the expected pose of the target."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
     measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
@@ -165,18 +166,18 @@ def step_detections(
     followed = update_tracks(state, measured, t_s, attitude, in_world, pipeline.tracks)
     measured, verdict = followed.measured, followed.verdict
 
-    stage = stage_of(detections.large is not None, detections.small is not None)
+    stage = detected_stage(detections.large is not None, detections.small is not None)
     anything = stage is not Stage.NONE
     disagreeing = state.disagreeing_frames
-    if stage is Stage.BOTH and verdict.taken:
+    if stage is Stage.BOTH and verdict.accepted:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
     surest = measured.surest
-    sees = surest is not None and verdict.taken
+    sees = surest is not None and verdict.accepted
     if surest is not None and sees:
         sighting = update_sighting(sighting, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     last = state.last
-    if anything and verdict.taken:
+    if anything and verdict.accepted:
         last = detections
     elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S:
         last = None
@@ -190,7 +191,7 @@ def step_detections(
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
         lock=followed.lock,
-        stranger=followed.stranger,
+        rival=followed.rival,
         fields=state.fields,
     )
     output = PipelineOutput(
@@ -201,7 +202,7 @@ def step_detections(
         disagreeing_frames=disagreeing,
         lock_note=verdict.text or (SEVERAL if detections.targets > 1 else ""),
         fields=fields,
-        refused=verdict.refused,
+        refused=verdict.is_foreign_target,
     )
     return new, output
 

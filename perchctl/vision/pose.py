@@ -49,8 +49,8 @@ class PoseSetup:
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
-    def lift(self) -> dict[_Source, Array]:
-        """Distances, m, by which a curled sheet lifts these corners out of its plane."""
+    def curl_lift_m(self) -> dict[_Source, Array]:
+        """Distances, m, of the corners of `corners_m` from the plane of a curled sheet."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
@@ -85,7 +85,7 @@ def estimate_pose(
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not finite(image_px):
         return None  # the lens cannot have imaged them
-    K, lift = setup.camera.K, setup.lift[source]
+    K, lift = setup.camera.K, setup.curl_lift_m[source]
     points = weigh_corners(detections, setup.corners_m[source], image_px, K, lift)
     R_level_body = level_rotation(attitude)
     if attitude is not None:
@@ -94,7 +94,7 @@ def estimate_pose(
     else:
         prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
     most_px = setup.config.max_reprojection_px
-    solution = _continued(points, start, prior, most_px) or solve(points, prior)
+    solution = _continued(points, start, prior, most_px) or solve_pose(points, prior)
     if solution is None or not solution.rms_px <= most_px:
         return None
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
@@ -114,8 +114,8 @@ def estimate_pose(
 def _continued(
     points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> ScoredPose | None:
-    """The solution next to a start, if it leaves `most_px` RMS or less."""
-    solution = None if start is None else gauss_newton(points, start)
+    """Return the solution next to a start, if it leaves `most_px` RMS or less."""
+    solution = None if start is None else refine_pose(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
     return solution
@@ -133,7 +133,7 @@ def _level_pose(
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
-    cov, chi2, curl = covariance(points, solution)
+    cov, chi2, curl = pose_covariance(points, solution)
     e_m = R_level_body.dot(R_body_cam.dot(solution.tvec) + t_body_cam_m - setup.gear_body_m)
     heading = R_level_cam.dot(R).dot(R_MARKER_TARGET)
     G = np.zeros((4, 6))  # change of (e, e_yaw) with (rvec, tvec)
@@ -222,7 +222,7 @@ class ScoredPose(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """The marker's normal (3,) as far as it is known, camera axes."""
+    """Expected normal (3,) of the marker, camera axes, and its tolerance."""
 
     normal_cam: Array | None
     spread_rad: float
@@ -235,8 +235,8 @@ class TiltPrior:
         )
 
 
-def solve(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
-    """Return the better of both tilts, in front of the camera."""
+def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
+    """Return the better of the two possible tilts of a planar marker."""
     candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
@@ -245,11 +245,12 @@ def solve(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     if prior.normal_cam is None or prior.contradicts(best):
         best = _likeliest([best, *_other_tilt(best, points)], points, prior)
     # The unweighted optimum is near enough for errors to be linear.
-    return gauss_newton(points, best) or best
+    return refine_pose(points, best) or best
 
 
-def gauss_newton(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine a pose with each corner's own spread, from a near start; None where that fails."""
+def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
+    """Refine a nearby pose by Gauss-Newton, each corner weighted by its spread; None if that
+    fails."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -288,8 +289,8 @@ def gauss_newton(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | 
     return None
 
 
-def covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
-    """Return the pose's covariance, its fit and its change by a curl of the sheet.
+def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
+    """Return the pose's covariance, its chi2 and the effect of the sheet's curl.
 
     These are the covariance (6, 6) of (rvec, tvec), the squared error per degree of freedom, and
     the change (6,) by one standard deviation of the curl. In the covariance are the corners'
@@ -321,7 +322,7 @@ def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return what each kind of curl does to the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
-    moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.lift
+    moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.curl_lift_m
     return np.asarray(points.whitening.dot(moved))
 
 
@@ -402,8 +403,9 @@ def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPri
 
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
-    """Return how far corners (n, 3) leave the sheet's plane at one sigma of each curl, (2n, 2) m,
-    for x and y of each: the whole rim to one side, or two corners to either."""
+    """Return the distances of corners (n, 3) from the sheet's plane, at one standard deviation of
+    each kind of curl: the whole rim to one side, or two corners to either.
+    (2n, 2) m, for x and y of each corner."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
@@ -436,11 +438,11 @@ _SIDES = 8 * _ROWS + _COLUMNS  # in an (8, 8) matrix
 
 @dataclass(frozen=True, eq=False)
 class WeightedCorners:
-    """object_m (n, 3) and image_px (n, 2) of a pinhole K; sigma_px (n,); whitening
-    (2n, 2n) makes errors independent and of unit spread; shift (2n, k): one standard deviation
-    each of what moves corners together, whitened: the shift that all edges share, the
-    detections' `common_px`, and what shakes the rows of each; lift (2n, 2) of a sheet that
-    curls, and whether corners are weighed by it."""
+    """Corners object_m (n, 3) on the target and image_px (n, 2) of a pinhole K, with spreads
+    sigma_px (n,). whitening (2n, 2n) makes errors independent and of unit spread; shift (2n, k)
+    holds one whitened standard deviation of each common error: the shift of all edges, the
+    detections' `common_px`, and the shake of each one's rows; `curl_lift_m` (2n, 2) is of
+    `curl_lift`, and `curled` tells whether it weighs the corners."""
 
     object_m: Array
     image_px: Array
@@ -448,7 +450,7 @@ class WeightedCorners:
     whitening: Array
     shift: Array
     K: Array
-    lift: Array
+    curl_lift_m: Array
     curled: bool = False
 
 
@@ -459,7 +461,7 @@ def weigh_corners(
     K: Array,
     lift: Array,
 ) -> WeightedCorners:
-    """Return the detections' corners with what each is worth."""
+    """Return the corners of one or both detections with their weights."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)

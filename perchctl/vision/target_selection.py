@@ -23,13 +23,14 @@ _SIGMA_PX = 1.0  # of corners as a search finds them
 
 @dataclass(frozen=True)
 class OwnTargetPlace:
-    """The own target's place in the estimate's world, if known; one beyond `within_m` is not it."""
+    """Place of the vehicle's own target in the world of the state estimate, None if unknown. A
+    target farther than `within_m` from there is another vehicle's."""
 
     xy_m: tuple[float, float] | None = None
     within_m: float = math.inf
 
 
-AsideOf = Callable[[MarkerName, Array], float]
+OwnOffset = Callable[[MarkerName, Array], float]
 """How far a marker with corners (4, 2) px is from the own target's place, or inf."""
 
 
@@ -45,7 +46,7 @@ def marker_offset_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return what `AsideOf` does, in a picture taken at `attitude`."""
+    """Return a marker's distance from the own target's place: an `OwnOffset`."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
@@ -56,7 +57,7 @@ def marker_offset_m(
 def target_offset_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """Return how far a target is from the own one's place."""
+    """Return the distance of a target from the own target's place."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -66,7 +67,7 @@ def target_offset_m(
 def refusal_text(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Return one sentence where the target is another vehicle's."""
+    """Return why a pose is another vehicle's target; None if it is the own."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = target_offset_m(pose, attitude, place, setup)
@@ -89,7 +90,8 @@ _YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 def to_world(
     e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Convert place (3,) and heading from gear and level frame to the estimate's world."""
+    """Return position (3,) and heading of a target in the world of the state estimate, from those
+    relative to the gear in the level frame."""
     way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -98,20 +100,21 @@ def to_world(
 def to_level(
     position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Convert place (3,) and heading from the estimate's world to gear and level frame."""
+    """Return position (3,) and heading of a target relative to the gear in the level frame, from
+    those in the world; the inverse of `to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
 
 
-def measurement(
+def track_measurement(
     pose: MarkerPose,
     attitude: Attitude | None,
     in_world: bool,
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """Return what a pose measures of a track."""
+    """Return a pose as a measurement for the filter."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:

@@ -23,7 +23,7 @@ from perchctl.vision.filter import (
 from perchctl.vision.lens import project
 from perchctl.vision.markers.cut import make_lattice
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import OwnTargetPlace, measurement, refusal_text
+from perchctl.vision.target_selection import OwnTargetPlace, refusal_text, track_measurement
 from perchctl.vision.types import (
     Attitude,
     Lock,
@@ -32,20 +32,21 @@ from perchctl.vision.types import (
     MarkerTrack,
     MeasuredMarkers,
     PipelineState,
+    RivalTrack,
     Sighting,
-    Stranger,
 )
 
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in either frame, whether poses are gated, and the own place."""
+    """The filters' constants in either frame, whether there is a gate, and the place of the
+    vehicle's own target."""
 
     level: FilterSetup
     world: FilterSetup
     pose: PoseSetup
-    gate: bool
-    own: OwnTargetPlace
+    has_gate: bool
+    own_place: OwnTargetPlace
 
     def constants(self, in_world: bool) -> FilterSetup:
         """Return the filters' constants in the tracks' frame."""
@@ -54,13 +55,13 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks one frame on; `measured` feeds nothing if the verdict did not take its pose."""
+    """The tracks after a frame; `measured.fed` is empty if the verdict rejects the pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
     verdict: GateVerdict
     lock: Lock | None = None
-    stranger: Stranger | None = None
+    rival: RivalTrack | None = None
 
 
 def update_tracks(
@@ -71,50 +72,51 @@ def update_tracks(
     in_world: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Return the tracks one frame on, fed with what the gate lets through."""
+    """Return the tracks after a frame, updated with the poses that the gate accepts."""
     constants = setup.constants(in_world)
     fed = {
-        name: measurement(pose, attitude, in_world, constants, setup.pose)
+        name: track_measurement(pose, attitude, in_world, constants, setup.pose)
         for name, pose in measured.fed.items()
     }
     old = state.tracks if state.in_world == in_world else {}
-    sight, verdict = None, GateVerdict(taken=True, stranger=state.stranger)
+    sight, verdict = None, GateVerdict(accepted=True, rival=state.rival)
     pose = measured.surest
     if fed and pose is not None:
         name = next(n for n, each in measured.fed.items() if each is pose)
         whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
         sight = FramePose(t_s, pose, fed[name], in_world, whole)
-        if state.stranger is not None and state.lock is not None and attitude is not None:
+        if state.rival is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
-            sight = replace(sight, looks_there=looks)
-        if setup.gate:
-            verdict = judged(state.lock, state.stranger, sight, constants)
+            sight = replace(sight, lock_in_view=looks)
+        if setup.has_gate:
+            verdict = judge_pose(state.lock, state.rival, sight, constants)
         # What was locked on goes on, however far the estimate's world has drifted meanwhile.
-        goes_on = not verdict.afresh or verdict.same
+        goes_on = not verdict.restarts or verdict.same_target
         goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
-        another = None if goes_on else refusal_text(pose, attitude, setup.own, setup.pose)
-        if another is not None and verdict.taken:
-            verdict = GateVerdict(False, stranger=state.stranger, text=another, refused=True)
-    if not verdict.taken:
+        another = None if goes_on else refusal_text(pose, attitude, setup.own_place, setup.pose)
+        if another is not None and verdict.accepted:
+            verdict = GateVerdict(False, rival=state.rival, text=another, is_foreign_target=True)
+    if not verdict.accepted:
         measured, fed = replace(measured, fed={}), {}
-    begun = {} if verdict.afresh else old
+    begun = {} if verdict.restarts else old
     stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in {**begun, **fed}}
     tracks = {n: track for n, track in stepped.items() if track is not None}
-    if not setup.gate:
+    if not setup.has_gate:
         return TrackedFrame(measured, tracks, verdict)
-    lock, stranger = drop_expired(state.lock, verdict.stranger, t_s)
-    if sight is not None and verdict.taken and tracks:
+    lock, rival = drop_expired(state.lock, verdict.rival, t_s)
+    if sight is not None and verdict.accepted and tracks:
         surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
-        lock = locked(lock, surest, sight, verdict)
-    return TrackedFrame(measured, tracks, verdict, lock, stranger)
+        lock = update_lock(lock, surest, sight, verdict)
+    return TrackedFrame(measured, tracks, verdict, lock, rival)
 
 
 # --- Whether a pose is the target's that was locked on ----------------
-# A picture does not tell another target or marker size from the target, but the target does not
-# jump: a pose off the lock by more than noise, motion and drift is a stranger's and feeds nothing.
+# Another target, or a marker of another size, cannot be told from the target in a picture, but the
+# target does not jump. A pose that contradicts the lock by more than noise, motion and drift
+# explain is a rival's and feeds no filter.
 #
-# The lock goes over to a stranger that rests on both markers: at once if the lock never did, or, if
+# The lock goes over to a rival that rests on both markers: at once if the lock never did, or, if
 # it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
 # picture; and to any that was seen more often than a lock that is hardly begun.
 #
@@ -125,7 +127,7 @@ def update_tracks(
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 FORGET_S = 10.0
 ESTABLISHED_FRAMES = 5
-"""A lock of fewer frames gives way to a stranger that was seen more often."""
+"""A lock of fewer frames gives way to a rival that was seen more often."""
 
 _JUMPED = "the state estimate jumped, the target did not"
 _GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
@@ -142,83 +144,87 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A measured pose; `whole`: of both markers; `looks_there`: the lock's place is in view."""
+    """A frame's pose as a measurement, whether it rests on both markers, and whether the locked
+    target's place is in the picture."""
 
     t_s: float
     pose: MarkerPose
     measured: Measurement
     in_world: bool
-    whole: bool
-    looks_there: bool = True
+    has_both: bool
+    lock_in_view: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
-    """The gate's decision. `taken`: the pose is the target's; `afresh`: the tracks restart there,
-    maybe for the `same` target; others go to `stranger`; `text` explains the unusual."""
+    """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
+    restart there, and if so for the same target. A rejected pose goes to `rival`; `text`
+    explains what is unusual."""
 
-    taken: bool
-    afresh: bool = False
-    same: bool = False
-    stranger: Stranger | None = None
+    accepted: bool
+    restarts: bool = False
+    same_target: bool = False
+    rival: RivalTrack | None = None
     text: str = ""
-    refused: bool = False  # another vehicle's, by its place
+    is_foreign_target: bool = False  # another vehicle's, by its place
 
 
-def judged(
-    lock: Lock | None, stranger: Stranger | None, sight: FramePose, constants: FilterSetup
+def judge_pose(
+    lock: Lock | None, rival: RivalTrack | None, sight: FramePose, constants: FilterSetup
 ) -> GateVerdict:
-    """Return the verdict on a frame's pose."""
-    lock, stranger = drop_expired(lock, stranger, sight.t_s)
-    if stranger is not None and stranger.in_world != sight.in_world:
-        stranger = None
+    """Return the gate's verdict on a frame's pose."""
+    lock, rival = drop_expired(lock, rival, sight.t_s)
+    if rival is not None and rival.in_world != sight.in_world:
+        rival = None
     if lock is None or lock.in_world != sight.in_world:
-        return GateVerdict(taken=True)
+        return GateVerdict(accepted=True)
     if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
-        return GateVerdict(taken=False, stranger=stranger)
-    if stranger is None and _is_clear(lock.track, sight, constants):
-        return GateVerdict(taken=True)
+        return GateVerdict(accepted=False, rival=rival)
+    if rival is None and _is_clear(lock.track, sight, constants):
+        return GateVerdict(accepted=True)
     fit = _misfit(lock.track, sight, constants)
-    other = None if stranger is None else _misfit(stranger.track, sight, constants)
+    other = None if rival is None else _misfit(rival.track, sight, constants)
     theirs = other is not None and other.squared <= _GATE
     if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
-        return GateVerdict(taken=True, stranger=stranger)
+        return GateVerdict(accepted=True, rival=rival)
     if not theirs and _goes_on(lock, sight, fit.off):
-        return GateVerdict(taken=True, afresh=True, same=True, text=_JUMPED)
-    seen = _watched(stranger if theirs else None, sight, fit, constants)
+        return GateVerdict(accepted=True, restarts=True, same_target=True, text=_JUMPED)
+    seen = _watched(rival if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
         text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
-        return GateVerdict(taken=True, afresh=True, text=text)
-    return GateVerdict(taken=False, stranger=seen, text=f"not the tracked target: {seen.text}")
+        return GateVerdict(accepted=True, restarts=True, text=text)
+    return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
 
 def drop_expired(
-    lock: Lock | None, stranger: Stranger | None, t_s: float
-) -> tuple[Lock | None, Stranger | None]:
-    """Return what of a lock and a stranger still counts at `t_s`."""
-    if stranger is not None and not 0.0 <= t_s - stranger.track.t_s <= MAX_TRACK_GAP_S:
-        stranger = None
+    lock: Lock | None, rival: RivalTrack | None, t_s: float
+) -> tuple[Lock | None, RivalTrack | None]:
+    """Return the lock and the rival, None for each that has expired at `t_s`."""
+    if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
+        rival = None
     if lock is None:
         return None, None
     age_s = t_s - lock.track.t_s
-    # A place in the level frame means nothing for long, but a stranger stays a stranger.
-    lasting = lock.in_world or stranger is not None
+    # A place in the level frame means nothing for long, but a rival stays a rival.
+    lasting = lock.in_world or rival is not None
     # A clock that was set back: nothing that is older than it will be confirmed.
     if age_s < -MAX_TRACK_GAP_S or age_s > (FORGET_S if lasting else MAX_TRACK_GAP_S):
         return None, None
-    return lock, stranger
+    return lock, rival
 
 
-def locked(lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict) -> Lock:
-    """Return the lock after a pose that was taken; `track` is what it fed."""
-    anew = verdict.afresh and not verdict.same
+def update_lock(
+    lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
+) -> Lock:
+    """Return the lock after an accepted pose, with the track that the pose updated."""
+    anew = verdict.restarts and not verdict.same_target
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
         track=track,
         pose=sight.pose,
         in_world=sight.in_world,
         frames=1 if before is None else before.frames + 1,
-        whole=sight.whole or (before is not None and before.whole),
+        has_both=sight.has_both or (before is not None and before.has_both),
     )
 
 
@@ -296,51 +302,51 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     return calm and seen < _EXPLAINED * jumped
 
 
-# --- strangers --------------------------------------------------------
+# --- rivals -----------------------------------------------------------
 
 
 def _watched(
-    before: Stranger | None, sight: FramePose, fit: _Fit, constants: FilterSetup
-) -> Stranger:
-    """The stranger with one more pose, or a new one."""
+    before: RivalTrack | None, sight: FramePose, fit: _Fit, constants: FilterSetup
+) -> RivalTrack:
+    """Return the rival with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
-        whole = before.whole + int(sight.whole)
-        return replace(before, track=track, frames=before.frames + 1, whole=whole)
+        whole = before.whole_frames + int(sight.has_both)
+        return replace(before, track=track, frames=before.frames + 1, whole_frames=whole)
     turned_rad, farther_m = abs(float(fit.off[0])), float(fit.off[3])
-    another_range = farther_m**2 > _SAME_RANGE**2 * float(fit.S[3, 3])
+    range_differs = farther_m**2 > _SAME_RANGE**2 * float(fit.S[3, 3])
     where = f"{fit.away_m:.2f} m away from it"
     if turned_rad > _TURNED_RAD:
         where += f" and turned by {math.degrees(turned_rad):.0f} deg"
-    if another_range:
+    if range_differs:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or of another size"
-    return Stranger(
+    return RivalTrack(
         track=start_track(sight.measured, sight.t_s, constants),
         in_world=sight.in_world,
         since_s=sight.t_s,
         frames=1,
-        whole=int(sight.whole),
-        another_range=another_range,
+        whole_frames=int(sight.has_both),
+        range_differs=range_differs,
         text=where,
     )
 
 
-def _believed(lock: Lock, stranger: Stranger, sight: FramePose) -> bool:
-    """True if the target is where the stranger is now."""
-    if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
+def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
+    """Return True if the target is where the rival is now."""
+    if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
         return True
-    if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
+    if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both:
         return False
-    if not lock.whole:
+    if not lock.has_both:
         return True
-    unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
+    unseen_s = sight.t_s - max(rival.since_s, lock.track.t_s)
     # What is not looked at is not empty.
     return (
-        (sight.looks_there or unseen_s >= 2.0 * REACQUIRE_S)
-        and not stranger.another_range
-        and stranger.whole >= REACQUIRE_FRAMES
+        (sight.lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
+        and not rival.range_differs
+        and rival.whole_frames >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
     )
 
@@ -364,7 +370,7 @@ def expected_corners(
     if attitude is None or then is None:
         return None, PoseCandidate(pose.rvec_rad, pose.tvec_m)
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
-    by_place, by_speed = sight.off_rad2
+    by_place, by_speed = sight.error_rad2
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
     stepped_m, flown_m = _camera_motions_m(then, attitude, setup)
     moved_m = stepped_m + share * (flown_m - stepped_m)
@@ -383,12 +389,12 @@ def expected_corners(
 def update_sighting(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
-    """Return the new sighting, with what it shows of the estimate's motion."""
+    """Return the new sighting, with the updated errors of the estimated motion."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
     if attitude is None or then is None or not 0.0 < passed_s <= MAX_TRACK_GAP_S:
-        return Sighting(pose, attitude, before.off_rad2)
+        return Sighting(pose, attitude, before.error_rad2)
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the view: along it a far target's own distance is vague.
@@ -398,7 +404,7 @@ def update_sighting(
     ]
     by_place, by_speed = (
         old + _FORGOTTEN * (float(new.dot(new)) - old)
-        for old, new in zip(before.off_rad2, off, strict=True)
+        for old, new in zip(before.error_rad2, off, strict=True)
     )
     return Sighting(pose, attitude, (by_place, by_speed))
 

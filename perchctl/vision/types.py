@@ -18,7 +18,7 @@ MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
 
 
 class Stage(Enum):
-    """What is seen of the target (paper, section II-A.2)."""
+    """Which markers of the target are seen (paper, section II-A.2)."""
 
     NONE = "none"
     LARGE = "large"  # stage 1, equation 5
@@ -44,7 +44,7 @@ class CameraModel:
 
     @property
     def contents(self) -> tuple[tuple[int, int], str, bytes, bytes]:
-        """A value that is the same for two cameras whose numbers are the same."""
+        """A hashable value, equal for cameras with the same calibration."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
 
@@ -54,11 +54,12 @@ class Frame:
     """One picture. `t_s` is the time of exposure on the loop's clock, as far as
     known: time of arrival less the profile's `camera.latency_s`.
 
-    `image` is grey, uint8, shape (height, width). `fields`: ``whole`` of one moment; ``woven`` of
-    two fields; the ``top`` or ``bottom`` field of such a one at full height; None: not examined
-    (`perchctl.vision.fields`). `repeated`: the picture before once more, no measurement.
-    `encoded`: the JPEG that came, where `cv2.imdecode(..., IMREAD_GRAYSCALE)` of it is `image` to
-    the bit; who changes the image leaves it out.
+    `image` is grey, uint8, shape (height, width). `fields` says whether it is a picture of one
+    moment: ``whole``; ``woven`` of two fields; the ``top`` or ``bottom`` field of such a one
+    at full height; None: not classified yet (`perchctl.vision.fields`). `repeated`: the
+    source gave the previous picture again, which is no measurement. `encoded`: the
+    JPEG that came, where `cv2.imdecode(..., IMREAD_GRAYSCALE)` of it is `image` to the bit; who
+    changes the image leaves it out.
     """
 
     index: int
@@ -94,8 +95,8 @@ class Detection:
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """By how many pixels white had grown over black in a picture, the spread of that
-    estimate, and how many pictures ago it was made."""
+    """Growth of white over black at the edges of a picture, px, its standard deviation, and
+    how many pictures ago it was measured."""
 
     shift_px: float
     sigma_px: float
@@ -132,7 +133,7 @@ class Attitude:
     """The vehicle's attitude (and position) at a frame's time, world axes.
 
     Signs as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is None
-    where nothing tells it.
+    if unknown.
     """
 
     t_s: float
@@ -216,8 +217,8 @@ class MarkerTrack:
 
 @dataclass(frozen=True, eq=False)
 class TargetEstimate:
-    """Where the target is at `t_s`: the paper's e = (e_x, e_y, e_z, e_psi), its spread, and
-    what it rests on. The one error that steers, is logged and is shown.
+    """Where the target is at `t_s`: the paper's e = (e_x, e_y, e_z, e_psi), and its
+    spread.
 
     Attributes:
         t_s: the time it holds for; of the frame, or later by prediction.
@@ -258,45 +259,46 @@ class TargetEstimate:
 class Sighting:
     """A pose of the target and the vehicle's attitude at that time, if it was known.
 
-    `off_rad2`: recent mean squares, seen from the camera, of what the vehicle's own account of its
-    way was off: of its places' steps and of its speeds times the time.
+    `error_rad2` holds recent mean square errors of the vehicle's estimated motion, as angles seen
+    from the camera: of its position differences, and of its velocity times the time.
     """
 
     pose: MarkerPose
     attitude: Attitude | None
-    off_rad2: tuple[float, float] = (0.0, 0.0)
+    error_rad2: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Lock:
-    """The target that the pipeline holds on to: its track, in the world or not, as the last of so
-    many `frames` with a pose left it; `whole` if one of them rested on both markers."""
+    """The target that the pipeline is locked on: its track after the last pose, in the world or
+    the level frame, the number of `frames` with a pose, and whether one had both markers."""
 
     track: MarkerTrack
     pose: MarkerPose
     in_world: bool
     frames: int
-    whole: bool
+    has_both: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Stranger:
-    """What looks like the target, but is not where the target can be (`text`): since when, in how
-    many frames and in how many with both markers; and whether it is nearer or farther, too."""
+class RivalTrack:
+    """A track of something that looks like the target, but at a place where the target cannot be
+    (`text`): its first time, its frames, those with both markers, and whether its range differs
+    from the target's."""
 
     track: MarkerTrack
     in_world: bool
     since_s: float
     frames: int
-    whole: int
-    another_range: bool
+    whole_frames: int
+    range_differs: bool
     text: str
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """What one frame's corners gave: poses by ``joint``, ``large``, ``small``, in this order; the
-    track that each which counts goes into; and whether the two markers exclude each other."""
+    """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order; `fed`, by
+    the track's name, those that update a track; and whether the two markers contradict."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     fed: dict[str, MarkerPose] = field(default_factory=dict)
@@ -304,15 +306,16 @@ class MeasuredMarkers:
 
     @property
     def surest(self) -> MarkerPose | None:
-        """The surest of the poses that are fed, or else of all; None without any."""
+        """The pose of least spread among those in `fed`, or else in `poses`; None without any."""
         poses = self.fed or self.poses
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """What is known of a stream's fields. `top_first` is None until the votes decide, `kind` is of
-    the last frame that was looked at, `skipped` frames ago; `previous` is the last combed one."""
+    """State of the interlacing detection of a stream. `top_first` is None until the `votes`
+    decide, `kind` is that of the last examined frame, `skipped` frames ago; `previous` is the
+    last combed picture."""
 
     kind: PictureKind | None = None
     skipped: int = 0
@@ -336,13 +339,13 @@ class PipelineState:
     disagreeing_frames: int = 0
     empty_frames: int = 0  # in a row, without either marker
     lock: Lock | None = None
-    stranger: Stranger | None = None
+    rival: RivalTrack | None = None
     fields: FieldState = FieldState()
 
 
 @dataclass(frozen=True, eq=False)
 class PipelineOutput:
-    """Everything one frame gave, for the planner and the log."""
+    """Result of one frame, for the planner and the log."""
 
     detections: Detections
     poses: dict[str, MarkerPose]
@@ -355,12 +358,13 @@ class PipelineOutput:
 
 
 @dataclass(frozen=True)
-class Consistency:
-    """What a flight shows of the camera beyond the profile, each with one standard deviation.
+class CameraErrors:
+    """Errors of the profile's camera latency and mounting as estimated in flight, each with one
+    standard deviation.
 
-    `delay_s`: by how much the pictures are later. `turn_rad`: the camera's turn about body x, y
-    and z. The attitude's constant error, which moves the target just as a mounting's roll and
-    pitch do, is in their `turn_sigma_rad`.
+    `delay_s`: latency beyond the profile's. `turn_rad`: rotation of the mounting about body x, y
+    and z. `turn_sigma_rad` includes the constant error of the attitude, which moves the target
+    just as a mounting's roll and pitch do.
     """
 
     delay_s: float

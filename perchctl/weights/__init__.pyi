@@ -1,7 +1,7 @@
 from .collect import Experiment as Experiment
-from .collect import MocapTruth as MocapTruth
+from .collect import MocapPoses as MocapPoses
 from .collect import SessionFile as SessionFile
-from .collect import TypedTruth as TypedTruth
+from .collect import TypedPoses as TypedPoses
 from .result import fit_weights as fit_weights
 from .result import report_text as report_text
 from .result import weights_record as weights_record

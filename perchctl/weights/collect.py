@@ -24,7 +24,7 @@ import numpy as np
 from perchctl.calibration import poll_frames
 from perchctl.camera import FrameSource, check_size
 from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, NotFound
-from perchctl.files import cannot_be_written
+from perchctl.files import write_error
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
 from perchctl.positioning import CaptureFrame, CaptureSource, VehiclePose
 from perchctl.profile import PositioningConfig, Profile
@@ -75,7 +75,7 @@ def read_markers(
     attitude: Attitude | None = None,
 ) -> Iterator[MarkerReading]:
     """Yield the poses in the frames of one place, relative to the gear in the level frame, by the
-    profile's pipeline as it is when it merges by weights."""
+    profile's pipeline with `merge.method` weights."""
     merge = profile.merge.model_copy(update={"method": "weights"})
     setup = make_pipeline(profile.model_copy(update={"merge": merge}), camera)
     state = PipelineState()
@@ -118,12 +118,12 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
-    """Return the lines of a position in the session's file."""
+    """Return the CSV lines of a position."""
     return "".join(csv_row(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
 class SessionFile:
-    """The file of a session. Raises InvalidValue for a file that is something else.
+    """The CSV file of a session. Raises InvalidValue for any other file.
 
     Attributes:
         note: a sentence, if an unfinished end was taken off.
@@ -141,7 +141,7 @@ class SessionFile:
             self._write(HEADER + "\n", "w")
 
     def append(self, rows: str) -> None:
-        """Append one whole position, and bring it to the disk."""
+        """Append the rows of a whole position, and flush them to the disk."""
         self._write(rows, "a")
         self.done += 1
         self.next_position += 1
@@ -154,7 +154,7 @@ class SessionFile:
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise cannot_be_written(self.path, error) from None
+            raise write_error(self.path, error) from None
 
     def _continue(self, frames: int) -> None:
         try:
@@ -187,10 +187,10 @@ ActualPose = tuple[Array, Attitude | None]
 """The actual pose (4,), and the attitude of the vehicle, None where it stands level."""
 
 
-class TypedTruth:
-    """A person with a ruler: centimetres and degrees, as in the paper's tables."""
+class TypedPoses:
+    """Actual poses, measured and typed by a person, in centimetres and degrees."""
 
-    def actual(self, ask: Ask) -> ActualPose:
+    def actual_pose(self, ask: Ask) -> ActualPose:
         """Ask the person for the pose. Raises InvalidValue for an answer that is no pose."""
         text = ask("actual pose of the target from the gear, x y z [cm] and yaw [deg]: ")
         try:
@@ -207,8 +207,8 @@ class TypedTruth:
         """Do nothing: a person needs no closing."""
 
 
-class MocapTruth:
-    """Motion capture, by the reader that flights have.
+class MocapPoses:
+    """Actual poses from motion capture, read as in flights.
 
     Args:
         config: names the capture and the vehicle's rigid body, and how that lies in body axes.
@@ -227,7 +227,7 @@ class MocapTruth:
         self._capture, self._config, self._target = capture, config, target
         self._gear, self._now, self._wait = gear_body_m, now, wait
 
-    def actual(self, ask: Ask) -> ActualPose:
+    def actual_pose(self, ask: Ask) -> ActualPose:
         """Return the median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
         self._capture.poll(self._now())  # an older one does not count
         frames: list[CaptureFrame] = []
@@ -280,7 +280,7 @@ class Experiment:
     source: FrameSource
     profile: Profile
     camera: CameraModel
-    truth: TypedTruth | MocapTruth
+    truth: TypedPoses | MocapPoses
     ask: Ask
     say: Callable[[str], None]
     bar: Bar
@@ -305,7 +305,7 @@ class Experiment:
     def _try_position(self, number: int, frames: int) -> str | None:
         """Take one position into the file; return a sentence if it must be taken again."""
         try:
-            actual, attitude = self.truth.actual(self._answer)
+            actual, attitude = self.truth.actual_pose(self._answer)
         except InvalidValue as error:
             return str(error)
         self._answer("hold still and press Enter (q stops): ")

@@ -113,14 +113,14 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
     return use
 
 
-def t_quantile(freedom: int) -> float:
-    """Return the two-sided 95 % quantile of Student's t; inf without a degree of freedom."""
-    return float(stdtrit(freedom, 0.975)) if freedom >= 1 else math.inf
+def t_quantile(degrees: int) -> float:
+    """Return Student's two-sided 95 % quantile at `degrees` of freedom; inf for none."""
+    return float(stdtrit(degrees, 0.975)) if degrees >= 1 else math.inf
 
 
-def closed_form(sums: Array) -> Array:
-    """Return the weights of least squared merged error about its mean, (..., 4); NaN where any
-    weight fits. `sums` is (6, ..., 4), as `Errors.sums`."""
+def closed_form_weights(sums: Array) -> Array:
+    """Return the weights (..., 4) with the least variance of the merged error; NaN where all
+    weights fit alike. `sums` is (6, ..., 4), as `Errors.sums`."""
     a, b, aa, bb, ab = sums[1:] / np.maximum(sums[0], 1.0)
     var_a, var_b, cov = aa - a * a, bb - b * b, ab - a * b
     below = var_a + var_b - 2.0 * cov
@@ -142,12 +142,11 @@ MOST_ROWS = 100_000
 _STREAM = (0, 601)
 
 
-def lms(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
-    """Return the weights that LMS ends at, (4,), not clipped, and those that it ends at without
-    each position in turn, (g, 4).
+def lms_weights(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
+    """Return the final weights of LMS, (4,), not clipped, and those with each position left out
+    in turn, (g, 4).
 
-    It begins at the weight `start` and takes the rows in a shuffled order, the mean errors taken
-    off; the rows of a position do not move the weights that are without it.
+    LMS begins at the weight `start` and takes the rows, less the mean errors, in a shuffled order.
     """
     power, pull = _recursion(errors)
     g = len(errors.positions)
@@ -184,26 +183,26 @@ def _recursion(errors: Errors) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class FittedWeights:
-    """One method's weights: as fitted, clipped to [0, 1], and the half width of their 95 %
-    interval over positions (jackknife), (4,); `folds` without each position in turn, (g, 4)."""
+    """One method's weights, (4,): as fitted, clipped to [0, 1], and the half width of their 95 %
+    interval over positions (jackknife); `fold_weights` (g, 4): each position left out in turn."""
 
     raw: Array
     weights: Array
-    half: Array
-    folds: Array
+    half_width: Array
+    fold_weights: Array
 
 
 def fit_all(errors: Errors) -> dict[str, FittedWeights]:
     """Return both methods' weights by name. Raises InvalidValue where all weights fit alike."""
     total = errors.sums.sum(axis=1)
-    closed = closed_form(total)
+    closed = closed_form_weights(total)
     if np.isnan(closed).any():
         raise InvalidValue(
             f"{errors.name}: the two markers differ by nothing or by a constant in "
             f"{AXES[int(np.argmax(np.isnan(closed)))]}, so every weight fits alike; were frames "
             f"repeated, or a column copied?"
         )
-    held_out = closed_form(total[:, None] - errors.sums)
+    held_out = closed_form_weights(total[:, None] - errors.sums)
     folds = np.where(np.isfinite(held_out), held_out, closed)
     g = len(folds)
     # LMS approaches the closed form, and so its weights have the same spread over positions.
@@ -211,13 +210,16 @@ def fit_all(errors: Errors) -> dict[str, FittedWeights]:
     half = t_quantile(g - 1) * spread
     return {
         name: FittedWeights(raw, np.clip(raw, 0.0, 1.0), half, np.clip(left, 0.0, 1.0))
-        for name, (raw, left) in {"lms": lms(errors), "closed_form": (closed, folds)}.items()
+        for name, (raw, left) in {
+            "lms": lms_weights(errors),
+            "closed_form": (closed, folds),
+        }.items()
     }
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Mean square errors by weights' name, (g, 4), on positions that these were not fitted to."""
+    """Mean square errors (g, 4) of each held-out position, by the name of the set of weights."""
 
     squares: dict[str, Array]
 
@@ -237,20 +239,22 @@ class Evidence:
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
-    def gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """Return the RMS error's drop below `other` (g, 4), and its interval's half width, (4,)."""
+    def rms_gain(self, name: str, other: Array) -> tuple[Array, Array]:
+        """Return by how much the RMS error is below that of `other` (g, 4), and the half width of
+        the difference's interval, (4,)."""
         (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """Return where the gain over the better marker is above 0 in its interval, (4,)."""
-        gain, half = self.gain(name, self.better_squares)
+        """Return true where the gain over the better single marker is above zero with its whole
+        interval, (4,)."""
+        gain, half = self.rms_gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)
 
 
-def evidence(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
-    """Return the errors of the fitted weights, of the paper's and of each marker alone. `weights`
-    by the fitted methods' names: (4,), or a row a position, (g, 4)."""
+def evaluate_weights(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
+    """Return the errors of the fitted weights, the paper's, and each marker alone. `weights` by
+    method: (4,), or one row per position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums
     known = {"large": np.ones(4), "small": np.zeros(4), "paper": np.array(PAPER_WEIGHTS)}
     return Evidence(

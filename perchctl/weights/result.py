@@ -25,7 +25,7 @@ from perchctl.weights.fit import (
     Errors,
     Evidence,
     FittedWeights,
-    evidence,
+    evaluate_weights,
     fit_all,
     marker_errors,
 )
@@ -38,8 +38,9 @@ _HEAD = """\
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """A fit's findings; `chosen` names the offered method, `other_name` the data of `other`."""
+class FitResult:
+    """Result of a fit. `chosen` names the method whose weights are recommended; `other` is the
+    evidence on the test data `other_name`."""
 
     errors: Errors
     fits: dict[str, FittedWeights]
@@ -65,11 +66,11 @@ class Result:
         return np.where(self.proven, self.fits[self.chosen].weights, alone)
 
 
-def fit_weights(path: Path, chosen: str, test: Path | None = None) -> Result:
+def fit_weights(path: Path, chosen: str, test: Path | None = None) -> FitResult:
     """Read the data, fit the weights by each method, and judge them by held-out positions.
 
     Args:
-        chosen: the method that is offered, one of `FITTED`.
+        chosen: the method to recommend, one of `FITTED`.
         test: other data to judge the weights by.
 
     Errors: NotFound, InvalidValue.
@@ -81,11 +82,11 @@ def fit_weights(path: Path, chosen: str, test: Path | None = None) -> Result:
     other = None
     if test is not None:
         weights = {name: fit.weights for name, fit in fits.items()}
-        other = evidence(marker_errors(read_data(test)), weights)
-    return Result(
+        other = evaluate_weights(marker_errors(read_data(test)), weights)
+    return FitResult(
         errors=errors,
         fits=fits,
-        evidence=evidence(errors, {name: fit.folds for name, fit in fits.items()}),
+        evidence=evaluate_weights(errors, {name: fit.fold_weights for name, fit in fits.items()}),
         other=other,
         other_name="" if test is None else str(test),
         chosen=chosen,
@@ -103,8 +104,8 @@ def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
     }
 
 
-def weights_record(result: Result) -> dict[str, Any]:
-    """Return the one object of `--json`. Lengths in m, angles in rad."""
+def weights_record(result: FitResult) -> dict[str, Any]:
+    """Return the result as the JSON object of `--json`. Lengths in m, angles in rad."""
     record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),
@@ -112,7 +113,7 @@ def weights_record(result: Result) -> dict[str, Any]:
         "recommended": _by_axis(result.recommended) if any(result.proven) else None,
         "proven": dict(zip(AXES, result.proven, strict=True)),
         "better_single": dict(zip(AXES, result.better, strict=True)),
-        "half_width": {name: _by_axis(fit.half) for name, fit in result.fits.items()},
+        "half_width": {name: _by_axis(fit.half_width) for name, fit in result.fits.items()},
         "errors": _errors_record(result.evidence),
         "data": {
             "file": result.errors.name,
@@ -134,9 +135,10 @@ def _errors_record(found: Evidence) -> dict[str, Any]:
     return record
 
 
-def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> None:
-    """Write the weights file: the recommended ones, or, `anyway`, all fitted ones; and the record
-    of the fit. Errors: InvalidValue when it cannot be written; the old one then stays."""
+def write_weights(path: Path, result: FitResult, date: str, *, anyway: bool) -> None:
+    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted; and
+    the record of the fit behind them. Errors: InvalidValue when it cannot be written; the old one
+    then stays."""
     flown = result.fits[result.chosen].weights if anyway else result.recommended
     content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
@@ -151,7 +153,7 @@ _SCALES = np.array([1e6, 1e6, 1e6, 180e3 / math.pi])
 _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
 
-def report_text(result: Result) -> str:
+def report_text(result: FitResult) -> str:
     """Return the report: verdict, errors, gains and weights."""
     errors = result.errors
     left_out = int((~errors.use).any(axis=1).sum())
@@ -166,7 +168,7 @@ def report_text(result: Result) -> str:
     for found, where in judged:
         rms = {LABELS[name]: _scaled(*found.rms(name)) for name in found.squares}
         gains = {
-            LABELS[name]: _scaled(*found.gain(result.chosen, square), "+")
+            LABELS[name]: _scaled(*found.rms_gain(result.chosen, square), "+")
             for name, square in found.squares.items()
             if name not in FITTED
         }
@@ -174,7 +176,9 @@ def report_text(result: Result) -> str:
         parts.append(_table(f"RMS error {where}, 95 % interval", _HEADS, rms))
         parts.append(_table(title, _HEADS, gains))
     weights = {
-        LABELS[name]: [f"{w:.3f} +-{h:.3f}" for w, h in zip(fit.weights, fit.half, strict=True)]
+        LABELS[name]: [
+            f"{w:.3f} +-{h:.3f}" for w, h in zip(fit.weights, fit.half_width, strict=True)
+        ]
         for name, fit in result.fits.items()
     }
     weights[LABELS["paper"]] = [f"{w:.3f}{'':8}" for w in PAPER_WEIGHTS]
@@ -182,8 +186,8 @@ def report_text(result: Result) -> str:
     return "\n\n".join(parts)
 
 
-def _verdict(result: Result) -> str:
-    """The weights to fly with, and why, in a line for each axis."""
+def _verdict(result: FitResult) -> str:
+    """Return the weights to fly with, and why, in a line for each axis."""
     if not any(result.proven):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "

@@ -69,8 +69,8 @@ class SimulatedStand:
             session.append(session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> CameraPlace:
-        """Return the place of a position, counted from 1. Its distance falls into its own share of
-        z3 to z2, so that few positions cover the range. Raises InvalidValue."""
+        """Return the place of a position, counted from 1. Each position has its own part of the
+        range z3 to z2, so that few cover it. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _STREAM, position])
         share = (position - 1) % self._positions

@@ -15,7 +15,7 @@ import pytest
 from perchctl.analysis import FlightAnalysis
 from perchctl.analysis.report import (
     ReportedFlight,
-    decision_frames,
+    captions_and_records,
     read_reported_flight,
     report_html,
 )
@@ -171,9 +171,9 @@ def test_a_report_shows_the_picture_of_each_decision(tmp_path: Path) -> None:
     for record in made().records:
         if record["frame"] is not None:
             number, t_s = int(record["frame"]), float(record["frame_t_s"])
-            recorder.frame(Frame(number, t_s, grey(number), t_s + 0.05))
+            recorder.write_frame(Frame(number, t_s, grey(number), t_s + 0.05))
     recorder.close()
-    decisions = decision_frames(FlightAnalysis(read_log(path)))
+    decisions = captions_and_records(FlightAnalysis(read_log(path)))
     assert [caption.partition(",")[0] for caption, _ in decisions.values()] == [
         "found", "aligned", "settled", "contact",
     ]  # fmt: skip

@@ -92,7 +92,7 @@ def test_at_the_ceiling_nothing_is_lost() -> None:
         if record["phase"] in ("PERCH", "COMPLETE", "PERCHED"):
             record |= dict.fromkeys(("frame", "frame_t_s", "lx_m", "sx_m", "jx_m"))
 
-    seen = FlightAnalysis(made(change)).losses
+    seen = FlightAnalysis(made(change)).target_losses
     assert [round(loss.start_s, 1) for loss in seen] == [GONE_S[0]]
 
 

@@ -57,7 +57,7 @@ def test_a_calibration_s_file_holds_its_quality(tmp_path: Path) -> None:
     camera = draw_camera(rng)
     result = calibrate_camera(FoundViews(tuple(corner_views(rng, camera))), "charuco:10x7:25mm")
     path = tmp_path / "camera.yaml"
-    path.write_text(result.text("camera", "2026-01-02T03:04:05+00:00"))
+    path.write_text(result.file_text("camera", "2026-01-02T03:04:05+00:00"))
     plain = yaml.safe_load(path.read_text())
     assert (load_calibration(path).K == result.camera.K).all()
     assert plain["views_used"] == len(result.views)

@@ -82,7 +82,7 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends(shown: list[Grey]) 
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"
     assert moments[-1].rows[-1] == ("views", str(len(views)), None)
-    assert len({m.line for m in moments}) == len(views) + 1  # a pipe gets one line a view
+    assert len({m.status_line for m in moments}) == len(views) + 1  # a pipe gets one line a view
     gone = _frames(shown[:3])
     gone.trouble = "camera:0 is unplugged"
     with pytest.raises(TimedOut, match="unplugged; only 1 views"):
@@ -156,9 +156,9 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
         view = corner_view(rng, camera, CHARUCO, pose, 0.05, "v")
         capture.update(view)
         capture.update(view)
-        if capture.finished:
+        if capture.is_finished:
             break
-    assert capture.finished
+    assert capture.is_finished
     assert len(capture.taken) >= 15
     assert not capture.update(capture.taken[-1])
     fresh, blurred = GuidedCapture(CHARUCO), dataclasses.replace(view, blur_px=8.0)

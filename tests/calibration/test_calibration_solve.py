@@ -60,12 +60,12 @@ def test_photographs() -> None:
 def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
     views, camera = drawn(5, views=20, noise_px=0.05)
     right = 0.62 * camera.size_px[0]
-    cut = [v.keep(v.corners_px[:, 0] < right) for v in views]
+    cut = [v.select(v.corners_px[:, 0] < right) for v in views]
     result = calibrate_camera([v for v in cut if len(v) >= 8])
     assert max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in result.errors) < 1.0
-    assert result.level == "care"
-    assert "% of the picture is uncovered: add views with the board at the" in result.lacks[-1]
-    assert "right" in result.lacks[-1]
+    assert result.verdict == "care"
+    assert "% of the picture is uncovered: add views with the board at the" in result.defects[-1]
+    assert "right" in result.defects[-1]
 
 
 def test_the_error_lies_below_its_95_percent_line_about_as_often() -> None:
@@ -87,8 +87,8 @@ def test_errors_that_go_together_widen_the_prediction() -> None:
     rng = np.random.default_rng(0)
     bent = []
     for view in views:
-        middle = view.object_m[:, :2].mean(axis=0)
-        bow = ((view.object_m[:, :2] - middle) ** 2).sum(axis=1) / 0.01
+        middle = view.corners_m[:, :2].mean(axis=0)
+        bow = ((view.corners_m[:, :2] - middle) ** 2).sum(axis=1) / 0.01
         bent.append(
             dataclasses.replace(
                 view, corners_px=view.corners_px + 0.3 * bow[:, None] * rng.normal(size=2)
@@ -122,8 +122,8 @@ def test_outliers_are_named_and_the_rest_stays() -> None:
     views[4] = dataclasses.replace(views[4], corners_px=views[4].corners_px + noise)
     views[9] = moved(views[9], np.array([3, 7]), (2.0, -1.0))
     result = calibrate_camera(views, "plumb_bob")
-    whole = [r.view for r in result.rejections if not r.corners]
-    corners = {r.view: r.corners for r in result.rejections if r.corners}
+    whole = [r.view for r in result.rejections if not r.corner_ids]
+    corners = {r.view: r.corner_ids for r in result.rejections if r.corner_ids}
     assert whole == [views[4].name]
     assert corners == {views[9].name: (int(views[9].ids[3]), int(views[9].ids[7]))}
     assert len(result.views) == len(views) - 1
@@ -143,7 +143,7 @@ def test_views_that_fit_no_camera_are_refused() -> None:
 def near_a_corner(views: list[BoardView]) -> list[BoardView]:
     """The views' corners in a third of the picture."""
     near = np.array(views[0].size_px) * (0.5, 0.6)
-    cut = [v.keep((v.corners_px < near).all(axis=1)) for v in views]
+    cut = [v.select((v.corners_px < near).all(axis=1)) for v in views]
     return [v for v in cut if len(v) >= 8]
 
 

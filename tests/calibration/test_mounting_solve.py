@@ -85,7 +85,7 @@ def test_the_tip_is_found(seed: int) -> None:
     still = replace(held, sway=replace(held.sway, amplitude=0.0 * held.sway.amplitude))
     found = solve_pivot(seen(still, errors=False))
     np.testing.assert_allclose(found.gear_cam_m, held.gear_cam_m, atol=1e-6)
-    np.testing.assert_allclose(found.point_target_m, held.point_target_m, atol=1e-6)
+    np.testing.assert_allclose(found.pivot_point_target_m, held.point_target_m, atol=1e-6)
 
 
 def test_the_tips_interval_holds_the_truth() -> None:

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from perchctl.camera import jpeg as module
-from perchctl.camera.jpeg import JpegSplitter, decode_grey, jpeg_extent
+from perchctl.camera.jpeg import JpegSplitter, decode_grey, jpeg_end_and_size
 from tests.helpers.live import jpeg, part, resized
 
 PICTURES = [
@@ -96,7 +96,7 @@ def test_the_size_is_the_decoder_s_also_behind_a_thumbnail(picture: bytes) -> No
     assert image is not None
     inside = b"\xff\xe1" + struct.pack(">H", 2 + len(small)) + small
     for each in (picture, SOI + inside + picture[2:], SOI + b"\xff\xff" + picture[3:]):
-        assert jpeg_extent(each) == (len(each), (image.shape[1], image.shape[0]))
+        assert jpeg_end_and_size(each) == (len(each), (image.shape[1], image.shape[0]))
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
@@ -110,5 +110,5 @@ def test_any_bytes_are_split_and_are_decoded_or_not(data: bytes) -> None:
 
 def test_what_opencv_refuses_is_no_exception_and_only_a_whole_jpeg_has_an_end() -> None:
     assert decode_grey(resized(PICTURES[0], 40_000, 40_000)) is None
-    assert jpeg_extent(PICTURES[0][:-1]) is None
-    assert jpeg_extent(PICTURES[0][:-2] + PICTURES[0]) == (len(PICTURES[0]) - 2, (0, 0))
+    assert jpeg_end_and_size(PICTURES[0][:-1]) is None
+    assert jpeg_end_and_size(PICTURES[0][:-2] + PICTURES[0]) == (len(PICTURES[0]) - 2, (0, 0))

@@ -74,19 +74,19 @@ class Lab:
 
         def tell(text: str) -> None:
             if HOW_TO_TURN in text:
-                self.sim.carry(Hand(lifted_and_turned(HOME)))
+                self.sim.move_by_hand(Hand(lifted_and_turned(HOME)))
 
         self._put_down()
         quick = CheckScope(**QUICK)
         wanted = replace(
-            quick, lift=True, lift_s=LIFT_S, listen_s=0.5, capture_s=0.5, announce=tell
+            quick, with_lift=True, lift_s=LIFT_S, listen_s=0.5, capture_s=0.5, announce=tell
         )
         found = check(options(self.sim.uri, profile=self.profile), wanted)
         return {row.name: row for row in found}
 
     def _put_down(self) -> None:
         """By a hand, too: what is put somewhere else no gyroscope follows."""
-        self.sim.carry(Hand(Stops((Stop(0.5, HOME),))))
+        self.sim.move_by_hand(Hand(Stops((Stop(0.5, HOME),))))
         end_s = time.monotonic() + 20.0
         while math.dist(self.sim.truth()["position_m"], HOME) > 1e-3:
             assert time.monotonic() < end_s

@@ -51,12 +51,12 @@ def test_what_is_doubtful_is_a_warning(name: str, changes: Mapping[str, Any], wo
 
 def test_each_doubtful_limit_is_broken_once() -> None:
     broken = {
-        limit.because
+        limit.consequence
         for name, changes, _ in CASES
         for limit in DOUBTFUL.get(name, ())
         if not limit.holds(short_profile(changes, base="sim"))
     }
-    assert broken == {limit.because for limits in DOUBTFUL.values() for limit in limits}
+    assert broken == {limit.consequence for limits in DOUBTFUL.values() for limit in limits}
 
 
 @pytest.mark.parametrize("name", ["sim", "paper", "fpv"])

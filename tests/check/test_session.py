@@ -47,7 +47,7 @@ def test_a_library_that_does_not_load_ends_the_check_as_it_ends_a_flight() -> No
 def test_nothing_arms_flies_or_turns(sim: SimProcess, relay: Relay) -> None:
     """The whole check, from the first packet to the last, through the wire."""
     wait_for(sim, 1.5)
-    rows = list(check(options(relay.uri, sim.stream_url), CheckScope(lift=True, **QUICK)))
+    rows = list(check(options(relay.uri, sim.stream_url), CheckScope(with_lift=True, **QUICK)))
     by_name = {row.name: row for row in rows}
     assert by_name["address"].verdict is Verdict.PASS
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE

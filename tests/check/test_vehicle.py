@@ -60,7 +60,7 @@ def looked_at(sim: SimProcess, silent_s: float = 0.0) -> dict[str, Row]:
         seen = query_vehicle(probe, sim.uri, LISTEN_S)
         if silent_s:
             sim.silence_link(silent_s)
-            seen = replace(seen, echoes=probe.echoes(LISTEN_S))
+            seen = replace(seen, echoes_s=probe.round_trips_s(LISTEN_S))
     finally:
         probe.close()
     return rows_of(seen)
@@ -130,7 +130,7 @@ def test_without_telemetry_nothing_that_hangs_on_it_passes(
 GOOD = VehicleStatus(
     uri="radio://0/80/2M/E7E7E7E7E7",
     parameters={"system.selftestPassed": 1, "stabilizer.estimator": 2},
-    echoes=[0.004] * 100,
+    echoes_s=[0.004] * 100,
     quality=99.0,
     telemetry=AT_REST,
     age_s=0.01,
@@ -140,11 +140,11 @@ GOOD = VehicleStatus(
 
 
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
-    ("packets", "warn", {"echoes": [0.004] * 97 + [math.inf] * 3}),
-    ("packets", "fail", {"echoes": [0.004] * 80 + [math.inf] * 20}),
+    ("packets", "warn", {"echoes_s": [0.004] * 97 + [math.inf] * 3}),
+    ("packets", "fail", {"echoes_s": [0.004] * 80 + [math.inf] * 20}),
     ("packets", "warn", {"quality": 80.0}),
     ("packets", "fail", {"quality": 40.0}),
-    ("packets", "fail", {"echoes": [math.inf] * 100}),
+    ("packets", "fail", {"echoes_s": [math.inf] * 100}),
     ("telemetry", "fail", {"samples_hz": 40.0}),
     ("telemetry", "fail", {"age_s": 0.5}),
     ("firmware", "fail", {"protocol": 11}),

@@ -63,7 +63,7 @@ def one_frame(frame: Frame) -> Any:
 def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
     flight = FlightPage(page, 0.15, 0.03)
     frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
-    source = flight.watched(one_frame(frame))
+    source = flight.watch_source(one_frame(frame))
     assert state_of(page)["phase"] == "WAITING"
     assert source.poll(1.0) is frame
     assert source.poll(1.1) is None
@@ -91,7 +91,7 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
 
 def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     flight = FlightPage(page, 0.15, 0.03)
-    flight.watched(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
+    flight.watch_source(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
     assert flight.problem is None

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from perchctl.display import FlightPanel
-from perchctl.display.panel import panel, status_rows
+from perchctl.display.panel import status_panel, status_rows
 from perchctl.mission import Phase
 from tests.helpers.live_page import tick
 from tests.helpers.mission import entered, held, note
@@ -110,7 +110,7 @@ def test_the_panel_fits_into_80_columns(changes: dict[str, Any]) -> None:
     shown = tick(**changes)
     console = Console(width=80, file=io.StringIO(), highlight=False, markup=False)
     with console.capture() as capture:
-        console.print(panel(shown))
+        console.print(status_panel(shown))
     lines = capture.get().splitlines()
     assert len(lines) == 8
     assert max(Text(line.rstrip()).cell_len for line in lines) + len("^C") <= 80

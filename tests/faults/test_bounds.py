@@ -34,10 +34,10 @@ SAFETY = SIM.safety
 def bound(*phases: Phase, scenario: Scenario = SCENARIO, at: tuple[float, float]) -> PositionBound:
     """Started at the origin, and `at` that place when the last of the phases was entered."""
     made = PositionBound(scenario, SIM)
-    made.enter(None, (0.0, 0.0))
+    made.note_phase(None, (0.0, 0.0))
     for phase in phases[:-1]:
-        made.enter(phase, (0.0, 0.0))
-    made.enter(phases[-1], at)
+        made.note_phase(phase, (0.0, 0.0))
+    made.note_phase(phases[-1], at)
     return made
 
 
@@ -61,7 +61,7 @@ def test_a_landing_goes_down_where_it_should_have_been_as_it_began() -> None:
     down = bound(P.ALIGN, P.LANDING, at=(1.2, 0.7))
     assert down.astray_m((1.2, 0.7)) == pytest.approx(0.7)
     assert down.astray_m((2.2, 0.0)) == pytest.approx(1.0)
-    down.enter(P.ABORTED, (2.2, 0.0))
+    down.note_phase(P.ABORTED, (2.2, 0.0))
     assert down.astray_m((2.2, 0.0)) == pytest.approx(1.0)
 
 

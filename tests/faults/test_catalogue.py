@@ -11,7 +11,7 @@ import pytest
 from perchctl.errors import UsageError
 from perchctl.faults import FAULTS, select_faults
 from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, draw_case, draw_fault_case
-from perchctl.faults.oracle import second_press_s
+from perchctl.faults.oracle import emergency_stop_s
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import Operator, Phase
 from perchctl.sim import Scenario
@@ -57,7 +57,7 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
         for _ in presses_s:
             switch.press()
         assert (switch.read() is Operator.STOP) is stops
-        assert (second_press_s(presses_s) is not None) is stops
+        assert (emergency_stop_s(presses_s) is not None) is stops
 
 
 def test_a_selection_by_name() -> None:

@@ -20,7 +20,7 @@ from perchctl.faults.oracle import (
     report_claims,
     rescue_claims,
 )
-from perchctl.mission import Event, EventKind, Finding, FlightReport, Outcome, Phase
+from perchctl.mission import Event, EventKind, FlightReport, Outcome, Phase, RestState
 from perchctl.mission.state import TERMINALS
 from perchctl.mission.table import TABLE
 
@@ -88,8 +88,8 @@ def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
     return Event(9.0, kind, text)
 
 
-@pytest.mark.parametrize("found", Finding)
-def test_what_a_rescue_says_counts_too(found: Finding) -> None:
+@pytest.mark.parametrize("found", RestState)
+def test_what_a_rescue_says_counts_too(found: RestState) -> None:
     """By what it found: that it hangs is another claim than that it stands."""
     claims = rescue_claims(Event.of_rescue(9.0, ValueError(), f"{found.value}; it fell hard"))
     words = {
@@ -99,11 +99,11 @@ def test_what_a_rescue_says_counts_too(found: Finding) -> None:
         "could not be confirmed": "not seen down",
     }  # fmt: skip
     assert claims == {claim for word, claim in words.items() if word in found.value}
-    assert set(RESCUE_CLAIMS) == set(Finding)
+    assert set(RESCUE_CLAIMS) == set(RestState)
 
 
 def test_what_is_no_rescue_s_note_claims_nothing() -> None:
     assert rescue_claims(note("no battery reading")) == set()
-    rescue = Event.of_rescue(9.0, ValueError(), Finding.UNSEEN.value)
+    rescue = Event.of_rescue(9.0, ValueError(), RestState.UNSEEN.value)
     phase = replace(rescue, kind=EventKind.PHASE)
     assert rescue_claims(phase) == set()

@@ -19,7 +19,7 @@ from perchctl.faults import effects as e
 from perchctl.faults.edges import (
     LONGEST_S,
     CameraFault,
-    Edges,
+    FaultRig,
     FaultyCamera,
     FaultyClock,
     FaultyRadio,
@@ -82,22 +82,22 @@ class Rig:
         moment_s: float = 0.0,
         capture: CaptureSettings | None = None,
     ) -> None:
-        scenario = e.changed_scenario(scenario, effects)
+        scenario = e.scenario_for(scenario, effects)
         self.vehicle = WatchedVehicle(scenario, CAMERA, TargetConfig(), capture)
         self.radio = FaultyRadio()
         self.by_link: list[float] = []
         self.clock = FaultyClock(self, self.radio, 100.0)  # type: ignore[arg-type]
         self.pressed: list[str] = []
         self.problem: str | None = None
-        self.edges = Edges(
+        self.edges = FaultRig(
             self.vehicle, self.radio, FaultyCamera(Pictures(), 1), self.clock,
             partial(self.pressed.append, "Ctrl-C"), partial(self.pressed.append, "hang-up"), self,
         )  # fmt: skip
         self.injector = e.Injector(self.edges, effects, Phase.SEARCH, moment_s)
-        self.vehicle.each = self._each
+        self.vehicle.on_sample = self._each
 
     def _each(self, t_s: float) -> None:
-        self.injector.each(t_s)
+        self.injector.begin_due(t_s)
         self.edges.call_due(t_s)
 
     @property
@@ -366,12 +366,12 @@ def test_the_magnet_lets_go_after_the_contact() -> None:
 def test_what_is_so_from_the_start() -> None:
     weight_n = SCENARIO.mass_kg * GRAVITY_MPS2
     first = replace(SCENARIO, first_contact_force_n=0.1)
-    weak = e.changed_scenario(first, (partial(e.magnet_holds, of_weight=0.5),))
+    weak = e.scenario_for(first, (partial(e.magnet_holds, of_weight=0.5),))
     assert weak.magnet_force_n == pytest.approx(0.5 * weight_n)
     assert weak.first_contact_force_n is None
-    other = e.changed_scenario(SCENARIO, (partial(e.room, ceiling_z_m=1.2, no_target=True),))
+    other = e.scenario_for(SCENARIO, (partial(e.room, ceiling_z_m=1.2, no_target=True),))
     assert (other.ceiling_z_m, other.no_target) == (1.2, True)
-    assert e.changed_scenario(SCENARIO, (partial(e.killed),)) == SCENARIO
+    assert e.scenario_for(SCENARIO, (partial(e.killed),)) == SCENARIO
 
 
 # --- the operator and the program ---------------------------------------------------------------

@@ -216,7 +216,7 @@ def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: fl
     case = draw_fault_case(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
     flight = faulty.FaultyFlight(profile(), case, scenario)
     flight._sample(0.0)
-    flight._place_bound.enter(Phase.SEARCH, (0.0, 0.0))
+    flight._place_bound.note_phase(Phase.SEARCH, (0.0, 0.0))
     assert flight._place_bound.astray_m((2.0, 0.0)) == pytest.approx(astray_m, abs=0.1)
 
 
@@ -348,7 +348,7 @@ def test_the_command_lists_and_refuses() -> None:
     assert listed.exit_code == 0
     assert all(f"{fault.name} " in listed.stdout for fault in FAULTS)
     told = json.loads(simulate("--faults", "list", "--json").stdout)
-    assert told["faults"] == {fault.name: fault.what for fault in FAULTS}
+    assert told["faults"] == {fault.name: fault.description for fault in FAULTS}
     refused = simulate("--faults", "hanged")
     assert refused.exit_code == 2
     assert "--faults list" in refused.stderr

@@ -13,19 +13,19 @@ from perchctl.faults.oracle import (
     Oracle,
     Sample,
     drop_limit_m,
-    second_press_s,
+    emergency_stop_s,
 )
 
 DT_S = 0.01
 G = 9.81
 FLOOR = Sample(
-    t_s=0.0, x_m=0.0, y_m=0.0, height_m=0.0, vz_mps=0.0, up_z=1.0, acc_g=1.0, motors_on=False,
-    pressing=False, floor=True, hanging=False, hold_ratio=2.0, locked=False,
+    t_s=0.0, x_m=0.0, y_m=0.0, height_m=0.0, vz_mps=0.0, body_up_z=1.0, acc_g=1.0, motors_on=False,
+    pressing=False, on_floor=True, hanging=False, hold_ratio=2.0, locked=False,
     ended_by_vehicle=False,
 )  # fmt: skip
 FLOOR_ON = FLOOR._replace(motors_on=True)
 LOCKED = FLOOR._replace(locked=True, ended_by_vehicle=True)
-HOVER = FLOOR._replace(height_m=1.0, motors_on=True, floor=False)
+HOVER = FLOOR._replace(height_m=1.0, motors_on=True, on_floor=False)
 LOW = HOVER._replace(height_m=0.05)
 HANGING = HOVER._replace(height_m=2.0, motors_on=False, hanging=True)
 HANGING_ON = HANGING._replace(motors_on=True)
@@ -53,7 +53,7 @@ class Script:
         for speed in speeds:
             height_m -= speed * DT_S
             if height_m <= 0.0:
-                self.show(sample, DT_S, height_m=0.0, vz_mps=0.0, floor=True)
+                self.show(sample, DT_S, height_m=0.0, vz_mps=0.0, on_floor=True)
                 break
             self.show(sample, DT_S, height_m=height_m, vz_mps=-speed)
         return self
@@ -116,10 +116,10 @@ def test_a_flight_that_hangs_raises_nothing() -> None:
 def test_what_is_a_flag_and_what_is_not_yet_one(
     last: Sample, for_s: float, flags: set[str]
 ) -> None:
-    before = FLOOR if last.floor else HOVER
+    before = FLOOR if last.on_floor else HOVER
     script = Script((before, 1.0), (last, for_s))
     assert script.flags == flags
-    assert script.oracle.astray_m == (0.0 if last.floor else last.astray_m)
+    assert script.oracle.astray_m == (0.0 if last.on_floor else last.astray_m)
     assert script.show(before, 1.0).flags == flags
 
 
@@ -204,16 +204,16 @@ TRUTHS = {
     ),
     "hangs": ((HANGING, HANGING._replace(miss_m=0.026)), (HANGING_ON, FLOOR)),
     "stands": (
-        (FLOOR, FLOOR._replace(up_z=0.6)),
-        (FLOOR_ON, HANGING, FLOOR._replace(up_z=-1.0), FLOOR._replace(up_z=0.5)),
+        (FLOOR, FLOOR._replace(body_up_z=0.6)),
+        (FLOOR_ON, HANGING, FLOOR._replace(body_up_z=-1.0), FLOOR._replace(body_up_z=0.5)),
     ),
     "hangs or stands": (
-        (HANGING, FLOOR), (HANGING_ON, HOVER, FLOOR._replace(up_z=-1.0)),
+        (HANGING, FLOOR), (HANGING_ON, HOVER, FLOOR._replace(body_up_z=-1.0)),
     ),
     "motors off": ((FLOOR,), (FLOOR_ON,)),
     "locked": ((LOCKED,), (FLOOR,)),
     "ended by the supervisor": ((LOCKED,), (FLOOR,)),
-    "tilted": ((FLOOR._replace(up_z=0.3),), (FLOOR._replace(up_z=0.9),)),
+    "tilted": ((FLOOR._replace(body_up_z=0.3),), (FLOOR._replace(body_up_z=0.9),)),
 }  # fmt: skip
 """Of each claim what it is true of, and what it is not."""
 
@@ -226,7 +226,7 @@ def test_lied(claim: Claim) -> None:
 
 
 def test_a_claim_may_be_of_before_or_become_true_within_half_a_second() -> None:
-    script = Script((HOVER._replace(up_z=0.2, ended_by_vehicle=True), 0.2), (FLOOR_ON, 1.0))
+    script = Script((HOVER._replace(body_up_z=0.2, ended_by_vehicle=True), 0.2), (FLOOR_ON, 1.0))
     script.claim("tilted", "ended by the supervisor", "motors off")
     assert script.show(FLOOR_ON, 0.3).show(FLOOR, 2.0).flags == set()
 
@@ -294,7 +294,7 @@ def every(period_s: float, for_s: float) -> list[float]:
     ],
 )
 def test_which_press_is_the_second(presses_s: list[float], second_s: float | None) -> None:
-    found_s = second_press_s(presses_s)
+    found_s = emergency_stop_s(presses_s)
     assert found_s == (None if second_s is None else pytest.approx(second_s))
 
 
@@ -325,7 +325,7 @@ def test_one_ctrl_c_asks_for_no_stop_and_nobody_obeys_after_the_end() -> None:
     assert ended.show(FLOOR_ON, 1.0).flags == set()
 
 
-@pytest.mark.parametrize("changes", [{"ended_by_vehicle": True}, {"up_z": 0.3}])
+@pytest.mark.parametrize("changes", [{"ended_by_vehicle": True}, {"body_up_z": 0.3}])
 def test_a_lock_has_its_reason_in_a_crash_before_it(changes: dict[str, Any]) -> None:
     """What tumbles after the lock was locked without reason."""
     locked = FLOOR._replace(locked=True)

@@ -112,16 +112,16 @@ def test_the_magnet_is_watched_by_the_world_not_by_the_report(
     it.show(HANGING, complete.hang_s + complete.watch_s - short_s)
     it.magnet.let_go = True
     it.show(HANGING, DT_S)
-    assert it.facts.let_go_s == pytest.approx(it.t_s - DT_S)
-    assert it.facts.watched is watched
+    assert it.facts.magnet_failed_s == pytest.approx(it.t_s - DT_S)
+    assert it.facts.was_watched is watched
 
 
 def test_silence_that_ends_in_a_cut() -> None:
     """By the vehicle's lock, not by how long nothing came."""
     it = Recorded().show(HOVER, 1.0).show(HOVER, CUT_S + 0.05, uplink=False).show(HOVER, 1.0)
-    assert it.facts.cut_s is None
+    assert it.facts.silence_lock_s is None
     it.show(HOVER, 2.0, uplink=False).show(HOVER, 1.0, uplink=False, locked=True)
-    assert it.facts.cut_s == pytest.approx(4.0 + CUT_S + 0.05)
+    assert it.facts.silence_lock_s == pytest.approx(4.0 + CUT_S + 0.05)
     assert not it.facts.own_landing
 
 
@@ -140,7 +140,7 @@ def test_a_cut_shows_only_after_the_silence_that_brought_it(
     it = Recorded().show(HOVER, 1.0).show(HOVER, silent_s, uplink=False).show(HOVER, heard_s)
     it.supervisor.emergency = emergency
     it.show(HOVER, 1.0, locked=True)
-    assert (it.facts.cut_s is not None) is cut
+    assert (it.facts.silence_lock_s is not None) is cut
 
 
 def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() -> None:
@@ -163,13 +163,13 @@ def test_a_slip_from_still_motors_is_kept_with_its_height() -> None:
     assert it.facts.slipped_s is None
     it.show(HANGING, 1.0, height_m=0.9).show(HOVER, 0.1, motors_on=False, height_m=0.89)
     assert it.facts.slipped_s == pytest.approx(2.5)
-    assert it.facts.slipped_m == 0.89
+    assert it.facts.slip_height_m == 0.89
 
 
 def test_when_nothing_lifts_it_any_more() -> None:
     it = Recorded().show(HOVER, 0.5)
-    assert (it.facts.weak_s, it.facts.low_s) == (None, None)
+    assert (it.facts.weak_s, it.facts.battery_low_s) == (None, None)
     it.world.battery_rest_v, it.world.battery_v = 3.3, 2.9
     it.show(HOVER, 0.5, height_m=1.2)
     assert it.facts.weak_s == pytest.approx(0.5)
-    assert (it.facts.low_s, it.facts.low_m) == (pytest.approx(0.5), 1.2)
+    assert (it.facts.battery_low_s, it.facts.battery_low_m) == (pytest.approx(0.5), 1.2)

@@ -106,8 +106,8 @@ def test_how_often_it_is_read_changes_nothing(silences_s: list[float], every_s: 
 
 def test_before_the_flight_a_signal_leaves() -> None:
     with pytest.raises(Interrupted, match="nothing was started"):
-        OperatorSwitch().leave()
-    OperatorSwitch(listening=True).leave()
+        OperatorSwitch().interrupt()
+    OperatorSwitch(listening=True).interrupt()
 
 
 # --- signals, in a process of its own -----------------------------------------------------------

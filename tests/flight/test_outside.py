@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import GroundCriteria
-from perchctl.flight.criteria import RestCheck, apart, up_axis_problem
+from perchctl.flight.criteria import RestCheck, estimate_problem, up_axis_problem
 from perchctl.flight.preflight import refuse_wrong_positions
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission import Operator, Outcome
@@ -95,7 +95,7 @@ def test_another_axis_up_is_named_by_the_attitude(
     (turned(0.2), True), (turned(0.4), False),
 ])  # fmt: skip
 def test_the_estimate_has_to_agree(place: ExternalPosition, agrees: bool) -> None:
-    assert (apart(place, REST) is None) is agrees
+    assert (estimate_problem(place, REST) is None) is agrees
 
 
 # --- The loop -------------------------------------------------------------------------------

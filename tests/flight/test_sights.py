@@ -51,7 +51,7 @@ def hung() -> tuple[TargetPositioning, list[ExternalPosition]]:
 def test_what_hangs_is_told_where_and_what_flies_nothing(touches: bool) -> None:
     sights, sent = hung()
     samples = at_rest()
-    sights.begin(history(samples), samples[-1].t_s, touches=touches)
+    sights.begin_tick(history(samples), samples[-1].t_s, in_contact=touches)
     assert [p.position_m for p in sent] == [sights.feed.contact_position(0.0)] * touches
     assert not touches or sights.feed.status(samples[-1].t_s).age_s == 0.0
 
@@ -62,7 +62,7 @@ def test_the_first_sample_of_a_fall_ends_it(felt_g: float) -> None:
     sights, sent = hung()
     samples = at_rest()
     samples.append(replace(samples[-1], t_s=samples[-1].t_s + SAMPLE_S, acc_z_g=felt_g))
-    sights.begin(history(samples), samples[-1].t_s, touches=True)
+    sights.begin_tick(history(samples), samples[-1].t_s, in_contact=True)
     assert not sent
 
 

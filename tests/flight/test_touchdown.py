@@ -51,7 +51,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
         for _ in range(10):
             t_s += 0.002
             link.advance_to(t_s)
-            if dropped_s < t_s < hit_s and vehicle.world.contact_state()[1]:
+            if dropped_s < t_s < hit_s and vehicle.world.push_n_and_on_floor()[1]:
                 hit_s, speed_mps = t_s, sink_mps
             sink_mps = -vehicle.world.vz_mps
         for sample in link.telemetry():

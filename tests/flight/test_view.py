@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
-from perchctl.flight import fly_lockstep, out_of_view
+from perchctl.flight import fly_lockstep, view_problem
 from perchctl.flight.preflight import (
     LEAN_DEG,
     still_waiting_for,
@@ -54,7 +54,7 @@ def place(x: float, y: float, z: float = 2.0, yaw_rad: float = 0.0) -> Place:
     place(0.03, 0.0, TOP_M + 0.125),  # 12 cm under it only the small marker is whole
 ])  # fmt: skip
 def test_straight_up_under_the_target_it_stays_in_view(target: Place) -> None:
-    assert out_of_view(target, FEET, 0.0, TARGET, CAMERA) is None
+    assert view_problem(target, FEET, 0.0, TARGET, CAMERA) is None
 
 
 @settings(max_examples=60, deadline=None)
@@ -64,7 +64,7 @@ def test_put_where_the_refusal_says_it_flies(
 ) -> None:
     """In whatever heading it stands, and the higher the vehicle, the less it sees."""
     target = place(x, y, z, target_yaw)
-    problem = out_of_view(target, FEET, yaw_rad, TARGET, CAMERA)
+    problem = view_problem(target, FEET, yaw_rad, TARGET, CAMERA)
     over = target_view_from((0.0, 0.0, TOP_M), yaw_rad, target, TARGET, CAMERA)
     leant_m = over.height_m * math.tan(math.radians(LEAN_DEG))
     # Farther aside of the camera, which is beside the body's axis, is as good as leaning.
@@ -79,12 +79,12 @@ def test_put_where_the_refusal_says_it_flies(
     signs = {"forward": (1, 0), "back": (-1, 0), "to the left": (0, 1), "to the right": (0, -1)}
     way = sum((float(m) * np.array(signs[name]) for m, name in ways), np.zeros(2))
     there = rot_z(yaw_rad)[:2, :2] @ way
-    assert out_of_view(target, (*there, 0.0), yaw_rad, TARGET, CAMERA) is None
+    assert view_problem(target, (*there, 0.0), yaw_rad, TARGET, CAMERA) is None
 
 
 def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
     near = changed({"planner.approach_xy_m": (0.3, -0.2)}, TARGET)
-    assert out_of_view(place(0.1, 0.05), FEET, 0.0, near, CAMERA) is None
+    assert view_problem(place(0.1, 0.05), FEET, 0.0, near, CAMERA) is None
     words = r"from x 2\.00, y 0\.00 m .* would not see it.* m aside .*leave .* out"
     with pytest.raises(SafetyAbort, match=words):
         fly_lockstep(FAR_APPROACH, 1)

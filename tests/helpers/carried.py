@@ -58,7 +58,7 @@ class Hand:
         before, here, after = (self._way(*start, t_s + k * dt_s) for k in (-1, 0, 1))
         turn = before[1].T @ after[1]  # so small a turn is its own vector
         rates = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2.0 * dt_s)
-        world.place(*here, (after[0] - before[0]) / (2.0 * dt_s), rates)
+        world.set_state(*here, (after[0] - before[0]) / (2.0 * dt_s), rates)
         world.set_acceleration(*((after[0] - 2.0 * here[0] + before[0]) / dt_s**2).tolist())
 
 

@@ -50,7 +50,7 @@ class Rig:
         return max(self.firmware.motors) == 0.0
 
     def take_off(self, height_m: float = 0.8, settle_s: float = 2.5) -> None:
-        self.firmware.give_order(HighLevelPlanner.take_off, height_m, 2.5, None)
+        self.firmware.command_planner(HighLevelPlanner.take_off, height_m, 2.5, None)
         self.run(2.5 + settle_s)
 
     def hold(self, seconds: float = 2.0, z_m: float = 0.8) -> None:

@@ -14,7 +14,7 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import MARKERS, Frame, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import follow_markers, follow_partly
+from perchctl.vision.markers.detect import add_partly_visible, follow_markers
 from perchctl.vision.markers.detector import Picture, make_aruco_detector
 from perchctl.vision.markers.pattern import Pattern
 from perchctl.vision.types import MarkerName
@@ -51,7 +51,7 @@ def followed(
 ) -> dict[MarkerName, RefinedCorners]:
     """What is where it is expected, wholly or partly."""
     picture = Picture(image, hidden, replace(SETUP, patterns=patterns), CAMERA)
-    return follow_partly(picture, expected, follow_markers(picture, expected))
+    return add_partly_visible(picture, expected, follow_markers(picture, expected))
 
 
 def box(cx: float, cy: float, side: float) -> Array:

@@ -59,8 +59,8 @@ def fly(recorder: Recorder, flight: Flown) -> None:
     """A frame in every other turn."""
     for n, tick in enumerate(flight.ticks):
         if n % 2 == 0 and n // 2 < len(flight.frames):
-            recorder.frame(flight.frames[n // 2])
-        recorder.tick(tick)
+            recorder.write_frame(flight.frames[n // 2])
+        recorder.write_tick(tick)
 
 
 def recorder(path: Path, live: bool = False, **changes: Any) -> Recorder:

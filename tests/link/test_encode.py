@@ -24,7 +24,7 @@ from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
 from perchctl.link.crtp import ARM, LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
 from perchctl.sim import Scenario, SimulatedVehicle
-from perchctl.sim.crtp import execute
+from perchctl.sim.crtp import execute_packet
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -116,7 +116,7 @@ class Calls:
 def in_lockstep(command: Command) -> list[tuple[str, tuple[Any, ...]]]:
     """What the lockstep link makes the firmware do."""
     firmware = Calls()
-    receive = partial(execute, firmware)  # type: ignore[arg-type]
+    receive = partial(execute_packet, firmware)  # type: ignore[arg-type]
     MockLink(SimpleNamespace(t_s=0.0, receive=receive)).send(command)  # type: ignore[arg-type]
     return firmware.made
 
@@ -157,7 +157,7 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
     for datagram in by_cflib(command):
         packet = Packet.decode(datagram)
         assert packet is not None
-        execute(firmware, packet)  # type: ignore[arg-type]
+        execute_packet(firmware, packet)  # type: ignore[arg-type]
     assert in_lockstep(command) == firmware.made
 
 

@@ -60,7 +60,7 @@ def test_a_scan_gives_uris_that_are_taken_and_prints_nothing(
     monkeypatch.setattr("cflib.crtp.CLASSES", [radiodriver.RadioDriver, Radio])
     monkeypatch.setattr(radiodriver.RadioManager, "open", lambda number: 1 / 0)
     monkeypatch.setattr(listening, "_radio_problem", lambda: "")
-    found = listening.find_vehicles("radio://0/80/2M/0000000001?rate_limit=100")[0]
+    found = listening.find_uris_and_problem("radio://0/80/2M/0000000001?rate_limit=100")[0]
     assert found == ["radio://0/80/2M", "radio://0/80/2M/1"]
     assert list(map(check_uri, found)) == ["radio", "radio"]
     assert capfd.readouterr() == ("", "")

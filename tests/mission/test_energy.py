@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.battery import (
     battery_outlook,
-    left_s,
+    hover_left_s,
     read_battery,
     update_energy,
 )
@@ -85,7 +85,7 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
         ahead_s = end_s - moment.t_s
         if moment.t_s < 6.0 or ahead_s <= 0.0:
             continue
-        told_s = left_s(moment.energy, PROFILE, hover)
+        told_s = hover_left_s(moment.energy, PROFILE, hover)
         assert told_s is not None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
             assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
@@ -103,7 +103,7 @@ def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) ->
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 5.1, 65.0])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
-    assert left_s(energy, PROFILE, HOVER) is None
+    assert hover_left_s(energy, PROFILE, HOVER) is None
     assert energy.unknown_s == pytest.approx(10.0)
 
 
@@ -121,7 +121,7 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
         energy = update_energy(energy, PERIOD_S, volts, thrust, MAH)
-    seconds = left_s(energy, PROFILE, HOVER)
+    seconds = hover_left_s(energy, PROFILE, HOVER)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
 
@@ -201,8 +201,8 @@ def test_a_reading_that_stands_still_is_none() -> None:
 )
 def test_a_flight_ends_sooner_where_battery_low_fires_sooner(changes: dict[str, Any]) -> None:
     energy = replace(FINE_BATTERY, rest_v=3.95)
-    usual_s = left_s(energy, PROFILE, 0.5)
-    sooner_s = left_s(energy, changed(changes), 0.5)
+    usual_s = hover_left_s(energy, PROFILE, 0.5)
+    sooner_s = hover_left_s(energy, changed(changes), 0.5)
     assert usual_s is not None
     assert sooner_s is not None
     assert 0.0 < sooner_s < usual_s

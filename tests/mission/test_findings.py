@@ -8,7 +8,7 @@ import pytest
 
 from perchctl.mission import Findings
 from perchctl.profile import CameraConfig
-from perchctl.vision import Consistency
+from perchctl.vision import CameraErrors
 
 
 def _seen(
@@ -16,10 +16,10 @@ def _seen(
     sigma_s: float = 0.003,
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sigma_deg: float = 0.4,
-) -> Consistency:
+) -> CameraErrors:
     x, y, z = (math.radians(t) for t in turn_deg)
     sigma_rad = math.radians(sigma_deg)
-    return Consistency(delay_s, sigma_s, (x, y, z), (sigma_rad, sigma_rad, sigma_rad))
+    return CameraErrors(delay_s, sigma_s, (x, y, z), (sigma_rad, sigma_rad, sigma_rad))
 
 
 CAMERA = CameraConfig(latency_s=0.06)
@@ -41,7 +41,7 @@ CAMERA = CameraConfig(latency_s=0.06)
     ],
 )
 def test_only_what_is_surely_beyond_its_gate_is_an_advice(
-    seen: Consistency, camera: CameraConfig, words: str
+    seen: CameraErrors, camera: CameraConfig, words: str
 ) -> None:
     found = Findings.of(seen, camera)
     assert found.latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import (
-    Finding,
     ImuMotion,
     Mismatch,
     Observation,
     Operator,
     Phase,
     PlannerState,
+    RestState,
     VisualInertialMotion,
     lander,
     planner,
@@ -225,7 +225,7 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     positioning: str, astray: bool
 ) -> None:
     """By such positions a landing would speed up until it tilts over."""
-    begin = replace(state_in(Phase.ALIGN, NOW_S), mount=MountingMonitor(against=SIGHTS_IN_A_ROW))
+    begin = replace(state_in(Phase.ALIGN, NOW_S), mount=MountingMonitor(doubts=SIGHTS_IN_A_ROW))
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
     assert (state.phase, state.row, state.astray) == (Phase.LANDING, "mounting", astray)
@@ -375,29 +375,29 @@ def ended(
     reckoning: DeadReckoning = UNRECKONED,
     touch_s: float | None = None,
     **observed: Any,
-) -> Finding:
+) -> RestState:
     seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = replace(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
         reach_s=reach_s, touch_s=touch_s, reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
-    return lander.rest_finding(Context(state, obs, BY_TARGET))
+    return lander.find_rest_state(Context(state, obs, BY_TARGET))
 
 
 @pytest.mark.parametrize(
     ("reach_s", "fell_s", "gap_s", "found"),
     [
-        (4.0, -math.inf, -math.inf, Finding.HANGS),
-        (4.0, 3.0, 3.5, Finding.HANGS),  # before it came there
-        (4.0, 6.0, -math.inf, Finding.STANDS),
-        (4.0, 6.0, 7.0, Finding.STANDS),
-        (4.0, -math.inf, 6.0, Finding.UNKNOWN),
-        (None, -math.inf, 6.0, Finding.STANDS),
+        (4.0, -math.inf, -math.inf, RestState.HANGS),
+        (4.0, 3.0, 3.5, RestState.HANGS),  # before it came there
+        (4.0, 6.0, -math.inf, RestState.STANDS),
+        (4.0, 6.0, 7.0, RestState.STANDS),
+        (4.0, -math.inf, 6.0, RestState.UNKNOWN),
+        (None, -math.inf, 6.0, RestState.STANDS),
     ],
 )
 def test_what_was_in_reach_and_has_not_fallen_since_hangs(
-    reach_s: float | None, fell_s: float, gap_s: float, found: Finding
+    reach_s: float | None, fell_s: float, gap_s: float, found: RestState
 ) -> None:
     assert ended(reach_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
 
@@ -409,10 +409,10 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
     silence = DeadReckoning(unsure_s=NOW_S - 3.0)
-    assert ended(reach_s, reckoning=silence) is Finding.UNKNOWN
-    assert ended(reach_s, reckoning=silence, touch_s=NOW_S - 1.5) is Finding.STANDS
+    assert ended(reach_s, reckoning=silence) is RestState.UNKNOWN
+    assert ended(reach_s, reckoning=silence, touch_s=NOW_S - 1.5) is RestState.STANDS
     seen = replace(silence, sight_s=NOW_S - 2.5)
-    told = Finding.STANDS if reach_s is None else Finding.HANGS
+    told = RestState.STANDS if reach_s is None else RestState.HANGS
     assert ended(reach_s, reckoning=seen) is told
 
 
@@ -428,12 +428,12 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     entered = replace(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
     new = lander.enter_landing(Context(entered, obs, BY_TARGET), before).state
     assert new.stopped_s == NOW_S
-    assert lander.rest_finding(Context(new, obs, BY_TARGET)) is Finding.HANGS
+    assert lander.find_rest_state(Context(new, obs, BY_TARGET)) is RestState.HANGS
 
 
 def test_a_target_seen_far_above_tells_that_it_stands() -> None:
     silent = ImuMotion(t_s=NOW_S, gap_s=6.0)
-    for z_m, found in ((CEILING_M - 1.0, Finding.STANDS), (HANG_Z_M, Finding.UNKNOWN)):
+    for z_m, found in ((CEILING_M - 1.0, RestState.STANDS), (HANG_Z_M, RestState.UNKNOWN)):
         target = target_at(NOW_S, body_m=(0.0, 0.0, z_m))
         assert ended(4.0, silent, target=target) is found
 
@@ -472,7 +472,7 @@ REMEMBERED = st.sampled_from(
         {"contact_z_m": HANG_Z_M, "reach_s": 9.0},
         {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.9},
         {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.0, "stopped_s": 9.8, "orders": 2},
-        {"caught": False, "catch_above_m": 1.0},
+        {"caught": False, "catch_goal_above_m": 1.0},
         {"pressed": True},
         {"hover_thrust": 0.0},
         {"blind_s": 9.0, "blind_height_m": 1.0},

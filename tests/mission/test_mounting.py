@@ -83,15 +83,15 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
         1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
     )
     sight = mount_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
-    assert sight.vehicle == pytest.approx(0.3 + 0.1j)
-    assert sight.target == pytest.approx(0.5 + 0.2j)
-    assert sight.lean == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
+    assert sight.vehicle_m == pytest.approx(0.3 + 0.1j)
+    assert sight.target_m == pytest.approx(0.5 + 0.2j)
+    assert sight.lean_m == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
 
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountingMonitor(against=9, turn_rad=math.pi / 2)
+    watch = MountingMonitor(doubts=9, turn_rad=math.pi / 2)
     flight = fly(replace(state_in(Phase.ALIGN), mount=watch, setpoint=ahead), at())
     assert flight.state.row == "mounting"
     assert isinstance(flight.command, PositionSetpoint)

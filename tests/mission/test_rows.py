@@ -168,7 +168,7 @@ CASES: dict[str, Case] = {
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
-        state={"mount": MountingMonitor(against=SIGHTS_IN_A_ROW)},
+        state={"mount": MountingMonitor(doubts=SIGHTS_IN_A_ROW)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),

@@ -20,7 +20,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.conditions import CONDITIONS
 from perchctl.mission.context import Context
-from perchctl.mission.guidance import FLOOR_M, limited
+from perchctl.mission.guidance import FLOOR_M, limit_setpoint
 from perchctl.mission.state import FLYING_PHASES, Condition
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
@@ -185,7 +185,7 @@ def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     state = replace(state_in(phase), ground_m=(0.0, 0.0, GROUND_Z_M))
     c = Context(state, observation(10.02), PROFILE)
     lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else FLOOR_M)
-    sent = limited(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
+    sent = limit_setpoint(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
     assert sent >= lowest
     assert sent == z_m or z_m < lowest or z_m > GROUND_Z_M + PROFILE.safety.max_height_m
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission import ContactError, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.guidance import UNREAD_S
-from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
+from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, onboard_landing
 from perchctl.mission.planner import step_mission
 from perchctl.mission.state import Condition
 from perchctl.mission.table import TABLE
@@ -425,7 +425,7 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
 def test_nothing_is_caught_on_an_old_speed() -> None:
     """Two seconds of full thrust on a speed of long ago would end far above."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
-    slipped = landing(HANG_Z_M, Phase.RECOVER, caught=False, catch_above_m=1.0, setpoint=below)
+    slipped = landing(HANG_Z_M, Phase.RECOVER, caught=False, catch_goal_above_m=1.0, setpoint=below)
     late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
     _, command = step_mission(slipped, late(10.08), PROFILE)
     assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
@@ -509,7 +509,7 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     """Also from below the ground, from where it would climb to it. Of a quintic the largest speed
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
-    order = own_landing(PROFILE.planner, 0.0, flown_s, z_m)
+    order = onboard_landing(PROFILE.planner, 0.0, flown_s, z_m)
     drift_m = min(MOST_DRIFT_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m

@@ -15,14 +15,14 @@ from perchctl.perception.online_calibration import (
     STAMPS_S,
     ConsistencySums,
     add_rows,
-    consistency_rows,
+    rows_variance_range,
     solve_consistency,
 )
 from perchctl.profile import Profile
 from perchctl.vision import (
     Attitude,
+    CameraErrors,
     CameraModel,
-    Consistency,
     MarkerPose,
     PoseSetup,
 )
@@ -122,12 +122,12 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
         sums = add_rows(
             sums,
             t_s,
-            *consistency_rows(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
+            *rows_variance_range(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
         )
     return sums
 
 
-def _seen(truth: Truth, seed: int = 0, told_s: float = 0.0) -> Consistency:
+def _seen(truth: Truth, seed: int = 0, told_s: float = 0.0) -> CameraErrors:
     sums = _fly(truth, np.random.default_rng(seed), told_s)
     found = solve_consistency(sums, ATTITUDE_SIGMA_RAD)
     assert found is not None

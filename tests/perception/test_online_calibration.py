@@ -18,7 +18,7 @@ from perchctl.perception.online_calibration import (
     update_calibration,
 )
 from perchctl.profile import USED_LATENCY_S, CameraConfig
-from perchctl.vision import CameraModel, Consistency, MarkerPose, PoseSetup
+from perchctl.vision import CameraErrors, CameraModel, MarkerPose, PoseSetup
 from tests.helpers.mission import PROFILE, observation, state_in, telemetry
 
 FRAME_S = 1 / 30
@@ -34,8 +34,8 @@ POSE = MarkerPose(
 )  # fmt: skip
 
 
-def _seen(delay_s: float, sigma_s: float) -> Consistency:
-    return Consistency(delay_s, sigma_s, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
+def _seen(delay_s: float, sigma_s: float) -> CameraErrors:
+    return CameraErrors(delay_s, sigma_s, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
 
 
 def _frames(
@@ -43,7 +43,7 @@ def _frames(
 ) -> OnlineCalibration:
     """At rest under the target, without a new solve."""
     history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
-    state = replace(start, solved_s=1e9, seen_s=10.0)
+    state = replace(start, solved_s=1e9, last_picture_s=10.0)
     for k in range(1, count + 1):
         t_s = 10.0 + k * FRAME_S
         state = update_calibration(state, t_s, pose, history, SETUP, camera, 0.005)
@@ -53,9 +53,9 @@ def _frames(
 def test_a_sure_latency_is_taken_over_slowly() -> None:
     """20 ms a second: what the target's place makes of that is what it makes of a drift."""
     start = OnlineCalibration(newest=_seen(0.04, 0.004))
-    assert _frames(start, MEASURED, 1).used_s == pytest.approx(SLEW * FRAME_S)
-    assert _frames(start, MEASURED, 45).used_s == pytest.approx(0.03, rel=0.01)
-    assert _frames(start, MEASURED, 200).used_s == pytest.approx(0.04)
+    assert _frames(start, MEASURED, 1).applied_delay_s == pytest.approx(SLEW * FRAME_S)
+    assert _frames(start, MEASURED, 45).applied_delay_s == pytest.approx(0.03, rel=0.01)
+    assert _frames(start, MEASURED, 200).applied_delay_s == pytest.approx(0.04)
 
 
 BEFORE_S = MEASURED.start_latency_s
@@ -74,10 +74,10 @@ BEFORE_S = MEASURED.start_latency_s
     ids=["unsure", "unknown", "no number", "told by the profile", "too little", "too much"],
 )
 def test_only_a_sure_latency_is_used_and_within_bounds(
-    newest: Consistency | None, camera: CameraConfig, used_s: float
+    newest: CameraErrors | None, camera: CameraConfig, used_s: float
 ) -> None:
-    start = OnlineCalibration(newest=newest, used_s=0.01)
-    assert _frames(start, camera, 600).used_s == pytest.approx(used_s)
+    start = OnlineCalibration(newest=newest, applied_delay_s=0.01)
+    assert _frames(start, camera, 600).applied_delay_s == pytest.approx(used_s)
 
 
 def test_what_is_no_number_teaches_nothing() -> None:

@@ -61,7 +61,7 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
     assert at is not None
     age_s = (NOW - at).total_seconds()  # of whole microseconds
     if min(abs(age_s - DAY_S), abs(age_s + compared.AHEAD_S)) > 1e-3:
-        found, _ = ago(seconds, passes).flight_objection(NOW) or ("", "")
+        found, _ = ago(seconds, passes).objection_and_advice(NOW) or ("", "")
         assert (found == "", "yet to" in found) == (allowed, passes and age_s < -compared.AHEAD_S)
 
 

@@ -19,9 +19,9 @@ from perchctl.commands.profile import (
     PICTURE_EDGES,
     QUESTIONS,
     WORDS,
-    edges_beside,
-    new_profile,
-    picture_edges,
+    front_left_edges,
+    left_edges,
+    profile_and_keys,
 )
 from perchctl.profile import Profile, find_calibration, load_profile, profile_value
 from perchctl.profile.keys import keys
@@ -60,7 +60,7 @@ def answers(draw: st.DrawFn) -> dict[str, str]:
         "camera.calibration": "example_640x480",
         "camera.latency_s": str(draw(st.decimals("0.001", "0.39", places=5))),
         "front": front,
-        "left": draw(st.sampled_from(edges_beside(front))),
+        "left": draw(st.sampled_from(left_edges(front))),
         "camera.mount.position_m": draw(places),
         "vehicle.gear_body_m": draw(places),
         "target.large.side_m": str(large),
@@ -83,12 +83,15 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
         assert profile_value(mine, key) == yaml.safe_load(said[key])
     assert mine.camera.source == said["camera.source"]
     assert find_calibration(mine.camera.calibration).name == "example_640x480.yaml"
-    assert picture_edges(mine.camera.mount, mine.camera.mirrored) == (said["front"], said["left"])
+    assert front_left_edges(mine.camera.mount, mine.camera.mirrored) == (
+        said["front"],
+        said["left"],
+    )
     ceiling_m = float(said["ceiling"])
     assert mine.safety.max_height_m == pytest.approx(ceiling_m + 0.4, abs=0.01)
     assert mine.planner.search.max_height_m <= ceiling_m - 0.49
     found, default = ({key.path: key.default for key in keys(p)} for p in (mine, type(mine)()))
-    other = default.keys() - new_profile(said, "mine")[1] - {"name"}
+    other = default.keys() - profile_and_keys(said, "mine")[1] - {"name"}
     assert {path: found[path] for path in other} == {path: default[path] for path in other}
 
 
@@ -102,7 +105,7 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("front", sorted(PICTURE_EDGES))
 def test_a_mirrored_picture_is_named(front: str, tmp_path: Path) -> None:
-    plain, mirrored = edges_beside(front)
+    plain, mirrored = left_edges(front)
     said = new(tmp_path / "plain.yaml", "--defaults", front=front, left=plain).stderr
     assert "camera.mirrored" not in said
     said = new(tmp_path / "m.yaml", "--defaults", front=front, left=mirrored).stderr

@@ -34,7 +34,7 @@ def test_each_impossible_pair_is_refused_with_its_keys(
     with pytest.raises(ValidationError) as caught:
         short_profile(changes, base="sim")
     said = str(caught.value.errors()[0]["ctx"]["error"])
-    assert limit.because in said
+    assert limit.consequence in said
     assert all(key in said for key in limit.keys)
     assert "\n" not in said
 
@@ -56,12 +56,12 @@ def test_a_measured_latency_counts_as_where_the_flight_begins() -> None:
 
 @pytest.mark.parametrize(
     "limit", [limit for limits in (IMPOSSIBLE, *DOUBTFUL.values()) for limit in limits],
-    ids=lambda limit: limit.because,
+    ids=lambda limit: limit.consequence,
 )  # fmt: skip
 def test_a_limit_that_does_not_hold_shows_each_key_with_its_value_and_unit(limit: Limit) -> None:
     profile = short_profile({}, base="sim")
     assert limit.holds(profile)
-    said = limit.sentence(profile)
+    said = limit.violation_text(profile)
     for key in limit.keys:
         assert re.search(rf"{re.escape(key)} \([0-9.e-]+( [a-zA-Z/^0-9]+)?\)", said), said
-    assert said.endswith(f"does not hold: {limit.because}")
+    assert said.endswith(f"does not hold: {limit.consequence}")

@@ -19,7 +19,7 @@ from perchctl.places import file_names
 from perchctl.profile import (
     Profile,
     SimulationConfig,
-    changed_profile,
+    apply_settings,
     find_calibration,
     load_profile,
 )
@@ -196,7 +196,7 @@ def test_another_value_of_a_constant_is_refused(
     with pytest.raises(InvalidValue, match=words):
         load_profile(str(tmp_path / "old.yaml"))
     with pytest.raises(InvalidValue, match=rf"--set: {re.escape(key)} is no longer"):
-        changed_profile(load_profile("sim"), [f"{key}={value}"])
+        apply_settings(load_profile("sim"), [f"{key}={value}"])
 
 
 def test_a_profile_in_an_old_log_is_read() -> None:
@@ -204,7 +204,7 @@ def test_a_profile_in_an_old_log_is_read() -> None:
     values = load_profile("sim").model_dump(mode="json")
     values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "drift_xyz_mps": None}
     values["planner"]["ascend"]["near_m"] = 0.35
-    assert Profile.lost_values(values) == []
+    assert Profile.lost_texts(values) == []
     values["planner"]["ascend"]["near_m"] = 0.5
     log = FlightLog(Path("f.jsonl"), {"profile": values}, [], [], None, True)
     with pytest.warns(Note, match=r"planner\.ascend\.near_m"):

@@ -8,8 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perchctl.commands.profile import PICTURE_EDGES, edges_beside, mount_from_edges, picture_edges
-from perchctl.profile import Mounting, Profile, editor_schema, load_profile, profile_text
+from perchctl.commands.profile import (
+    PICTURE_EDGES,
+    front_left_edges,
+    left_edges,
+    yaw_deg_and_mirrored,
+)
+from perchctl.profile import Mounting, Profile, json_schema, load_profile, profile_text
 from perchctl.profile.keys import keys
 from tests.helpers.flights import short_profile
 
@@ -44,7 +49,7 @@ def test_a_hostile_text_stays_a_text(tmp_path: Path) -> None:
 
 
 def test_the_schema_holds_each_key_with_meaning_and_unit() -> None:
-    schema = editor_schema()
+    schema = json_schema()
     assert "extends" in schema["properties"]
     for key in keys(Profile()):
         section = schema
@@ -65,8 +70,8 @@ PLACES = {"front": (1.0, 0.0, 0.0), "left": (0.0, 1.0, 0.0)}
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_a_hand_over_the_vehicle_comes_in_where_it_was_said(front: str, mirrored: bool) -> None:
     """A point above the vehicle's front, or its left side, is seen at that edge."""
-    left = edges_beside(front)[int(mirrored)]
-    turn_deg, found_mirrored = mount_from_edges(front, left)
+    left = left_edges(front)[int(mirrored)]
+    turn_deg, found_mirrored = yaw_deg_and_mirrored(front, left)
     assert found_mirrored is mirrored
     mount = Mounting(position_m=(0, 0, 0), rpy_deg=(0, 0, turn_deg))
     for side, edge in (("front", front), ("left", left)):
@@ -75,4 +80,4 @@ def test_a_hand_over_the_vehicle_comes_in_where_it_was_said(front: str, mirrored
         seen = (-x if mirrored else x, y)  # in the picture as the camera gives it
         assert z > 0
         np.testing.assert_allclose(seen, PICTURE_EDGES[edge], atol=1e-12)
-    assert picture_edges(mount, mirrored) == (front, left)
+    assert front_left_edges(mount, mirrored) == (front, left)

@@ -18,7 +18,7 @@ from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions
 from perchctl.mission import FlightReport, Outcome, Phase, SentCommand
-from perchctl.profile import changed_profile, load_profile
+from perchctl.profile import apply_settings, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
 from perchctl.vehicle import EmergencyStop
 from tests.helpers import log as synthetic
@@ -75,9 +75,9 @@ def test_a_record_without_a_form_costs_itself_alone(
     def encode(record: Mapping[str, Any]) -> bytes:
         if record.get("odd"):
             raise error("odd")
-        return exact.encode(record)
+        return exact.encode_line(record)
 
-    monkeypatch.setattr(write, "encode", encode)
+    monkeypatch.setattr(write, "encode_line", encode)
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live)
     for i in range(4):
         log.write({"t_s": 0.02 * i, "odd": i == 1})
@@ -216,7 +216,7 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
         log.write({"t_s": 0.0, "phase": "PERCHED"})
         return FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False), None
 
-    quiet = changed_profile(load_profile("sim"), ["log.plot=false"])
+    quiet = apply_settings(load_profile("sim"), ["log.plot=false"])
     options = FlyOptions(quiet, Path("sim.yaml"), "sim://", "sim:", log_dir=tmp_path)
     monkeypatch.setattr(fly, "_session", session)
     if full:

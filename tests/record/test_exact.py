@@ -28,7 +28,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.state import Condition
 from perchctl.record import from_exact_json, to_exact_json
-from perchctl.record.exact import decode_line, encode, to_rounded_json
+from perchctl.record.exact import decode_line, encode_line, to_rounded_json
 from perchctl.record.read import parse_exact, parse_turn
 from perchctl.record.write import sent_line, turn_line
 from perchctl.vehicle import (
@@ -199,7 +199,7 @@ def test_plain_values() -> None:
         "nan": [math.nan, math.inf, -math.inf], "vector": np.array([1.23456789, -0.0]).tolist(),
         "enum": Phase.ALIGN, "path": Path("a/b"), "text": "°€\ud800",
     }  # fmt: skip
-    line = encode(values)
+    line = encode_line(values)
     assert "-0.0" not in line.decode()
     assert decode_line(line) == {
         "np": 0.5, "int": 3, "bool": True, "nan": [None] * 3, "vector": [1.234568, 0.0],
@@ -216,8 +216,8 @@ json_values = st.recursive(
 
 @given(st.dictionaries(st.text(max_size=8), json_values))
 def test_encoding_is_one_line_and_stable(record: dict[str, Any]) -> None:
-    line = encode(record)
+    line = encode_line(record)
     assert line.count(b"\n") == 1
     back = decode_line(line)
     assert back == {k: v for k, v in to_rounded_json(record).items() if v is not None}
-    assert encode(back) == line
+    assert encode_line(back) == line

@@ -27,7 +27,7 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
 )
-from perchctl.vision import Consistency
+from perchctl.vision import CameraErrors
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held
 
@@ -104,7 +104,7 @@ def test_every_field_is_filled_by_something() -> None:
             state,
             output=frame,
             target=pose,
-            consistency=Consistency(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
+            consistency=CameraErrors(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
             delay_used_s=0.005,
             outside=ExternalPositions(0.012, "hidden", 7, 99.0, place),
         )

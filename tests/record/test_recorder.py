@@ -61,7 +61,7 @@ def test_what_ends_the_recording_is_one_sentence_and_the_flight_goes_on(
     recorded.fly(recorder, recorded.Flown(flight.frames[:60], flight.ticks[:120]))
     disk.room, disk.free = change.get("room"), change.get("free", 10**12)
     if "tick" in change:
-        recorder.tick(change["tick"])
+        recorder.write_tick(change["tick"])
     recorded.fly(recorder, recorded.Flown(flight.frames[60:], flight.ticks[120:]))
     end = recorder.close()
     assert said in (end.recording_problem or "")
@@ -115,8 +115,8 @@ def test_a_disk_that_hangs_holds_up_nobody(
     assert "does not keep up" in (recorder.problem or "")
     hung.gate.set()
     until(lambda: recorder._writer._left == 0)
-    recorder.frame(recorded.frame(200, 20.0, as_jpeg=True))
-    recorder.tick({**flight.ticks[-1], "t_s": 20.0})
+    recorder.write_frame(recorded.frame(200, 20.0, as_jpeg=True))
+    recorder.write_tick({**flight.ticks[-1], "t_s": 20.0})
     end = recorder.close()
     kept = pictures_on(hung, tmp_path)
     assert end.pictures == len(kept)
@@ -146,8 +146,8 @@ def test_frames_before_the_first_tick_are_kept_and_repetitions_are_not(tmp_path:
     """The pipeline has seen them: a replay begins with them."""
     recorder, flight = recorded.recorder(tmp_path / "f.mcap"), recorded.flown(8)
     for frame in flight.frames:
-        recorder.frame(frame)
-    recorder.frame(replace(flight.frames[-1], repeated=True))
+        recorder.write_frame(frame)
+    recorder.write_frame(replace(flight.frames[-1], repeated=True))
     assert recorder.close().pictures == 8
     found = recorded.messages(tmp_path / "f.mcap")
     assert (len(found["/camera/image"]), len(found["/camera/frame"])) == (8, 9)
@@ -193,7 +193,7 @@ def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> Non
     log.recorder = onto(disk)
     disk.room = 0
     for tick in recorded.flown(1).ticks:
-        log.recorder.tick(tick)
+        log.recorder.write_tick(tick)
     assert log.problem is None
     (said,) = log.remarks()
     assert "No space left" in said

@@ -120,7 +120,7 @@ def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
 
 def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
     recorder = recorded.recorder(tmp_path / "f.mcap")
-    recorder.tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
+    recorder.write_tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
     recorder.close()
     (said,) = recorded.messages(tmp_path / "f.mcap")["/tf"]
     assert set(recorded.transforms(said)) == {"body camera", "body gear"}

@@ -77,7 +77,7 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
 def test_a_rescue_s_orders_are_told() -> None:
     link, told = Vehicle(), []
     flown = History((telemetry(0.0, 1.0),))
-    rescue(link, Clock(link), PROFILE, lambda: Operator.NONE, None, flown, told=told.append)
+    rescue(link, Clock(link), PROFILE, lambda: Operator.NONE, None, flown, on_sent=told.append)
     assert told
     assert [(each.t_s, each.command) for each in told] == link.sent
     assert {each.by for each in told} == {"rescue"}

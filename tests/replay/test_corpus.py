@@ -71,7 +71,7 @@ def test_flights_of_two_formats_are_in_it() -> None:
 def _beyond_last_bits(found: Replay) -> list[Any]:
     return [
         each.difference
-        for each in found.decided
+        for each in found.decisions
         if (d := each.difference) is not None and not _near(d[1], d[2])
     ]
 

@@ -12,7 +12,7 @@ from perchctl.analysis import replay
 from perchctl.analysis.replayer import Replay
 from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS, fly_fault_in_folder
-from perchctl.profile import changed_profile
+from perchctl.profile import apply_settings
 from perchctl.record import read_log, recorded_pictures
 from tests.helpers.flights import short_profile
 
@@ -62,9 +62,9 @@ def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
     check_seen(recorded(tmp_path, 0))
     path = tmp_path / "f.jsonl"
     log = read_log(path)
-    nearer = changed_profile(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
+    nearer = apply_settings(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
     found = replay(log, recorded_pictures(path), nearer)
-    assert found.changed == ("vehicle.gear_body_m",)
+    assert found.changed_keys == ("vehicle.gear_body_m",)
     assert found.differences[0].field.startswith(("command.", "phase"))
 
 

@@ -18,7 +18,7 @@ from perchctl.analysis.decide import field_difference
 from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.mission import Turn, guidance, step_mission
-from perchctl.profile import Profile, changed_profile
+from perchctl.profile import Profile, apply_settings
 from perchctl.record import FlightLog, LogWatcher, json_line, read_log
 from perchctl.record.header import make_header
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
@@ -61,7 +61,7 @@ def test_a_changed_constant_is_named_by_tick_and_field(monkeypatch: pytest.Monke
     assert first.field == "command.z_m"
     assert first.recorded != first.replayed
     assert first.recorded == pytest.approx(first.replayed, abs=1e-12)
-    at = next(each for each in found.decided if each.difference is not None)
+    at = next(each for each in found.decisions if each.difference is not None)
     assert (first.tick, first.t_s) == (at.tick, log.to_flight_s(at.turn.t_s))
     assert len(found.differences) <= found.ticks
     (said,) = [line for line in found.lines() if "command.z_m was" in line]
@@ -197,14 +197,14 @@ def test_the_header_s_profile_and_mask_are_the_flown_ones_to_the_bit(tmp_path: P
 
 
 def what_if(log: FlightLog, setting: str) -> Replay:
-    return replay(log, None, changed_profile(log.flown_profile, [setting]))
+    return replay(log, None, apply_settings(log.flown_profile, [setting]))
 
 
 def test_what_if_names_the_first_tick_that_would_differ() -> None:
     log = corpus("perched")
     dwell_s = log.flown_profile.planner.ascend.settle_dwell_s
     found = what_if(log, f"planner.ascend.settle_dwell_s={dwell_s + 0.2}")
-    assert found.changed == ("planner.ascend.settle_dwell_s",)
+    assert found.changed_keys == ("planner.ascend.settle_dwell_s",)
     first = found.differences[0]
     assert (first.field, first.recorded, first.replayed) == ("phase", "PERCH", "ASCEND")
     assert CAUTION in found.notes
@@ -224,7 +224,7 @@ def test_what_if_names_the_first_tick_that_would_differ() -> None:
 )
 def test_a_setting_that_is_none(setting: str, error: type[Exception]) -> None:
     with pytest.raises(error, match="--set"):
-        changed_profile(Profile(), [setting])
+        apply_settings(Profile(), [setting])
 
 
 # --- the command ---------------------------------------------------------------------------

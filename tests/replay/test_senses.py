@@ -17,7 +17,7 @@ from perchctl.errors import InvalidValue
 from perchctl.flight import fly
 from perchctl.mission import Operator, Phase, Tick
 from perchctl.perception import perception
-from perchctl.profile import changed_profile
+from perchctl.profile import apply_settings
 from perchctl.record import FlightLog, LogWatcher, read_log
 from perchctl.record.header import make_header
 from perchctl.vision import Frame, Pipeline, PipelineState
@@ -99,7 +99,7 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert redone
     found = seen_again(log, pictures)
     assert found.is_identical
-    assert found.ticks == len(log.records) == len(found.decided) - len(redone)
+    assert found.ticks == len(log.records) == len(found.decisions) - len(redone)
     assert found.seen is not None
     assert not found.seen.end_reason
 
@@ -129,7 +129,7 @@ def test_with_another_latency_the_pictures_are_of_another_time(
     given_s.clear()
     latency_s = PROFILE.camera.start_latency_s + 0.02
     found = replay(
-        log, flight[1], changed_profile(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup
+        log, flight[1], apply_settings(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup
     )
     assert found.seen is not None
     assert not found.seen.end_reason

@@ -17,7 +17,7 @@ from perchctl.link import Packet, Radio
 from perchctl.link.mock import TELEMETRY_DELAY_S
 from perchctl.profile import PositioningConfig, Profile, load_profile
 from perchctl.sim import Scenario, draw_capture, draw_scenario
-from perchctl.sim.scenario import CONNECTED_S, Bursts
+from perchctl.sim.scenario import CONNECTED_S, RadioBursts
 
 NOMINAL_SHA256 = "b8d613ad776dbc378846d5e8d02d5fcdc3e0384a4bfb241e780905d9d4b55071"
 """Of the nominal scenarios of seeds 0 to 20: figures of earlier campaigns are of these."""
@@ -92,10 +92,10 @@ PACKET = Packet(7, 0, b"\x07")
 
 @pytest.mark.parametrize(("share", "mean_s"), [(0.03, 0.1), (0.2, 0.3)])
 def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: float) -> None:
-    until_s, bursts = 2000.0, Bursts(3, share, mean_s)
-    assert not any(bursts.lost(step * STEP_S) for step in range(round(CONNECTED_S / STEP_S)))
+    until_s, bursts = 2000.0, RadioBursts(3, share, mean_s)
+    assert not any(bursts.is_lost(step * STEP_S) for step in range(round(CONNECTED_S / STEP_S)))
     times_s = [CONNECTED_S + step * STEP_S for step in range(round(until_s / STEP_S))]
-    lost = [bursts.lost(t_s) for t_s in times_s]
+    lost = [bursts.is_lost(t_s) for t_s in times_s]
     runs = [sum(run) * STEP_S for is_lost, run in itertools.groupby(lost) if is_lost]
     spread = 4.0 / math.sqrt(len(runs))
     assert sum(runs) / until_s == pytest.approx(share, rel=1.5 * spread)
@@ -103,15 +103,15 @@ def test_share_and_length_of_bursts_are_what_is_asked_for(share: float, mean_s: 
     # Not all alike: as many are longer than twice the mean as an exponential has.
     long = sum(length_s > 2.0 * mean_s for length_s in runs) / len(runs)
     assert long == pytest.approx(math.exp(-2.0), rel=0.35)
-    seldom = Bursts(3, share, mean_s)
-    assert lost[::40] == [seldom.lost(t_s) for t_s in times_s[::40]]
+    seldom = RadioBursts(3, share, mean_s)
+    assert lost[::40] == [seldom.is_lost(t_s) for t_s in times_s[::40]]
 
 
 def test_both_directions_are_lost_together() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    radio, same = Radio(scenario.radio_bursts()), Bursts(2, 0.3, 0.3)
+    radio, same = Radio(scenario.radio_bursts()), RadioBursts(2, 0.3, 0.3)
     for step in range(4000):
         t_s = step * STEP_S
-        lost = same.lost(t_s)
+        lost = same.is_lost(t_s)
         assert radio.uplink_arrives(PACKET, t_s) is not lost
         assert radio.downlink_delay_s("fast", t_s) == (None if lost else TELEMETRY_DELAY_S)

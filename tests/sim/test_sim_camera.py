@@ -20,7 +20,7 @@ from perchctl.profile import TargetConfig
 from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimulatedVehicle
 from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.optics import Picture
-from perchctl.sim.renderer import Shot
+from perchctl.sim.renderer import Exposure
 from perchctl.vision import CameraModel
 
 
@@ -39,9 +39,9 @@ class Stub:
     def __init__(self) -> None:
         self.rendered: list[int] = []
 
-    def expose(self, shots: Sequence[Shot], frame_index: int = 0) -> Any:
+    def expose(self, shots: Sequence[Exposure], frame_index: int = 0) -> Any:
         self.rendered.append(frame_index)
-        (poses,) = shots[0].rows
+        (poses,) = shots[0].row_poses
         middle = poses[len(poses) // 2]
         return np.array([[frame_index, round(middle[0, 3] * 1e6)]])
 

@@ -81,7 +81,7 @@ def test_hangs_level_in_its_place_for_a_minute() -> None:
     assert world.gear_miss_m() == pytest.approx(before, abs=1e-4)
     assert rotation_from_quaternion(world.quaternion)[2, 2] > math.cos(math.radians(0.5))
     # What the ceiling pushes back is the pull less the weight.
-    assert world.contact_state()[0] == pytest.approx(1.2 - 0.042 * GRAVITY_MPS2, rel=0.1)
+    assert world.push_n_and_on_floor()[0] == pytest.approx(1.2 - 0.042 * GRAVITY_MPS2, rel=0.1)
     assert world.fz_mps2 == pytest.approx(GRAVITY_MPS2, abs=0.05)
 
 
@@ -142,7 +142,7 @@ def test_the_attitude_estimate_follows_a_hand_all_the_way() -> None:
     """By the gyroscope: what is put somewhere at once is followed in seconds only."""
     rig = make_rig()
     world, estimator = rig.world, rig.firmware.estimator
-    world.carry(Hand(lifted_and_turned(HOME)))
+    world.move_by_hand(Hand(lifted_and_turned(HOME)))
     turned, felt = [], []
     for _ in range(round(8.0 / CONTROL_PERIOD_S)):
         rig.firmware.step()

@@ -89,7 +89,7 @@ boards = st.builds(
 def test_a_board_s_notation_reads_back(board: Board) -> None:
     assert Board.parse(board.notation()) == board
     width, height = (round(1e3 * side * 1.003, 3) for side in board.size_m)
-    measured, _ = board.with_sides(f"{width}x{height}mm")
+    measured, _ = board.with_measured_sides(f"{width}x{height}mm")
     again = Board.parse(measured.notation())
     assert again.scale == pytest.approx(measured.scale, rel=1e-5)
     assert again.notation() == measured.notation()
@@ -97,7 +97,7 @@ def test_a_board_s_notation_reads_back(board: Board) -> None:
 
 def test_a_measured_print_moves_the_corners_along_each_side_for_itself() -> None:
     meant = Board.parse("charuco:10x7:25mm:18mm:DICT_5X5_100")
-    board, notes = meant.with_sides("246.5x175.7")
+    board, notes = meant.with_measured_sides("246.5x175.7")
     assert board.corners_m() == pytest.approx(
         meant.corners_m() * [246.5 / 250, 175.7 / 175, 1.0], abs=1e-12
     )
@@ -245,7 +245,7 @@ def claimed(text: str) -> tuple[float, float]:
     ("scale", "wrong"), [(1.0, False), (1.001, False), (0.97, True), (1.02, True)]
 )
 def test_only_an_error_beyond_the_noise_is_named(scale: float, wrong: bool) -> None:
-    named, text = checked(scale, 0.05, 60, wrong=6).verdict()
+    named, text = checked(scale, 0.05, 60, wrong=6).error_and_text()
     assert named is wrong
     value, sigma = claimed(text)
     assert value == pytest.approx(scale / 6.0, abs=3.0 * sigma / 6.0 + 1e-4)
@@ -253,8 +253,8 @@ def test_only_an_error_beyond_the_noise_is_named(scale: float, wrong: bool) -> N
 
 
 def test_noise_hides_a_small_error_more_frames_are_surer_and_few_say_nothing() -> None:
-    few, many = (claimed(checked(1.02, 1.0, n).verdict()[1])[1] for n in (10, 200))
+    few, many = (claimed(checked(1.02, 1.0, n).error_and_text()[1])[1] for n in (10, 200))
     assert many < 0.4 * few
-    assert not checked(1.006, 0.6, 6).verdict()[0]
-    assert not checked(1.05, 0.05, 2).judged
-    assert "not judged" in checked(1.05, 0.05, 2).verdict()[1]
+    assert not checked(1.006, 0.6, 6).error_and_text()[0]
+    assert not checked(1.05, 0.05, 2).has_enough_frames
+    assert "not judged" in checked(1.05, 0.05, 2).error_and_text()[1]

@@ -196,7 +196,7 @@ def test_a_printed_board_is_found_and_true_to_size(notation: str) -> None:
     assert isinstance(view, BoardView)
     columns, rows = board.corner_count
     assert len(view) == columns * rows
-    corners, expected = view.corners_px * 25.4 / 200, view.object_m[:, :2] * 1e3
+    corners, expected = view.corners_px * 25.4 / 200, view.corners_m[:, :2] * 1e3
     if corners[0, 0] > corners[-1, 0]:  # a chessboard found from its other end
         corners = corners[::-1]
     shift = np.median(corners - expected, axis=0)

@@ -268,14 +268,14 @@ def tracker(profile: Profile | None = None, live: bool = True, stills: bool = Fa
 
 def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     image, live = picture(VIEWS["both"]), tracker()
-    [first] = live.results(Frame(0, 0.0, image), 0)
+    [first] = live.process(Frame(0, 0.0, image), 0)
     assert first.stage == "both"
-    assert live.results(Frame(1, 0.03, image), 1) == []
-    [frozen] = live.results(Frame(2, 1.0, image), 2)
+    assert live.process(Frame(1, 0.03, image), 1) == []
+    [frozen] = live.process(Frame(2, 1.0, image), 2)
     assert (frozen.stage, frozen.target) == ("none", None)
     assert frozen.notes == ("the picture stands still",)
     noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)
-    [snow] = live.results(Frame(3, 1.1, noise), 3)
+    [snow] = live.process(Frame(3, 1.1, noise), 3)
     assert (snow.stage, snow.output) == ("none", None)
     assert "snow" in snow.notes[0]
 
@@ -285,7 +285,7 @@ def test_markers_that_contradict_are_named() -> None:
     small = sim.target.small.model_copy(update={"side_m": 0.032})
     target = sim.target.model_copy(update={"small": small})
     doubting = tracker(sim.model_copy(update={"target": target}), live=False, stills=True)
-    [seen] = doubting.results(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))), 0)
+    [seen] = doubting.process(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))), 0)
     assert [note.partition(":")[0] for note in seen.notes] == ["the two markers contradict"]
 
 

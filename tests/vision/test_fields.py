@@ -19,7 +19,7 @@ from perchctl.vision import (
     pictures,
     step,
 )
-from perchctl.vision.fields import field_picture, is_combed, separate_fields
+from perchctl.vision.fields import interpolate_field, is_combed, separate_fields
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.types import FieldState
 from tests.helpers.interlaced import Pass
@@ -41,7 +41,7 @@ def test_a_field_at_full_height_keeps_everything_in_its_place(first_row: int) ->
     """Half a row's offset would move the whole picture."""
     rows = np.arange(48.0)
     truth = np.rint(127.0 + 100.0 * np.sin(rows / 7.0))[:, None].repeat(32, axis=1)
-    picture = field_picture(truth.astype(np.uint8), first_row)
+    picture = interpolate_field(truth.astype(np.uint8), first_row)
     assert np.array_equal(picture[first_row::2], truth[first_row::2])
     assert np.abs(picture[4:-4] - truth[4:-4]).max() <= 1.0
     assert np.abs(picture[[0, -1]] - truth[[0, -1]]).max() <= 20.0  # one row on, at the rims
@@ -170,7 +170,7 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
     for k in range(12):
         T = pose_of(0.0, 0.0005 * k, 0.4)
         image = render(*T, noise=2.0, seed=k)
-        field = Frame(0, 0.0, field_picture(image, first_row), fields=kind)
+        field = Frame(0, 0.0, interpolate_field(image, first_row), fields=kind)
         seen = detect_markers(field, None, setup.detector, CAMERA).large
         assert seen.lying_sigma_px > 0.0
         for name, d in (("claimed", seen), ("as elsewhere", replace(seen, lying_sigma_px=0.0))):

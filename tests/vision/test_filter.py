@@ -32,7 +32,7 @@ from perchctl.vision.filter import (
     step_track,
 )
 from perchctl.vision.pipeline import step_detections
-from perchctl.vision.target_selection import measurement
+from perchctl.vision.target_selection import track_measurement
 from perchctl.vision.types import MarkerTrack
 from tests.helpers.seen import seen_from
 
@@ -247,7 +247,7 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
             "joint", 0.0, np.zeros(3), np.zeros(3), level, 0.2, np.ones(3), 1.0, 0.0,
             cov=1e-6 * np.eye(4),
         )  # fmt: skip
-        found = measurement(pose, attitude, in_world, constants, setup.pose)
+        found = track_measurement(pose, attitude, in_world, constants, setup.pose)
         return found.z, found.bias[:, TILTS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)

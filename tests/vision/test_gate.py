@@ -22,9 +22,9 @@ from perchctl.vision.tracks import (
     REACQUIRE_S,
     FramePose,
     _is_clear,
-    judged,
+    judge_pose,
 )
-from perchctl.vision.types import Detections, Lock, MarkerTrack, Stranger
+from perchctl.vision.types import Detections, Lock, MarkerTrack, RivalTrack
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -113,7 +113,7 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
 def test_what_is_clearly_the_targets_is_so_by_every_spread(
     off_m: tuple[float, float, float], off_rad: float, sigma_m: float, range_m: float
 ) -> None:
-    """By way of all spreads, as beside a stranger, too."""
+    """By way of all spreads, as beside a rival, too."""
     track = MarkerTrack(t_s=0.0, x=np.zeros(8), P=np.eye(8) * sigma_m**2)
     pose = MarkerPose(
         "joint", 0.03, np.zeros(3), np.array([0.0, 0.0, range_m]), np.zeros(3), 0.0, np.ones(3),
@@ -124,10 +124,10 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
         0.03, pose, Measurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
     )
     constants = make_filter(KalmanConfig(), in_world=True)
-    stranger = Stranger(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
-    lock = Lock(track=track, pose=pose, in_world=True, frames=9, whole=True)
+    rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
+    lock = Lock(track=track, pose=pose, in_world=True, frames=9, has_both=True)
     if _is_clear(track, sight, constants):
-        assert judged(lock, stranger, sight, constants).taken
+        assert judge_pose(lock, rival, sight, constants).accepted
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:

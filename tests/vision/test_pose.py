@@ -39,7 +39,7 @@ from perchctl.vision import (
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import markers_disagree
 from perchctl.vision.pose import normal_cam
-from perchctl.vision.target_selection import measurement
+from perchctl.vision.target_selection import track_measurement
 from perchctl.vision.types import Detection
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -68,15 +68,15 @@ def marker(
     noise_px: float = 0.0,
     rng: np.random.Generator | None = None,
     sigma_px: float = 0.02,
-    by_lines: bool = False,
+    fits_lines: bool = False,
 ) -> Detection:
     """Corners that err on their own, or as intersections of lines that do."""
     corners = project(square_corners(SIDES[name]), rvec, tvec, CAMERA)
-    if rng is not None and by_lines:
+    if rng is not None and fits_lines:
         corners = corners + line_errors(corners, noise_px, rng)
     elif rng is not None:
         corners = corners + rng.normal(0.0, noise_px, corners.shape)
-    return Detection(name, corners, sigma_px, by_lines)
+    return Detection(name, corners, sigma_px, fits_lines)
 
 
 def line_errors(corners: Array, noise_px: float, rng: np.random.Generator) -> Array:
@@ -328,7 +328,7 @@ def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
     true, doubtful = setup_of(size_sigma=0.0, curl_per_m=0.0), setup_of(size_sigma=0.02)
     constants = make_filter(KalmanConfig())
     known, told = (
-        measurement(solved(["large", "small"], setup), None, False, constants, setup)
+        track_measurement(solved(["large", "small"], setup), None, False, constants, setup)
         for setup in (true, doubtful)
     )
     assert known.R is not None

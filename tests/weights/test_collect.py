@@ -12,8 +12,8 @@ import pytest
 from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.profile import PositioningConfig, changed_profile, find_calibration, load_profile
-from perchctl.weights import MocapTruth, SimulatedStand
+from perchctl.profile import PositioningConfig, apply_settings, find_calibration, load_profile
+from perchctl.weights import MocapPoses, SimulatedStand
 from perchctl.weights.collect import position_fault, read_markers
 from perchctl.weights.data import HEADER, read_data
 from tests.helpers.weights_data import run
@@ -75,7 +75,7 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     blind = [type(s)(s.t_s, s.large, None, None) for s in good]
     assert "at once were found in 6 of 12" in (position_fault([*good, *blind]) or "")
     assert "only 2 frames" in (position_fault(good[:2]) or "")
-    strict = changed_profile(profile, ["pose.max_reprojection_px=1e-6"])
+    strict = apply_settings(profile, ["pose.max_reprojection_px=1e-6"])
     poseless = list(read_markers(stand.frames(1, place, 3), strict, camera))
     assert "at once were found in 0 of 3" in (position_fault(poseless) or "")
 
@@ -144,15 +144,15 @@ class Recorded:
 GEAR = np.array([0.0, 0.0, 0.03])
 
 
-def truth_of(capture: Recorded, body: str, yaw_deg: float = 0.0) -> MocapTruth:
+def truth_of(capture: Recorded, body: str, yaw_deg: float = 0.0) -> MocapPoses:
     config = PositioningConfig(by="mocap", body=body, body_rpy_deg=(0.0, 0.0, yaw_deg))
-    return MocapTruth(capture, config, "target", GEAR, capture.clock, capture.wait)
+    return MocapPoses(capture, config, "target", GEAR, capture.clock, capture.wait)
 
 
 @pytest.mark.parametrize(("body", "yaw_rad"), [("cf", 0.0), ("askew", 0.4)])
 def test_motion_capture_gives_the_median_of_the_vehicle_s_axes(body: str, yaw_rad: float) -> None:
     truth = truth_of(Recorded(), body, math.degrees(yaw_rad))
-    pose, attitude = truth.actual(lambda question: "")
+    pose, attitude = truth.actual_pose(lambda question: "")
     assert pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
     assert attitude is not None
     assert attitude.yaw_rad == pytest.approx(0.0, abs=1e-6)
@@ -160,11 +160,11 @@ def test_motion_capture_gives_the_median_of_the_vehicle_s_axes(body: str, yaw_ra
 
 def test_a_capture_that_does_not_see_the_body_is_named() -> None:
     with pytest.raises(NotFound, match="both rigid bodies, 'drone' and 'target'"):
-        truth_of(Recorded(), "drone").actual(lambda question: "")
+        truth_of(Recorded(), "drone").actual_pose(lambda question: "")
     gone = Recorded()
     gone.trouble = "motion capture at vicon:host has ended"
     with pytest.raises(ConnectionFailed, match="has ended"):
-        truth_of(gone, "drone").actual(lambda question: "")
+        truth_of(gone, "drone").actual_pose(lambda question: "")
 
 
 def test_motion_capture_is_the_profile_s(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tests.helpers.weights_data import BEST, independent, known, measured
 
 
 def fitted(data: Measurements) -> np.ndarray:
-    return fit.closed_form(fit.marker_errors(data).sums.sum(axis=1))
+    return fit.closed_form_weights(fit.marker_errors(data).sums.sum(axis=1))
 
 
 def test_the_closed_form_finds_the_known_weights() -> None:
@@ -37,7 +37,7 @@ def test_it_is_the_regression_that_numpy_finds() -> None:
 @given(start=st.floats(0.0, 1.0), seed=st.integers(0, 50), best=st.floats(0.05, 0.95))
 def test_lms_ends_at_the_closed_form_from_any_start(start: float, seed: int, best: float) -> None:
     for data in (known(seed, np.full(4, best)), independent(seed)):
-        weights, _ = fit.lms(fit.marker_errors(data), start)
+        weights, _ = fit.lms_weights(fit.marker_errors(data), start)
         assert np.abs(weights - fitted(data)).max() < 0.01
 
 
@@ -46,7 +46,7 @@ def test_lms_without_a_position_is_lms_of_the_others() -> None:
     rest = data.position != 1
     errors = (data.large - data.actual)[rest], (data.small - data.actual)[rest]
     others = measured(data.position[rest], data.actual[rest], *errors)
-    held_out = fit.lms(fit.marker_errors(data))[1][0]
+    held_out = fit.lms_weights(fit.marker_errors(data))[1][0]
     assert np.abs(held_out - fitted(others)).max() < 0.003
     assert np.abs(held_out - fitted(data)).max() > 0.006
 
@@ -89,7 +89,9 @@ def test_a_constant_offset_moves_no_weight() -> None:
 
 def judged(errors: fit.Errors) -> tuple[dict[str, fit.FittedWeights], fit.Evidence]:
     fits = fit.fit_all(errors)
-    return fits, fit.evidence(errors, {name: each.folds for name, each in fits.items()})
+    return fits, fit.evaluate_weights(
+        errors, {name: each.fold_weights for name, each in fits.items()}
+    )
 
 
 def test_evidence_holds_whole_positions_out() -> None:
@@ -99,11 +101,11 @@ def test_evidence_holds_whole_positions_out() -> None:
     rest = data.position != errors.positions[0]
     apart = (data.large - data.actual)[rest], (data.small - data.actual)[rest]
     others = measured(data.position[rest], data.actual[rest], *apart)
-    assert np.abs(fits["closed_form"].folds[0] - fitted(others)).max() < 1e-9
+    assert np.abs(fits["closed_form"].fold_weights[0] - fitted(others)).max() < 1e-9
     assert found.better.tolist()[0] == 0  # x: the large marker is twice as good
     assert found.better.tolist()[2:] == [1, 1]
     assert all(found.proven(name).all() for name in fit.FITTED)
-    gain, half = found.gain("closed_form", found.squares["paper"])
+    gain, half = found.rms_gain("closed_form", found.squares["paper"])
     assert (np.abs(gain) + half > 0.0).all()
 
 
@@ -119,7 +121,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         errors = fit.marker_errors(independent(seed, per=30))
         fits, found = judged(errors)
         closed = fits["closed_form"]
-        inside += (np.abs(closed.raw - [0.8, 0.5, 0.2, 0.2]) < closed.half).tolist()
+        inside += (np.abs(closed.raw - [0.8, 0.5, 0.2, 0.2]) < closed.half_width).tolist()
         rms, half = found.rms("large")
         inside += (np.abs(rms - [1e-3, 1e-3, 2e-3, 0.02]) < half).tolist()
     assert 0.88 < np.mean(inside) < 0.995

@@ -32,7 +32,7 @@ class NoSolution(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """A camera and the boards' poses that fit the views.
+    """Least-squares solution for a camera and the board's pose in each view.
 
     Attributes:
         poses: rvec and tvec of each view's board in the camera frame, (v, 6).
@@ -50,12 +50,12 @@ class CameraFit:
 
     @property
     def rms_px(self) -> float:
-        """Over all corners: root mean of squared distances, as OpenCV's."""
+        """RMS reprojection error over all corners, defined as in OpenCV."""
         return float(np.sqrt((np.concatenate(self.residuals) ** 2).sum(axis=1).mean()))
 
     @property
-    def spread_px(self) -> float:
-        """The spread of one coordinate of the residuals, from their median distance."""
+    def robust_std_px(self) -> float:
+        """Robust SD of one coordinate of the residuals, from their median distance."""
         return _spread_px(np.concatenate(self.residuals))
 
 
@@ -74,7 +74,7 @@ def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
     Raises NoSolution.
     """
     size_px = views[0].size_px
-    objects = [view.object_m.astype(np.float32)[None] for view in views]
+    objects = [view.corners_m.astype(np.float32)[None] for view in views]
     corners = [view.corners_px.astype(np.float32)[None] for view in views]
     solve = cv2.calibrateCamera if model == "plumb_bob" else cv2.fisheye.calibrate
     flags = 0 if model == "plumb_bob" else _FISHEYE
@@ -91,14 +91,16 @@ def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
 
 
 def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | None:
-    """Return the best poses for a camera held fixed; None where it cannot see some board."""
+    """Fit the board poses for a fixed camera; None if the camera cannot see some board."""
     poses = []
     for view in views:
         seen = undistort(view.corners_px, camera)
         if not np.isfinite(seen).all():
             return None
-        _, rvec, tvec = cv2.solvePnP(view.object_m, seen, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-        pose = cv2.solvePnPRefineLM(view.object_m, seen, np.eye(3), None, rvec, tvec)
+        _, rvec, tvec = cv2.solvePnP(
+            view.corners_m, seen, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        pose = cv2.solvePnPRefineLM(view.corners_m, seen, np.eye(3), None, rvec, tvec)
         poses.append(np.ravel(pose))
     return _fit_of(views, camera, np.array(poses))
 
@@ -106,7 +108,7 @@ def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | No
 def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> CameraFit:
     """Return the fit of a camera and poses, with its residuals."""
     residuals = tuple(
-        view.corners_px - project(view.object_m, pose[:3], pose[3:], camera)
+        view.corners_px - project(view.corners_m, pose[:3], pose[3:], camera)
         for view, pose in zip(views, poses, strict=True)
     )
     return CameraFit(camera, poses, residuals)
@@ -115,8 +117,8 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Ca
 def projection_derivatives(
     camera: CameraModel, pose: Array, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the derivatives of the pixels of points (n, 3) at a pose (rvec, tvec: (6,)) by lens
-    (2 n, p) and by pose (2 n, 6)."""
+    """Return the Jacobians of the projections of points (n, 3) at a pose (rvec and tvec, (6,)) by
+    the lens parameters, (2 n, p), and by the pose, (2 n, 6)."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
     p = len(lens_parameters(camera))
@@ -129,10 +131,10 @@ def projection_derivatives(
 
 
 def lens_covariance(views: Sequence[BoardView], fit: CameraFit) -> Array:
-    """Return the covariance of the lens parameters (p, p), each board's pose being free."""
+    """Return the covariance (p, p) of the lens parameters, marginalized over the board poses."""
     rows = []
     for view, pose, residual in zip(views, fit.poses, fit.residuals, strict=True):
-        lens, outside = projection_derivatives(fit.camera, pose, view.object_m)
+        lens, outside = projection_derivatives(fit.camera, pose, view.corners_m)
         Q, _ = np.linalg.qr(outside)
         rows.append((lens - Q @ (Q.T @ lens), residual.ravel()))
     p = len(fit.parameters)
@@ -163,7 +165,7 @@ _REJECTION_ROUNDS = 10
 def reject_outliers(
     views: Sequence[BoardView], fit: CameraFit
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
-    """Return the fit without outliers, the views that it rests on, and what was left out.
+    """Return the fit without outliers, the views used, and the rejected views and corners.
 
     Raises:
         InvalidValue: too many views do not fit one camera. NoSolution.
@@ -183,7 +185,7 @@ def reject_outliers(
                 f"zoom and focus left alone between the pictures?"
             )
         kept = [
-            view.keep(mask)
+            view.select(mask)
             for view, mask in zip(kept, masks, strict=True)
             if view.name not in reasons
         ]
@@ -202,7 +204,7 @@ def _find_outliers(
     masks, rms = [], []
     for residual in fit.residuals:
         distance = np.linalg.norm(residual, axis=1)
-        spread = max(fit.spread_px, _spread_px(residual))
+        spread = max(fit.robust_std_px, _spread_px(residual))
         mask = distance <= max(CORNER_FACTOR * spread, CORNER_FLOOR_PX)
         masks.append(mask)
         rms.append(float(np.sqrt((distance[mask] ** 2).mean())) if mask.any() else np.inf)
@@ -234,23 +236,24 @@ _LEAST_KNOWN = 1e-10
 
 def jackknife_covariance(
     blocks: Sequence[tuple[Array, Array]],
-    known: Array,
+    prior: Array,
     curvature_factor: float = 1.0,
     information_factor: float = 1.0,
 ) -> Array:
-    """Return the covariance (p, p): the inverse information, or the jackknife's if more.
+    """Return the covariance (p, p) of a least-squares solution: the inverse information, enlarged
+    to the variances of the delete-one-block jackknife where these are larger.
 
     Args:
         blocks: information J' J (p, p) and gradient J' r (p,) of each block of rows.
-        known: prior information (p, p), added to theirs.
-        curvature_factor: ratio of the robust cost's true curvature to the information in `blocks`.
-        information_factor: further factor on it, of the M-estimator's sandwich covariance.
+        prior: prior information (p, p), added to the information of the blocks.
+        curvature_factor: ratio of the robust cost's true curvature to the blocks' information.
+        information_factor: further factor on the blocks' information (sandwich covariance).
     """
     seen = np.sum([information for information, _ in blocks], axis=0)
     # Unlike units are brought to one scale.
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known + curvature_factor * seen), 1e-300))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(prior + curvature_factor * seen), 1e-300))
     both = np.outer(scale, scale)
-    known = known + np.diag(_LEAST_KNOWN / scale**2)
+    known = prior + np.diag(_LEAST_KNOWN / scale**2)
     inverted = np.asarray(
         np.linalg.inv((known + curvature_factor * information_factor * seen) * both)
     )
@@ -263,13 +266,13 @@ def jackknife_covariance(
         ]
     )
     count = len(blocks)
-    spread = (count - 1) * moves.var(axis=0) * student_factor(count - 1) ** 2
+    spread = (count - 1) * moves.var(axis=0) * student_to_normal_ratio(count - 1) ** 2
     # Each parameter by itself: all together would be more than the blocks can tell.
     grown = np.sqrt(np.maximum(spread / np.diagonal(inverted), 1.0)) * scale
     return np.asarray(inverted * np.outer(grown, grown))
 
 
-def student_factor(freedom: int) -> float:
-    """Return Student's 95 % half-width over the normal distribution's, for that many degrees of
-    freedom, taken as at least 3."""
-    return float(stdtrit(max(freedom, 3), 0.975)) / SIGMAS_95
+def student_to_normal_ratio(degrees_of_freedom: int) -> float:
+    """Return the ratio of the 95 % half-widths of Student's t and the normal distribution; fewer
+    than 3 degrees of freedom count as 3."""
+    return float(stdtrit(max(degrees_of_freedom, 3), 0.975)) / SIGMAS_95

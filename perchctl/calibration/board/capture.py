@@ -27,8 +27,8 @@ def find_views(
     board: Board,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundViews:
-    """Return the board's views in picture files, and the pictures that are broken or show none;
-    `progress` gets the numbers done and of all.
+    """Detect the board in picture files; pictures that are broken or show no board are returned
+    apart. `progress` is called with the number of pictures done, and of all.
 
     Raises InvalidValue: unequal sizes.
     """
@@ -76,11 +76,12 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """Return where and how a view shows the board, (5,): its middle and its size as parts of the
-    picture, and by how much its right and its lower side are farther away."""
+    """Return how a view shows the board, (5,): centre of its corners relative to the picture's
+    width and height, its relative size, and its tilt: how much farther away its right side is than
+    its left, and its lower side than its upper."""
     w, h = view.size_px
     x, y = view.corners_px.mean(axis=0) / (w, h)
-    squares = view.object_m[:, :2] / board.square_m
+    squares = view.corners_m[:, :2] / board.square_m
     H, _ = cv2.findHomography(squares - squares.mean(axis=0), view.corners_px)
     if H is None:
         return np.array([x, y, 0.0, 0.0, 0.0])
@@ -95,7 +96,7 @@ def view_signature(view: BoardView, board: Board) -> Array:
 
 
 def signature_distance(one: Array, other: Array) -> float:
-    """Return how different two signatures are; beyond `NEW_BEYOND` a view is new."""
+    """Return the distance of two signatures; beyond `NEW_BEYOND` a view counts as new."""
     return float(np.abs(one - other) @ _WEIGHTS)
 
 
@@ -129,10 +130,10 @@ def capture_views(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> FoundViews:
-    """Take views of a video or a live camera until all is covered, it has ended or `stopped`,
-    whenever the view is new, sharp and still. `show` gets each frame's moment.
+    """Collect new, sharp, still views of the board from a video or live camera, until they cover
+    everything, the source ends, or `stopped` returns True. `show` is called on each frame.
 
-    Raises TimedOut: the camera is gone before there may be enough.
+    Raises TimedOut: the camera is lost before there are `MIN_VIEWS` views.
     """
     capture = GuidedCapture(board)
     try:
@@ -144,7 +145,7 @@ def capture_views(
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")
             taken = capture.update(seen)
             show(capture.guided_frame(frame, seen, taken))
-            if capture.finished:
+            if capture.is_finished:
                 break
     except TimedOut as gone:
         if len(capture.taken) < MIN_VIEWS:
@@ -153,7 +154,7 @@ def capture_views(
 
 
 class GuidedCapture:
-    """The memory of a guided capture: the views `taken`, and what to do next, `advice`."""
+    """State of a guided capture: the views `taken`, and `advice` on the next one."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -163,14 +164,15 @@ class GuidedCapture:
         self.advice = "show the board to the camera"
 
     @property
-    def finished(self) -> bool:
-        """Enough of everything, or so many views that more would not change the solution."""
+    def is_finished(self) -> bool:
+        """True if the views cover everything, or `MOST_VIEWS` were taken."""
         covered = min(covered_shares(self._signatures).values()) >= 1.0
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
-    def update(self, seen: BoardView | str) -> bool:
-        """Judge a picture by its view or the lack of one; true if taken: new, sharp and still."""
-        before = self._last
+    def update(self, view_or_reason: BoardView | str) -> bool:
+        """Process the next picture: its view of the board, or why it has none. Return True if the
+        view was taken, as it is new, sharp and still."""
+        before, seen = self._last, view_or_reason
         self._last = seen if isinstance(seen, BoardView) else None
         if isinstance(seen, str):
             self.advice = seen
@@ -191,11 +193,11 @@ class GuidedCapture:
             return True
         return False
 
-    def guided_frame(self, frame: Frame, seen: BoardView | str, taken: bool) -> GuidedFrame:
-        """Return what to show of a frame."""
+    def guided_frame(self, frame: Frame, view: BoardView | str, taken: bool) -> GuidedFrame:
+        """Return a frame with outline, coverage and advice."""
         outlines: tuple[tuple[str, Array], ...] = ()
-        if isinstance(seen, BoardView):
-            hull = cv2.convexHull(seen.corners_px.astype(np.float32)).reshape(-1, 2)
+        if isinstance(view, BoardView):
+            hull = cv2.convexHull(view.corners_px.astype(np.float32)).reshape(-1, 2)
             outlines = (("small" if taken else "large", hull.astype(np.float64)),)
         shares = covered_shares(self._signatures).items()
         rows = [(name, f"{100 * share:.0f} %", share) for name, share in shares]
@@ -214,8 +216,8 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """Return one thing to do, in the picture's directions: towards where the least was shown so far
-    of what is covered least."""
+    """Return one instruction, in directions of the picture, towards the gap in the least covered of
+    `AXES`."""
     done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:

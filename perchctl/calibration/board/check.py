@@ -24,7 +24,7 @@ import numpy as np
 from perchctl.calibration.board.adjust import CameraFit, fit_poses, lens_covariance
 from perchctl.calibration.board.detect import FoundViews, Rejection
 from perchctl.calibration.board.predict import allowed_error_mm, position_errors_mm, predict_errors
-from perchctl.calibration.board.solve import rejected_views, robust_fit, tilts_deg
+from perchctl.calibration.board.solve import rejected_view_records, robust_fit, tilts_deg
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 
@@ -36,30 +36,31 @@ UNSURE_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class Deviation:
-    """The distance between the target's places by the two cameras, straight ahead, in mm; `mm95`
-    is how well the new pictures fix that."""
+    """Shift in mm of the target's position between the checked and the refitted camera, straight
+    ahead; `mm95`: 95 % uncertainty of the refit."""
 
     z_m: float
     mm: float
     mm95: float
 
     @property
-    def share(self) -> float:
-        """Share of the limit; zero where the pictures themselves do not fix it so well."""
+    def limit_share(self) -> float:
+        """`mm` as a share of the limit; 0 if it is within the uncertainty."""
         return self.mm / allowed_error_mm(self.z_m) if self.mm > self.mm95 else 0.0
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The verdict on a calibration by new pictures, and why.
+    """Verdict on a calibration by new pictures, with the reason.
 
-    rms_px: by the file's camera (infinite: it sees no board); free_rms_px: by the best-fitting one.
+    rms_px is of the checked camera (infinite if it cannot see the boards), best_rms_px of the
+    camera refitted to the pictures.
     """
 
     passed: bool
     reason: str
     rms_px: float
-    free_rms_px: float
+    best_rms_px: float
     deviations: tuple[Deviation, ...]
     rejections: tuple[Rejection, ...]
 
@@ -70,8 +71,8 @@ class CheckResult:
             "reason": self.reason,
             "file": str(file),
             "rms_px": self.rms_px if np.isfinite(self.rms_px) else None,
-            "best_rms_px": self.free_rms_px,
-            "views_rejected": rejected_views(self.rejections),
+            "best_rms_px": self.best_rms_px,
+            "views_rejected": rejected_view_records(self.rejections),
             "error_mm": [vars(d) for d in self.deviations if np.isfinite(d.mm)],
         }
 
@@ -79,7 +80,7 @@ class CheckResult:
 def check_calibration(camera: CameraModel, found: FoundViews) -> CheckResult:
     """Judge a calibration by new views of a board.
 
-    Raises InvalidValue for too few views, or views that do not fix it.
+    Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
     """
     if len(found.views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
@@ -111,8 +112,8 @@ def _verdict(
             f"reprojection RMS {fixed.rms_px:.2f} px, where these pictures allow "
             f"{free.rms_px:.2f} px"
         )
-    worst = max(deviations, key=lambda d: d.share, default=None)
-    if worst is not None and worst.share > 0.5:
+    worst = max(deviations, key=lambda d: d.limit_share, default=None)
+    if worst is not None and worst.limit_share > 0.5:
         return False, (
             f"at {worst.z_m * 100:.0f} cm the target would be {worst.mm:.1f} mm from where "
             f"these pictures put it (+-{worst.mm95:.1f} mm), and "

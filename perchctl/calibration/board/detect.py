@@ -24,56 +24,57 @@ _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One picture of the board.
+    """Detected board corners of one picture.
 
     Attributes:
-        name: of the file, or the frame's number.
+        name: the file's name, or the frame's number.
         size_px: the picture's width and height.
-        ids: number of each corner on the board, (n,).
-        object_m: the corners on the board, z = 0, (n, 3).
-        corners_px: in the picture, pixel (0, 0) is the centre of the top-left one, (n, 2).
+        ids: index of each corner on the board, (n,).
+        corners_m: corner positions on the board, z = 0, (n, 3).
+        corners_px: corner positions in the picture, (n, 2); the top-left pixel's centre is (0, 0).
         blur_px: median spread of the edges at the corners (tanh width).
     """
 
     name: str
     size_px: tuple[int, int]
     ids: NDArray[np.intp]
-    object_m: Array
+    corners_m: Array
     corners_px: Array
     blur_px: float = 0.0
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def keep(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> BoardView:
-        """Return the same view with some of its corners."""
+    def select(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> BoardView:
+        """Return this view with only the corners of a mask or of indices."""
         return replace(
             self,
             ids=self.ids[which],
-            object_m=self.object_m[which],
+            corners_m=self.corners_m[which],
             corners_px=self.corners_px[which],
         )
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """A view, or corners of a view, left out, and why."""
+    """A view left out, or some of its corners, and why."""
 
     view: str
     reason: str
-    corners: tuple[int, ...] = ()  # empty: the whole view
+    corner_ids: tuple[int, ...] = ()  # empty: the whole view
 
 
 @dataclass(frozen=True, eq=False)
 class FoundViews:
-    """The views of a board, and the pictures in which none was found, with the reason."""
+    """The detected views of a board, and the pictures without one, with the reason."""
 
     views: tuple[BoardView, ...]
-    missing: tuple[Rejection, ...] = ()
+    without_board: tuple[Rejection, ...] = ()
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """Return the view in a grey picture (h, w), of its first field if interlaced, or why none."""
+    """Return the view of a board in a grey picture (h, w), or why there is none. In an interlaced
+    picture the first field is used, as a moving board has two positions."""
     image = split_fields(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
@@ -91,11 +92,11 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     # A ChArUco board's markers begin so far inside of its white squares.
     white = 1.0 if board.marker_m is None else 0.5 * (1.0 - board.marker_m / board.square_m)
     fit = fit_saddles(image, corners, _local_axes(_cells(board, ids), corners), white)
-    if fit.ok.sum() < MIN_CORNERS:
-        return f"only {int(fit.ok.sum())} corners are sharp enough to be measured"
-    blur_px = float(np.median(fit.width_px[fit.ok]))
+    if fit.is_valid.sum() < MIN_CORNERS:
+        return f"only {int(fit.is_valid.sum())} corners are sharp enough to be measured"
+    blur_px = float(np.median(fit.edge_width_px[fit.is_valid]))
     object_m = board.corners_m()[ids]
-    return BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px).keep(fit.ok)
+    return BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px).select(fit.is_valid)
 
 
 def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
@@ -184,26 +185,26 @@ _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedCorners:
-    """Refined corners: corners_px (n, 2); ok (n,), true where the fit holds; width_px (n,), the
-    wider edge's spread."""
+class SaddleFit:
+    """Refined corners (n, 2); is_valid (n,); edge_width_px (n,), blur (tanh width) of the wider
+    edge at each corner."""
 
     corners_px: Array
-    ok: NDArray[np.bool_]
-    width_px: Array
+    is_valid: NDArray[np.bool_]
+    edge_width_px: Array
 
 
 def fit_saddles(
-    image: NDArray[np.uint8], corners_px: Array, axes_px: Array, white: float = 1.0
-) -> RefinedCorners:
+    image: NDArray[np.uint8], corners_px: Array, axes_px: Array, white_rim: float = 1.0
+) -> SaddleFit:
     """Return the corners refined to hundredths of a pixel.
 
     Args:
         image: grey picture (h, w).
         corners_px: first guess, good to a fifth of a square, (n, 2).
-        axes_px: the vectors from a corner to its neighbours on the board, as the picture shows
-            them, the columns of (n, 2, 2).
-        white: how far the white squares are empty at their rims, in squares.
+        axes_px: in the picture, the vectors from each corner to its two neighbours on the board,
+            as the columns of (n, 2, 2).
+        white_rim: width of the blank rim of the white squares, in squares (1: no markers inside).
     """
     start = np.asarray(corners_px, dtype=np.float64)
     area = np.abs(np.linalg.det(axes_px))
@@ -214,7 +215,7 @@ def fit_saddles(
     uv = np.stack(np.meshgrid(t, t), axis=-1).reshape(1, -1, 2) * reach[:, None, None]
     offsets = np.einsum("nij,nmj->nmi", axes_px, uv)
     grey, inside = _sample(image, start[:, None] + offsets)
-    weight = inside * _is_blank(uv, grey, white, size_px)
+    weight = inside * _is_blank(uv, grey, white_rim, size_px)
     # Lines: along u and along v, by their normals. State: x, y, angle 1, 2, ln w1, ln w2.
     state = np.zeros((len(start), 6))
     state[:, 2:4] = np.arctan2(axes_px[:, 0], -axes_px[:, 1])
@@ -239,7 +240,7 @@ def fit_saddles(
         & (np.abs(np.sin(state[:, 2] - state[:, 3])) > 0.1)
     )
     corners = np.where(ok[:, None], start + state[:, :2], start)
-    return RefinedCorners(corners, ok, np.exp(state[:, 4:]).max(axis=1))
+    return SaddleFit(corners, ok, np.exp(state[:, 4:]).max(axis=1))
 
 
 def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.bool_]]:

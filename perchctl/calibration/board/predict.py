@@ -31,10 +31,11 @@ _LIMIT_FLOOR_MM = 1.0
 
 
 @dataclass(frozen=True)
-class RangeError:
-    """95 % line of the target's position error at one distance.
+class ErrorAtRange:
+    """95 % bound of the target's position error at one distance.
 
-    mm95: the worst place with a whole marker where boards were seen; axis_mm95: straight ahead.
+    mm95: largest over the part of the picture that the calibration boards covered and that shows a
+    whole marker; axis_mm95: straight ahead.
     """
 
     z_m: float
@@ -43,12 +44,12 @@ class RangeError:
 
 
 def allowed_error_mm(z_m: float) -> float:
-    """Return the allowed error: 1 mm, or 1 % of the distance if more."""
+    """Return the position error that perching allows: the larger of 1 mm and 1 % of distance."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
 def covered_cells(views: Sequence[BoardView]) -> NDArray[np.bool_]:
-    """Return the cells of the picture (rows, columns) that lie inside of some board's corners."""
+    """Return a mask (rows, columns) of the picture's grid cells inside some board's corners."""
     rows, columns = CELLS
     cells_seen = np.zeros(CELLS, dtype=np.uint8)
     for view in views:
@@ -62,9 +63,9 @@ def predict_errors(
     covariance: Array,
     covered: NDArray[np.bool_] | None = None,
     ranges_m: Sequence[float] = RANGES_M,
-) -> tuple[RangeError, ...]:
-    """Return the 95 % lines of position error at each distance where a marker lies wholly in
-    `covered` cells (None: anywhere), and straight ahead."""
+) -> tuple[ErrorAtRange, ...]:
+    """Predict the target's position error at each distance from the covariance of the lens
+    parameters, for markers wholly within `covered` cells (None: the whole picture)."""
     result = []
     for z_m in ranges_m:
         lines_mm = []
@@ -74,14 +75,15 @@ def predict_errors(
             # Corners stay where they are, so the pose moves against the lens.
             moved = np.linalg.lstsq(pose, lens, rcond=None)[0][3:]
             lines_mm.append(1e3 * SIGMAS_95 * np.sqrt(np.trace(moved @ covariance @ moved.T)))
-        result.append(RangeError(z_m, float(max(lines_mm)), float(lines_mm[0])))
+        result.append(ErrorAtRange(z_m, float(max(lines_mm)), float(lines_mm[0])))
     return tuple(result)
 
 
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """Return how far apart `truth` and `camera` put a target at each place, (n,) mm, axis first."""
+    """Return the target's position errors (n,) if pictures of camera `truth` are evaluated with
+    `camera`, at n places at distance z_m; the first is on the axis."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)
     views = [

@@ -22,7 +22,7 @@ from perchctl.calibration.board.adjust import (
 )
 from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection
 from perchctl.calibration.board.predict import (
-    RangeError,
+    ErrorAtRange,
     allowed_error_mm,
     covered_cells,
     predict_errors,
@@ -50,11 +50,11 @@ class Calibration:
     Attributes:
         fit: the camera, and the poses and residuals of the `views`.
         covariance: of its lens parameters, (p, p).
-        views: those used, without rejected corners.
-        missing: pictures without a board, and why.
-        errors: what the covariance means at the target, by distance.
-        covered: the picture's cells (rows, columns) that boards were seen in.
-        lacks: what keeps it from being good, and what would mend it.
+        views: the views used, without rejected corners.
+        without_board: pictures without a board, and why.
+        errors: predicted position error of the target, by distance.
+        covered_cells: mask (rows, columns) of the picture's grid cells that boards covered.
+        defects: what rules out the best verdict whatever the error, with remedies.
     """
 
     board: str
@@ -62,10 +62,10 @@ class Calibration:
     covariance: Array
     views: tuple[BoardView, ...]
     rejections: tuple[Rejection, ...]
-    missing: tuple[Rejection, ...]
-    errors: tuple[RangeError, ...]
-    covered: NDArray[np.bool_]
-    lacks: tuple[str, ...]
+    without_board: tuple[Rejection, ...]
+    errors: tuple[ErrorAtRange, ...]
+    covered_cells: NDArray[np.bool_]
+    defects: tuple[str, ...]
 
     @property
     def camera(self) -> CameraModel:
@@ -78,20 +78,21 @@ class Calibration:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def level(self) -> Level:
-        """Verdict by the predicted error ahead, where it perches; twice the limit to the side."""
+    def verdict(self) -> Level:
+        """Verdict by defects and by the predicted error straight ahead, where perching happens; off
+        axis twice the limit is accepted."""
         ahead = max(e.axis_mm95 / allowed_error_mm(e.z_m) for e in self.errors)
         aside = max(e.mm95 / allowed_error_mm(e.z_m) for e in self.errors)
-        if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.lacks:
+        if ahead <= 1.0 and aside <= ASIDE_FACTOR and not self.defects:
             return "fly"
         return "care" if ahead <= CARE_FACTOR else "stop"
 
     @property
     def verdict_text(self) -> str:
-        """The verdict in words, with the two distances that matter."""
+        """The verdict in words, with the predicted errors at 10 cm and 1 m."""
         near, far = (e for e in self.errors if e.z_m in (0.1, 1.0))
         text = (
-            f"{TITLES[self.level]}: the target's centre is within {near.axis_mm95:.2g} mm at "
+            f"{TITLES[self.verdict]}: the target's centre is within {near.axis_mm95:.2g} mm at "
             f"10 cm and {far.axis_mm95:.2g} mm at 1 m (95 %)"
         )
         aside = max(self.errors, key=lambda e: e.mm95 / allowed_error_mm(e.z_m))
@@ -100,10 +101,14 @@ class Calibration:
         return text
 
     def lines(self) -> list[str]:
-        """Return what was left out, the lens, what it lacks, and the verdict at the end."""
-        lines = [f"left out {r.view}: {r.reason}" for r in self.missing]
+        """Return lines on rejections, lens parameters, shortcomings and the verdict."""
+        lines = [f"left out {r.view}: {r.reason}" for r in self.without_board]
         for r in self.rejections:
-            what = f"corners {', '.join(map(str, r.corners))} of {r.view}" if r.corners else r.view
+            what = (
+                f"corners {', '.join(map(str, r.corner_ids))} of {r.view}"
+                if r.corner_ids
+                else r.view
+            )
             lines.append(f"rejected {what}: {r.reason}")
         values = zip(
             ("fx", "fy", "cx", "cy"), self.fit.parameters, self.parameter_std, strict=False
@@ -112,10 +117,10 @@ class Calibration:
         lines.append(
             f"{len(self.views)} views, RMS {self.fit.rms_px:.3f} px, {self.camera.model}, {lens} px"
         )
-        return [*lines, *self.lacks, self.verdict_text]
+        return [*lines, *self.defects, self.verdict_text]
 
     def record(self) -> dict[str, Any]:
-        """Return the measured part of the object of `calibrate --json`."""
+        """Return the results for `calibrate --json`."""
         names = PARAMETERS[self.camera.model]
         values = self.fit.parameters.tolist()
         return {
@@ -126,17 +131,17 @@ class Calibration:
             "board": self.board,
             "rms_px": self.fit.rms_px,
             "views_used": len(self.views),
-            "views_rejected": rejected_views(self.rejections),
-            "pictures_without_board": rejected_views(self.missing),
+            "views_rejected": rejected_view_records(self.rejections),
+            "pictures_without_board": rejected_view_records(self.without_board),
             "std": dict(zip(names, self.parameter_std.tolist(), strict=True)),
             "error_mm": [vars(e) | {"limit_mm": allowed_error_mm(e.z_m)} for e in self.errors],
-            "coverage": float(self.covered.mean()),
-            "warnings": list(self.lacks),
-            "verdict": self.level,
+            "coverage": float(self.covered_cells.mean()),
+            "warnings": list(self.defects),
+            "verdict": self.verdict,
         }
 
-    def text(self, name: str, date: str) -> str:
-        """Return the calibration file, with its quality and the parameters' covariance."""
+    def file_text(self, name: str, date: str) -> str:
+        """Return the content of the calibration file, with quality and covariance."""
         return calibration_text(
             self.camera,
             name,
@@ -145,7 +150,7 @@ class Calibration:
                 "board": self.board,
                 "rms_px": self.fit.rms_px,
                 "views_used": len(self.views),
-                "views_rejected": len(rejected_views(self.rejections)),
+                "views_rejected": len(rejected_view_records(self.rejections)),
                 "parameters": " ".join(PARAMETERS[self.camera.model]),
                 "parameter_std": self.parameter_std[None],
                 "parameter_covariance": self.covariance,
@@ -153,23 +158,23 @@ class Calibration:
         )
 
 
-def rejected_views(rejections: Iterable[Rejection]) -> list[dict[str, str]]:
-    """Return the whole views that were left out, as a record has them."""
-    return [{"name": r.view, "reason": r.reason} for r in rejections if not r.corners]
+def rejected_view_records(rejections: Iterable[Rejection]) -> list[dict[str, str]]:
+    """Return name and reason of each wholly rejected view, for JSON."""
+    return [{"name": r.view, "reason": r.reason} for r in rejections if not r.corner_ids]
 
 
 def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Calibration:
-    """Solve for the camera, leave outliers out, and predict the error at the target.
+    """Fit the camera without outliers, and predict the position error at the target.
 
     Args:
-        board: its notation, for the file.
+        board: notation of the board, for the file.
         model: ``plumb_bob`` or ``fisheye``; ``auto`` for the simplest one that follows the lens.
 
     Raises:
         InvalidValue: too few views, all frontal, most of the image empty, focal length
         not fixed, or too many views that fit no camera.
     """
-    pictures = len(found.views) + len(found.missing)
+    pictures = len(found.views) + len(found.without_board)
     _check_count(found.views, pictures)
     models = MODEL_NAMES if model == "auto" else (model,)
     fit, kept, rejections = robust_fit(found.views, models)
@@ -185,18 +190,19 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
         covariance=covariance,
         views=tuple(kept),
         rejections=tuple(rejections),
-        missing=found.missing,
+        without_board=found.without_board,
         errors=predict_errors(fit.camera, covariance, covered),
-        covered=covered,
-        lacks=tuple(_lacks(fit, len(kept), covered)),
+        covered_cells=covered,
+        defects=tuple(_lacks(fit, len(kept), covered)),
     )
 
 
 def robust_fit(
     views: Sequence[BoardView], models: Sequence[str] = MODEL_NAMES
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
-    """Return the fit without outliers by the simplest of `models` that follows the lens (one that
-    cannot would call views at the rim outliers), its views, and what was left out.
+    """Fit the views without outliers, with the simplest of `models` that describes the lens (an
+    unfit model would reject views at the picture's rim). Return the fit, the views used, and the
+    rejected views and corners.
 
     Raises InvalidValue: the views fit no camera.
     """
@@ -206,7 +212,7 @@ def robust_fit(
             fit = fit_camera(views, model)
         except NoSolution:
             continue
-        follows = best is not None and fit.spread_px < _EASIER * best.spread_px
+        follows = best is not None and fit.robust_std_px < _EASIER * best.robust_std_px
         if best is None or (follows and _is_usable(fit.camera)):
             best = fit
     try:
@@ -299,7 +305,7 @@ def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
 
 
 def tilts_deg(poses: Array) -> Array:
-    """Return how far each board (poses (v, 6)) is turned out of the image plane, (v,) deg."""
+    """Return the tilt of each board (poses (v, 6)) against the image plane, (v,)."""
     normals = np.array([cv2.Rodrigues(pose[:3])[0][2, 2] for pose in poses])
     return np.asarray(np.degrees(np.arccos(np.minimum(np.abs(normals), 1.0))), dtype=np.float64)
 

@@ -43,14 +43,14 @@ def record_mounting(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Fill the recording until no motion is missing, a recorded source has ended, or `stopped`.
+    """Fill the recording until it has all motions, a recorded source ends, or `stopped` is True.
 
     Args:
-        attitudes: returns the vehicle's samples that are new, oldest first.
-        problem: returns what is wrong with the vehicle by a time, None if nothing is.
+        attitudes: returns the vehicle's new samples, oldest first.
+        problem: returns the vehicle's problem at a time, or None.
 
     Raises:
-        TimedOut: camera or vehicle are gone; the recording keeps what came before.
+        TimedOut: camera or vehicle are lost; the recording keeps the data until then.
         InvalidValue: the picture is mirrored.
     """
     oldest_s = clock() - BEFORE_S

@@ -44,11 +44,11 @@ LATENCY, KNOTS = 12, 13
 
 @dataclass(frozen=True, eq=False)
 class RotationSolution:
-    """The carry's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
+    """Camera rotation and latency from the carry recording; value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
-        R_body_cam: (3, 3); rotation_cov_rad2 (3, 3) of a small turn of it in body axes.
-        latency_s: from exposure to the picture's timestamp; positive is a late picture.
+        rotation_cov_rad2: covariance (3, 3) of a small rotation of R_body_cam in body axes.
+        latency_s: from exposure to the picture's timestamp; positive if pictures are late.
     """
 
     R_body_cam: Array
@@ -58,13 +58,13 @@ class RotationSolution:
 
     @property
     def rpy_deg(self) -> tuple[float, float, float]:
-        """The camera's turn in degrees, as `camera.mount.rpy_deg` has it."""
+        """The camera's rotation in degrees, as in `camera.mount.rpy_deg`."""
         x, y, z = np.degrees(rpy_from_rotation(self.R_body_cam)).tolist()
         return x, y, z
 
     @property
     def rpy_sigma_deg(self) -> tuple[float, float, float]:
-        """Sigma of the three angles, from the covariance of a small turn left of R_body_cam."""
+        """Sigma of the three angles."""
         step = 1e-6
         small = Rotation.from_rotvec(step * np.eye(3)).as_matrix()
         here = np.array(rpy_from_rotation(self.R_body_cam))
@@ -75,7 +75,7 @@ class RotationSolution:
 
 
 def solve_rotation(recording: MountingRecording) -> RotationSolution:
-    """Solve for the camera's turn in the body and its latency.
+    """Solve for the camera's rotation in the body and its latency.
 
     Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
     agree; with what to do.
@@ -87,7 +87,7 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
     bias = np.zeros(3)
     scale = np.zeros(3)
     body = integrate_gyro(t_s, gyro, bias, scale)
-    R_body_cam, latency_s = guess_rotation(body, poses)
+    R_body_cam, latency_s = guess_rotation_and_latency(body, poses)
     R_world_target = _middle_target(body, poses, R_body_cam, latency_s)
     knots_s = np.linspace(t_s[0], t_s[-1], 1 + max(1, round((t_s[-1] - t_s[0]) / KNOT_S)))
     walk = np.zeros((len(knots_s) - 1, 3))
@@ -181,10 +181,10 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class GyroRotation:
-    """The integrated rotation R_world_body (n, 3, 3) at t_s (n,), with its rates (n, 3).
+    """The vehicle's rotation, integrated from its gyroscope, at n times, with its rates (n, 3).
 
     `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the rotation, in world axes, by
-    the gyroscope's bias (rad/s) and by its scale error.
+    the gyroscope's bias (rad/s) and scale error.
     """
 
     t_s: Array
@@ -195,9 +195,9 @@ class GyroRotation:
 
 
 def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Array) -> GyroRotation:
-    """Integrate the gyroscope (n, 3), its errors taken off: rate = (gyro - bias) (1 + scale).
+    """Integrate the gyroscope (n, 3), corrected to rate = (gyro - bias) (1 + scale).
 
-    Between two samples the rate goes straight from one to the other, to fourth order (Magnus).
+    The rate is taken as linear between samples; the method is of fourth order (Magnus).
     """
     unbiased = gyro_radps - bias_radps
     rate = unbiased * (1.0 + scale)
@@ -220,25 +220,25 @@ def _integral(values: Array, dt: Array) -> Array:
     return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
 
-def interpolate_rotation(whole: GyroRotation, t_s: Array) -> GyroRotation:
-    """Return the rotation at other times (m,), which are clipped to the recording's."""
-    grid = whole.t_s
+def interpolate_rotation(gyro: GyroRotation, t_s: Array) -> GyroRotation:
+    """Interpolate the rotation at m times, which are clipped to the recording."""
+    grid = gyro.t_s
     t_s = np.clip(t_s, grid[0], grid[-1])
     k = np.clip(np.searchsorted(grid, t_s, side="right") - 1, 0, len(grid) - 2)
     into = (t_s - grid[k])[:, None]
     share = into / (grid[k + 1] - grid[k])[:, None]
-    change = whole.rate_radps[k + 1] - whole.rate_radps[k]
-    way = into * (whole.rate_radps[k] + 0.5 * share * change)
+    change = gyro.rate_radps[k + 1] - gyro.rate_radps[k]
+    way = into * (gyro.rate_radps[k] + 0.5 * share * change)
 
     def between(values: Array) -> Array:
         return np.asarray(values[k] + share[..., None] * (values[k + 1] - values[k]))
 
     return GyroRotation(
         t_s=t_s,
-        R_world_body=whole.R_world_body[k] @ _turns(way),
-        rate_radps=whole.rate_radps[k] + share * change,
-        bias_jacobian=between(whole.bias_jacobian),
-        scale_jacobian=between(whole.scale_jacobian),
+        R_world_body=gyro.R_world_body[k] @ _turns(way),
+        rate_radps=gyro.rate_radps[k] + share * change,
+        bias_jacobian=between(gyro.bias_jacobian),
+        scale_jacobian=between(gyro.scale_jacobian),
     )
 
 
@@ -267,9 +267,9 @@ _FIT_ROUNDS = 3
 _HALF_COUNTED_RAD = 0.02
 
 
-def guess_rotation(whole: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
-    """Return a guess of R_body_cam and the latency. Raises InvalidValue without pairs of pictures
-    some tenths of a second apart."""
+def guess_rotation_and_latency(gyro: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
+    """Return a first estimate of R_body_cam and of the latency in s. Raises InvalidValue without
+    pairs of pictures some tenths of a second apart."""
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
         raise InvalidValue(
@@ -279,8 +279,8 @@ def guess_rotation(whole: GyroRotation, poses: PoseArrays) -> tuple[Array, float
     seen = _vectors(R[first] @ R[second].transpose(0, 2, 1))
     guesses = []
     for latency_s in LATENCIES_S.tolist():
-        a = interpolate_rotation(whole, poses.t_s[first] - latency_s).R_world_body
-        b = interpolate_rotation(whole, poses.t_s[second] - latency_s).R_world_body
+        a = interpolate_rotation(gyro, poses.t_s[first] - latency_s).R_world_body
+        b = interpolate_rotation(gyro, poses.t_s[second] - latency_s).R_world_body
         R_body_cam, misfit = _fit_turn(_vectors(a.transpose(0, 2, 1) @ b), seen)
         guesses.append((misfit, latency_s, R_body_cam))
     _, latency_s, R_body_cam = min(guesses, key=lambda guess: guess[0])
@@ -322,61 +322,68 @@ _MEDIAN_OF_CHI2 = 2.366  # with three degrees of freedom
 
 @dataclass(frozen=True, eq=False)
 class PoseResiduals:
-    """Residuals `misfit` (n, 3) of poses in time order, their Jacobian `design` (n, 3, p), inverse
-    covariances (n, 3, 3), robust weights `counted` (n,), and prior information `known` (p, p)."""
+    """Residuals `misfit` (n, 3) of n poses in time order, Jacobian (n, 3, p), inverse covariances
+    (n, 3, 3), robust weights (n,), and prior information (p, p) of the p parameters."""
 
-    design: Array
+    jacobian: Array
     misfit: Array
-    inverse: Array
-    counted: Array
-    known: Array
+    inverse_cov: Array
+    robust_weights: Array
+    prior: Array
 
     @property
     def chi2(self) -> Array:
         """Squared size of each misfit in standard deviations, (n,)."""
-        return _distance2(self.misfit, self.inverse)
+        return _distance2(self.misfit, self.inverse_cov)
 
     @property
     def rejected_share(self) -> float:
-        """Share of the poses that hardly count."""
-        return float((self.counted < _COUNTS_LITTLE).mean())
+        """Share of the poses whose robust weight is nearly 0."""
+        return float((self.robust_weights < _COUNTS_LITTLE).mean())
 
-    def normal_equations(self, some: slice | NDArray[np.intp] = slice(None)) -> tuple[Array, Array]:
-        """Return information (p, p) and gradient (p,) of some of the poses."""
-        p = self.design.shape[2]
-        design = self.design[some]
-        counted = self.counted[some, None, None]
-        weighted = ((self.inverse[some] * counted) @ design).reshape(-1, p)
-        return design.reshape(-1, p).T @ weighted, -weighted.T @ self.misfit[some].ravel()
+    def normal_equations(
+        self, poses: slice | NDArray[np.intp] = slice(None)
+    ) -> tuple[Array, Array]:
+        """Return information (p, p) and gradient (p,) of the poses with these indices."""
+        p = self.jacobian.shape[2]
+        jacobian = self.jacobian[poses]
+        weights = self.robust_weights[poses, None, None]
+        weighted = ((self.inverse_cov[poses] * weights) @ jacobian).reshape(-1, p)
+        return jacobian.reshape(-1, p).T @ weighted, -weighted.T @ self.misfit[poses].ravel()
 
     def step(self, prior_offset: Array | float = 0.0) -> Array:
-        """Return the Gauss-Newton step (p,) to the least misfit; `prior_offset` (p,) is from the
+        """Return the Gauss-Newton step (p,); `prior_offset` (p,) is the parameters' offset from the
         prior's mean."""
         information, gradient = self.normal_equations()
-        pull = self.known @ np.broadcast_to(prior_offset, gradient.shape)
-        return np.asarray(np.linalg.solve(information + self.known, gradient - pull))
+        pull = self.prior @ np.broadcast_to(prior_offset, gradient.shape)
+        return np.asarray(np.linalg.solve(information + self.prior, gradient - pull))
 
     def after_step(self, step: Array) -> PoseResiduals:
-        """Return the rows after a step (p,) of a linear problem."""
-        misfit = self.misfit + self.design @ step
-        return replace(self, misfit=misfit, counted=_weights(_distance2(misfit, self.inverse)))
+        """Return the residuals after a step (p,), to first order."""
+        misfit = self.misfit + self.jacobian @ step
+        return replace(
+            self, misfit=misfit, robust_weights=_weights(_distance2(misfit, self.inverse_cov))
+        )
 
     def covariance(self) -> Array:
-        """Return the parameters' covariance (p, p), by a jackknife of blocks: the errors of
-        neighbouring pictures may correlate."""
+        """Return the parameters' covariance (p, p), by a block jackknife, as errors of consecutive
+        pictures may correlate."""
         blocks = [
             self.normal_equations(k) for k in np.array_split(np.arange(len(self.misfit)), BLOCKS)
         ]
-        return jackknife_covariance(blocks, self.known, *_robust_shares(self.chi2))
+        return jackknife_covariance(blocks, self.prior, *_robust_shares(self.chi2))
 
 
 def weight_residuals(
-    design: Array, misfit: Array, cov: Array, known: Array, late: Array | None = None
+    jacobian: Array,
+    misfit: Array,
+    cov: Array,
+    prior: Array,
+    late_jacobian: Array | None = None,
 ) -> PoseResiduals:
-    """Return the residuals of poses, weighted by their covariances (n, 3, 3) times an estimated
-    factor. With `late` (n, 3), the derivative by a second of delay, the likeliest jitter of the
-    timestamps is added."""
-    best_cost, best = np.inf, cov
+    """Weight the residuals of poses by their covariances (n, 3, 3), times an estimated factor. With
+    `late_jacobian` (n, 3), by a second of delay, the timestamps' jitter is estimated and added."""
+    best_cost, best, late = np.inf, cov, late_jacobian
     for jitter_s in (0.0,) if late is None else _JITTERS_S:
         spread = cov
         if late is not None:
@@ -390,7 +397,8 @@ def weight_residuals(
         if cost < best_cost:
             best_cost = cost
             best = inverse / factor2
-    return PoseResiduals(design, misfit, best, _weights(_distance2(misfit, best)), known)
+    weights = _weights(_distance2(misfit, best))
+    return PoseResiduals(jacobian, misfit, best, weights, prior)
 
 
 def _distance2(misfit: Array, inverse: Array) -> Array:

@@ -31,16 +31,16 @@ _STEPS, _SPLITS, _SLIP_STEPS = 12, 19, 4
 
 @dataclass(frozen=True, eq=False)
 class PivotSolution:
-    """The pivot's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
+    """Gear tip from the pivot recording; value +- 1.96 sigma is a 95 % interval.
 
     Attributes:
-        gear_cam_m: tip of the gear in the camera's frame; its covariance (3, 3).
-        point_target_m: where the tip stood, in the target's frame, (3,).
+        gear_cam_m: tip of the gear in the camera frame, (3,), with covariance_m2 (3, 3).
+        pivot_point_target_m: the fixed point on which the tip stood, in the target frame, (3,).
     """
 
     gear_cam_m: Array
     covariance_m2: Array
-    point_target_m: Array
+    pivot_point_target_m: Array
 
     @property
     def gear_cam_sigma_m(self) -> Array:
@@ -52,8 +52,8 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     """Solve for the gear's tip in the camera's frame.
 
     Args:
-        size_sigma: by which share the printed sizes may be off (`target.size_sigma`): all
-            distances are, with them.
+        size_sigma: relative sigma of the printed sizes (`target.size_sigma`), which scale all
+            distances.
 
     Raises InvalidValue: too few or too equal tilts, a tip that slipped, a mirrored picture.
     """
@@ -82,7 +82,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     return PivotSolution(
         gear_cam_m=tip_m,
         covariance_m2=cov_m2 + size_sigma**2 * np.outer(tip_m, tip_m),
-        point_target_m=found[3:],
+        pivot_point_target_m=found[3:],
     )
 
 
@@ -103,10 +103,10 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
     n, alone = len(rows.misfit), _size(rows)
     explains, moved_m, at_s = 0.0, 0.0, 0.0
     for k in np.unique(np.linspace(0, n, _SPLITS + 2).astype(np.intp))[1:-1]:
-        after = (np.arange(n) >= k)[:, None, None] * rows.design[:, :, 3:]
-        design = np.concatenate([rows.design, after], axis=2)
+        after = (np.arange(n) >= k)[:, None, None] * rows.jacobian[:, :, 3:]
+        design = np.concatenate([rows.jacobian, after], axis=2)
         found = np.zeros(9)
-        two = replace(rows, design=design, known=np.zeros((9, 9)))
+        two = replace(rows, jacobian=design, prior=np.zeros((9, 9)))
         for _ in range(_SLIP_STEPS):
             step = two.step()
             found = found + step

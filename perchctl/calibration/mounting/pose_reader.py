@@ -24,9 +24,8 @@ from perchctl.vision import (
 class PoseReader:
     """Reads the target's pose from each frame of a stream.
 
-    `mirrored` counts the pictures in which a target was seen mirrored only. `outlines` are
-    those of the newest picture, a marker's name and corners (4, 2) px; `trouble` is what keeps
-    it from being searched.
+    `mirrored` counts pictures with only a mirrored target. Of the newest picture, `outlines` are
+    the markers' names and corners (4, 2) px, and `trouble` says why it could not be searched.
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:

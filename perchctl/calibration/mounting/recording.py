@@ -46,9 +46,8 @@ class AttitudeSample:
 class TargetPose:
     """The target in the camera's frame.
 
-    `t_s` is the camera's own timestamp, before any latency is taken off. Of `covariance` (6, 6)
-    the first three are a small turn in camera axes (rad, on the left of `rotation_cam_target`),
-    the others the position (m).
+    `t_s` is the camera's timestamp, not corrected for latency. `covariance` (6, 6): a small
+    rotation in camera axes (rad, left of `rotation_cam_target`), then the position (m).
     """
 
     t_s: float
@@ -59,7 +58,8 @@ class TargetPose:
 
 @dataclass(eq=False)
 class MountingRecording:
-    """One part's recording, which grows; `mirrored_pictures` counts targets seen mirrored only."""
+    """Recording of one part (carry or pivot), appended to while it runs. `mirrored_pictures` counts
+    the pictures with only a mirrored target."""
 
     part: MountingPart
     attitudes: list[AttitudeSample] = field(default_factory=list)
@@ -68,7 +68,7 @@ class MountingRecording:
 
     @staticmethod
     def write(path: Path, recordings: Sequence[MountingRecording]) -> None:
-        """Write the parts into one file, whole or not at all. Raises InvalidValue: it cannot be
+        """Write the recordings into one file atomically. Raises InvalidValue if it cannot be
         written."""
         records: list[dict[str, Any]] = []
         for recording in recordings:
@@ -83,11 +83,11 @@ class MountingRecording:
 
     @staticmethod
     def read(path: Path) -> list[MountingRecording]:
-        """Return the parts of a file, in its order.
+        """Return the recordings of a file, in its order.
 
         Raises:
             NotFound: no such file.
-            InvalidValue: it is none of `write`, with the line that is not.
+            InvalidValue: not a file of `write`; names the bad line.
         """
         try:
             text = path.read_text(encoding="utf-8")
@@ -172,7 +172,7 @@ MOST_LATE_S = 1.0
 
 
 def check_recording(recording: MountingRecording, part: MountingPart) -> None:
-    """Raises InvalidValue where a solve would be in vain, with what to do."""
+    """Raises InvalidValue, with advice, for a recording that cannot be solved."""
     attitudes = recording.attitudes
     poses = recording.poses
     if recording.part != part:

@@ -49,7 +49,7 @@ class _Value:
 
 @dataclass(frozen=True, eq=False)
 class MountingReport:
-    """What was measured of a profile's vehicle; a part that was not done is None."""
+    """The measured camera mounting of a profile's vehicle; None for a part not recorded."""
 
     profile: Profile
     rotation: RotationSolution | None
@@ -57,7 +57,7 @@ class MountingReport:
 
     @property
     def gear_body_m(self) -> Array:
-        """The tip in body axes; the profile's where no pivot was done."""
+        """The gear's tip in body axes; from the profile without a pivot."""
         if self.pivot is None:
             return np.array(self.profile.vehicle.gear_body_m)
         T = self.profile.camera.mount.T_body_cam
@@ -66,12 +66,13 @@ class MountingReport:
 
     @property
     def profile_gear_cam_m(self) -> Array:
-        """The tip in the camera's frame, by the profile, (3,)."""
+        """The gear's tip in the camera frame, according to the profile, (3,)."""
         T = self.profile.camera.mount.T_body_cam
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
 
-    def profile_values(self) -> dict[str, float | tuple[float, ...]]:
-        """Return the values for the profile by dotted key; no latency that each flight measures."""
+    def new_profile_values(self) -> dict[str, float | tuple[float, ...]]:
+        """Return the measured values to write into the profile, by dotted key, without the latency
+        if the profile leaves it to be measured in each flight."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.rotation is not None:
             values["camera.mount.rpy_deg"] = _rounded(self.rotation.rpy_deg, 2)
@@ -82,9 +83,9 @@ class MountingReport:
         return values
 
     def keys_text(self) -> str:
-        """Return the profile's keys, as they are typed into it."""
+        """Return the new values as YAML for the profile."""
         lines = []
-        for key, value in self.profile_values().items():
+        for key, value in self.new_profile_values().items():
             numbers = value if isinstance(value, tuple) else (value,)
             text = ", ".join(f"{v:g}" for v in numbers)
             lines.append(f"{key}: [{text}]" if isinstance(value, tuple) else f"{key}: {text}")
@@ -108,16 +109,17 @@ class MountingReport:
         return values
 
     def record(self) -> dict[str, Any]:
-        """Return measured values, sigmas, and the profile's values before and after, for JSON."""
+        """Return the results for `calibrate mount --json`: measured values, sigmas, the profile's
+        values, and its new ones."""
         values = self._values()
         return {v.key: v.measured.tolist() for v in values} | {
             "sigma": {v.key: v.sigma.tolist() for v in values},
             "written": {v.key: v.written.tolist() for v in values if v.written is not None},
-            "profile_values": self.profile_values(),
+            "profile_values": self.new_profile_values(),
         }
 
     def lines(self) -> list[str]:
-        """Return each number, its 95 % interval, and what the profile says instead."""
+        """Return a line for each value, with its 95 % interval and the profile's value."""
         return [line for value in self._values() for line in value.lines()]
 
 
@@ -126,9 +128,9 @@ def _rounded(values: Any, decimals: int) -> tuple[float, ...]:
 
 
 def solve_mounting(profile: Profile, recordings: Sequence[MountingRecording]) -> MountingReport:
-    """Return the measured mounting, of each part there is.
+    """Solve for the mounting from the recorded parts.
 
-    Raises InvalidValue: a recording is too little or contradicts itself, with what to do.
+    Raises InvalidValue, with advice: a recording is too short or inconsistent.
     """
     by_part = {recording.part: recording for recording in recordings}
     carry = by_part.get("carry")

@@ -55,7 +55,7 @@ class Setpoint:
     thrust: float = 0.0
 
     def level_setpoint(self) -> Setpoint:
-        """Return what the supervisor flies while setpoints are missing: level, no turn, same z."""
+        """Return the setpoint flown while setpoints are missing: level, no yaw rate, same z."""
         mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, VELOCITY)
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
@@ -95,10 +95,10 @@ class Pid:
         self._integral = 0.0
         self._measured = measured
 
-    def update(self, desired: float, measured: float, turning: bool = False) -> float:
-        """Return the output after one period; `turning`: on the circle of 360 degrees."""
+    def update(self, desired: float, measured: float, is_angle: bool = False) -> float:
+        """Return the output after one period; an angle's error is wrapped to +-180 degrees."""
         error, change = desired - measured, measured - self._measured
-        if turning:
+        if is_angle:
             error, change = wrap_deg(error), wrap_deg(change)
         bound = self._i_limit
         integral = max(-bound, min(bound, self._integral + error * self._period))

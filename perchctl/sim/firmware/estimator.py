@@ -75,13 +75,13 @@ class Estimator:
     def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
         """Take one measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self._parameters["stabilizer.estimator"] == KALMAN:
-            self.outside.position(position_m)
+            self.outside.update_position(position_m)
             if quaternion is not None:
-                self.outside.attitude(quaternion)
+                self.outside.update_attitude(quaternion)
 
-    def shift_accelerometer(self, z_mps2: float) -> None:
-        """Let the accelerometer read so much more along z from now on. A deck, which is simulated
-        by its errors, has none."""
+    def add_accelerometer_bias(self, z_mps2: float) -> None:
+        """Add to the accelerometer's bias along z. No effect with a deck, whose estimate
+        needs none."""
         if self._imu is not None:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
@@ -98,12 +98,13 @@ class Estimator:
         self,
         world: World,
         *,
-        flown: bool,
+        has_flown: bool,
         spinning: bool,
         flying: bool = False,
         pressed: bool = False,
     ) -> None:
-        """Estimate one control period later. `spinning` motors shake the accelerometer."""
+        """Advance by one control period. Drift runs once the vehicle `has_flown`; `spinning`
+        motors shake the accelerometer; `flying` is the supervisor's state."""
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:
@@ -120,7 +121,7 @@ class Estimator:
             acc_unit /= self._imu.acc_scale
         else:
             self.gyro = w, x, y, z = self._integrate(world)
-            self._move_by_deck(world, flown=flown)
+            self._move_by_deck(world, flown=has_flown)
         now = self.now
         bias = self._scenario.estimate_tilt_bias_rad
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))

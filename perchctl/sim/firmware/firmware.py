@@ -80,7 +80,7 @@ class Firmware:
         supervisor = self.supervisor
         self.estimator.update(
             self.world,
-            flown=self._flown,
+            has_flown=self._flown,
             spinning=self.motors is not MOTORS_OFF,
             flying=supervisor.is_flying,
             pressed=self._pressed,
@@ -88,7 +88,7 @@ class Firmware:
         if step % PLANNER_EVERY == 0:
             self._consult_planner(t_s)
             if self.estimator.outside is not None:
-                self._pressed = self.world.contact_state()[0] > 0.0
+                self._pressed = self.world.push_n_and_on_floor()[0] > 0.0
         if step % SUPERVISOR_EVERY == 0:
             ended = supervisor.update(
                 t_s,
@@ -100,7 +100,7 @@ class Firmware:
                 # The setpoint of a flight that is over must not fly the next one: after
                 # re-arming only a new packet, or the planner, spins the motors.
                 self._low_level = False
-            self.planner.block(not supervisor.motors_allowed)
+            self.planner.set_blocked(not supervisor.motors_allowed)
             self._watch_battery(t_s)
         setpoint = self._setpoint if supervisor.motors_allowed else _NULL
         if supervisor.state is State.LEVEL_OUT:
@@ -118,9 +118,9 @@ class Firmware:
     # Commands -----------------------------------------------------------------------
 
     def fly_setpoint(self, setpoint: Setpoint) -> None:
-        """Fly this setpoint; it takes over from the high-level commander.
+        """Fly this setpoint, which overrides the high-level commander.
 
-        Raw thrust is limited, and forced to 0 until one packet with thrust 0 has come since boot
+        Raw thrust is limited, and locked at 0 until a packet with thrust 0 arrives after boot
         (docs/firmware.md, "Raw thrust").
         """
         if setpoint.mode == MODE_RAW:
@@ -139,9 +139,9 @@ class Firmware:
         self._inform_planner()
         self._low_level = False
 
-    def give_order(self, order: Callable[..., object], *values: Any) -> None:
-        """Give an order, a method of `HighLevelPlanner`; a low-level stream has priority."""
-        order(self.planner, *values, self.t_s)
+    def command_planner(self, method: Callable[..., object], *values: Any) -> None:
+        """Call a method of `HighLevelPlanner`; low-level setpoints have priority."""
+        method(self.planner, *values, self.t_s)
 
     def emergency_stop(self) -> None:
         """Stop the motors and lock, within one supervisor update."""
@@ -192,7 +192,7 @@ class Firmware:
 
     def _inform_planner(self) -> None:
         now = self.estimator.now
-        self.planner.start_from(
+        self.planner.set_plan_start(
             (now.x_m, now.y_m, now.z_m),
             (now.vx_mps, now.vy_mps, now.vz_mps),
             math.radians(now.yaw_deg),

@@ -120,8 +120,7 @@ _REVERSION = 1e-3
 class ExternalFilter:
     """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate.
 
-    `covariance` (9, 9) is what it knows of its own errors: position, velocity and attitude, with
-    all that one says about another; SI, radians, world axes.
+    `covariance` (9, 9) is of the errors of position, velocity and attitude; SI, world axes.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
@@ -168,15 +167,15 @@ class ExternalFilter:
         if far_m > _FARTHEST_M or fast_mps > _FASTEST_MPS:
             self.reset()
 
-    def position(self, measured_m: Vector) -> None:
-        """Take a position from outside for the one of now."""
+    def update_position(self, measured_m: Vector) -> None:
+        """Correct the estimate by an external position, taken as current."""
         if all(map(math.isfinite, measured_m)):
             (mx, my, mz), (x, y, z) = measured_m, self.position_m
             sigma_m = self._parameters["locSrv.extPosStdDev"]
             self._correct(POSITION, (mx - x, my - y, mz - z), sigma_m)
 
-    def attitude(self, measured: Quaternion) -> None:
-        """Take an attitude from outside, body to world."""
+    def update_attitude(self, measured: Quaternion) -> None:
+        """Correct the estimate by an external attitude, body to world."""
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
             return

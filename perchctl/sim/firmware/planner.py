@@ -75,14 +75,14 @@ class HighLevelPlanner:
         """End the plan at once."""
         self.state = IDLE
 
-    def block(self, blocked: bool) -> None:
+    def set_blocked(self, blocked: bool) -> None:
         """Forbid or allow motors. While forbidden, plans end and new ones are refused."""
         if blocked and not self.blocked:
             self.stop()
         self.blocked = blocked
 
-    def start_from(self, position_m: Place, velocity_mps: Place, yaw_rad: float) -> None:
-        """Let the next plan begin here, unless a setpoint is planned before."""
+    def set_plan_start(self, position_m: Place, velocity_mps: Place, yaw_rad: float) -> None:
+        """Set the state at which the next plan begins."""
         axes = zip(position_m, velocity_mps, strict=True)
         self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
 
@@ -92,14 +92,14 @@ class HighLevelPlanner:
         duration_s: float,
         yaw_rad: float | None,
         t_s: float,
-        to: int = FLYING,
+        state: int = FLYING,
     ) -> bool:
-        """Plan the way to a height, or refuse. `yaw_rad` None keeps the heading."""
-        if self.blocked or self.state not in ((IDLE, FLYING) if to == LANDING else (IDLE,)):
+        """Plan the way to a height in `state`; False if refused. `yaw_rad` None: same heading."""
+        if self.blocked or self.state not in ((IDLE, FLYING) if state == LANDING else (IDLE,)):
             return False
         x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
         self._plan((x, y, z, yaw), (x.value, y.value, height_m), yaw_rad, duration_s, t_s)
-        self.state = to
+        self.state = state
         return True
 
     def land(self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float) -> bool:

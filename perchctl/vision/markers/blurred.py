@@ -25,8 +25,8 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detector import Picture, make_quadrilateral_finder
 from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance
-from perchctl.vision.markers.photometric_fit import Alignment, align
+from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, correlations
+from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
 _BLURS_PX, _BLUR_PX = (1.5, 3.0), 2.0  # to start with
@@ -54,7 +54,7 @@ def find_expected_blurred(
         if mean_side_px(corners) < LEAST_SIDE_PX:
             continue
         start = _shifted(image, corners, patterns[name])
-        if resemblance(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
+        if correlations(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
             continue
         for blur_px in blurs_px:
             seen = align_marker(picture, name, start, blur_px=blur_px)
@@ -84,7 +84,7 @@ def _best(
         return []
     found: list[tuple[float, MarkerName, Array]] = []
     for name in MARKERS:
-        like = np.array([resemblance(image, quad, patterns[name]) for quad in quads])
+        like = np.array([correlations(image, quad, patterns[name]) for quad in quads])
         for i in np.flatnonzero(like.max(axis=1) > _MIN_RESEMBLANCE):
             turn = int(like[i].argmax())
             found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
@@ -168,15 +168,15 @@ def align_marker(
 ) -> RefinedCorners | None:
     """Return the marker by its drawing, None unless the picture looks like it.
 
-    `reach` is how far the corners may be from `start_px`, and `max_sigma` how vague they
-    may stay, in sides. Where the other marker shows which one it must be (not `alone`), its
-    codeword need not be told apart from others.
+    `reach` is the allowed distance of the corners from `start_px`, and `max_sigma` their
+    largest spread, both in sides. If `alone`, the codeword must be distinctive; otherwise the
+    other marker identifies it.
     """
     side_px = mean_side_px(start_px)
     if not side_px >= LEAST_SIDE_PX:
         return None
     image, drawing = picture.image, picture.setup.patterns[name].drawing
-    found = align(image, start_px, drawing, picture.camera, blur_px)
+    found = align_drawing(image, start_px, drawing, picture.camera, blur_px)
     if (
         found is None
         or not is_verified(found, max_sigma)

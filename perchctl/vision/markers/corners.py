@@ -49,16 +49,18 @@ def apply_homography(H: Array, points: Array) -> Array:
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
-def corner_jacobian(H: Array) -> Array:
-    """Return the change (8, 8) of corners by H (3, 3) with the terms of `increment_homography`."""
-    q = _UNIT1.dot(H.T)
+def homography_jacobian(homography: Array) -> Array:
+    """Return the Jacobian (8, 8) of the projected corners of the unit square with respect to the
+    terms `p` of `increment_homography`, at a homography (3, 3)."""
+    q = _UNIT1.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
-    A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
+    A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
     return np.asarray((A @ _INCREMENTS).reshape(8, 8))
 
 
 def increment_homography(H: Array, p: Array) -> Array:
-    """Return H (1 + P), scaled to 1 in its last term; p (8,) are P's rows but for its last 0."""
+    """Return H (I + P), scaled to 1 in its last term; p (8,) are the first terms of P
+    (3, 3), row by row; the last is 0."""
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     return np.asarray(H / H[2, 2])
 
@@ -82,15 +84,16 @@ def doubled_area(corners: Array) -> Array:
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """True if all corners (4, 2) are `room_px` or more inside a picture."""
+    """Return True if all corners (4, 2) are at least `room_px` inside the picture's edges."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
     # False for NaN.
     return all(room_px <= x <= right and room_px <= y <= low for x, y in corners_px.tolist())
 
 
-def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """Return the concentric coplanar square (4, 2), `ratio` as large, by `camera`'s lens if any."""
+def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
+    """Return the corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
+    without a camera, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = apply_homography(homography_from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
     return found if camera is None else distort(found, camera)
@@ -102,9 +105,9 @@ def with_missing_marker(
     """Return both markers' corners; a missing marker is derived from the other one."""
     both = dict(expected)
     if "small" not in both and "large" in both:
-        both["small"] = nested(both["large"], ratio, camera)
+        both["small"] = scale_square(both["large"], ratio, camera)
     elif "large" not in both and "small" in both:
-        both["large"] = nested(both["small"], 1.0 / ratio, camera)
+        both["large"] = scale_square(both["small"], 1.0 / ratio, camera)
     return both
 
 
@@ -120,7 +123,7 @@ NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothi
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
     """A marker's corners as they were refined; spreads and covariance as of a `Detection`, blurs in
-    px. `edge_shift` is what was taken out."""
+    px. `edge_shift` is the correction that was applied."""
 
     corners_px: Array
     sigma_px: float

@@ -20,7 +20,7 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import UNIT, RefinedCorners, apply_homography, within
-from perchctl.vision.markers.detector import Covered, Picture, hides, make_aruco_detector
+from perchctl.vision.markers.detector import Covered, Picture, is_hidden, make_aruco_detector
 from perchctl.vision.markers.edge_fit import MIDDLES, sample_profiles
 from perchctl.vision.markers.pattern import Drawing, Pattern, render_cells
 from perchctl.vision.markers.photometric_fit import likeness, make_grid
@@ -51,9 +51,10 @@ def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraMo
 def is_target_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """True if no expected marker (4, 2) px is surely in the picture and free of the gear."""
+    """Return True if each expected marker (4, 2) px may be cut by the picture's edge or hidden
+    by the vehicle's gear."""
     whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
-    return bool(expected) and all(hides(hidden, c) for c in whole)
+    return bool(expected) and all(is_hidden(hidden, c) for c in whole)
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
@@ -64,7 +65,8 @@ def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -
 def fit_cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return a marker's corners by the target's visible part near `expected` (4, 2) px."""
+    """Fit the target's visible part and return the corners of one marker, computed from it.
+    `expected` are the predicted corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -92,7 +94,8 @@ def fit_cut_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """True if a picture of the large marker at pose (3, 3), (3,) can be measured."""
+    """Return True if the visible part of the target is enough to measure it, for a large marker
+    with these axes (3, 3) and this centre (3,) in the camera."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
     found = predict_fit(pose, _outline(patterns), camera)
@@ -113,8 +116,8 @@ def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
 
 
 def _stands_for(found: PoseFit) -> MarkerName:
-    """The marker that was seen: the small one, if enough of it was."""
-    return "small" if found.small >= _SMALL_PLACES else "large"
+    """Return the marker that was seen: the small one, if enough of it was."""
+    return "small" if found.small_points >= _SMALL_PLACES else "large"
 
 
 def _start(
@@ -159,7 +162,7 @@ def _trusted(found: PoseFit) -> bool:
     """True if nearly all edges are there, and tell enough of the place."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
-        found.shown >= _MIN_SHOWN * found.in_view
+        found.points_shown >= _MIN_SHOWN * found.points_in_view
         and found.residual_px < _MOST_RESIDUAL_PX
         and spread < _MOST_SPREAD
     )
@@ -216,7 +219,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A reduced picture: grey values at a lattice's nodes (rows, columns), and which are seen."""
+    """A reduced picture: grey values (rows, columns) at a lattice's nodes, `seen` if uncovered."""
 
     lattice: Lattice
     grey: Grey
@@ -333,9 +336,9 @@ _TEXELS = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Places along the edges: at (n, 2); normal (n, 2) from black to white; the line that each lies
-    on (n,), and how far that may be printed off (n,); the cells' width beside it (n,); and whether
-    it is the small marker's (n,)."""
+    """Points along the drawing's edges: `at` (n, 2); normal (n, 2) from black to white; number of
+    its line (n,); that line's print error, sigma (n,); width of the adjacent cells (n,); and
+    whether the edge is the small marker's (n,)."""
 
     at: Array
     normal: Array
@@ -351,7 +354,7 @@ Texture = tuple[NDArray[np.float32], Array]
 
 @lru_cache(maxsize=8)
 def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
-    """Return the outline of both markers; tolerances are in cells."""
+    """Return the edges of both markers; tolerances are in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -442,14 +445,14 @@ class RigidPose:
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A pose with its covariance (6, 6) of turn and move; how many places were in view, how many
-    showed their edge, how many of these are the small marker's; and the spread of one."""
+    """A pose with its covariance (6, 6) of rotation and translation; the numbers of edge points in
+    view, of those that showed an edge, and of the small marker's among these; and their RMS."""
 
     pose: RigidPose
     cov: Array
-    in_view: int
-    shown: int
-    small: int
+    points_in_view: int
+    points_shown: int
+    small_points: int
     residual_px: float
 
 
@@ -478,7 +481,7 @@ def fit_pose(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
-    """Fit the pose in which the outline's edges are the picture's."""
+    """Fit the pose in which the drawing's edges match the picture's."""
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
@@ -504,7 +507,7 @@ def fit_pose(
 
 
 def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """Return what `fit_pose` would make of a flawless picture."""
+    """Return the result that `fit_pose` would have for a perfect picture at that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -616,8 +619,8 @@ def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) 
     return PoseFit(
         pose=pose,
         cov=cov[:6, :6],
-        in_view=len(shown),
-        shown=int(np.count_nonzero(shown)),
-        small=int(np.count_nonzero(shown & outline.small[places.index])),
+        points_in_view=len(shown),
+        points_shown=int(np.count_nonzero(shown)),
+        small_points=int(np.count_nonzero(shown & outline.small[places.index])),
         residual_px=math.sqrt(variance),
     )

@@ -31,7 +31,13 @@ from perchctl.vision.markers.corners import (
     within,
 )
 from perchctl.vision.markers.cut import MOST_AGE_S, fit_cut_markers, is_target_cut, may_be_whole
-from perchctl.vision.markers.detector import DetectorSetup, Picture, filled, hidden_area, hides
+from perchctl.vision.markers.detector import (
+    DetectorSetup,
+    Picture,
+    fill_hidden,
+    hidden_area,
+    is_hidden,
+)
 from perchctl.vision.markers.edge_fit import refine_lines
 from perchctl.vision.markers.partial import ROOM_PX, KnownBy, fit_partly_seen, is_wholly_seen
 from perchctl.vision.markers.pattern import (
@@ -39,10 +45,10 @@ from perchctl.vision.markers.pattern import (
     Pattern,
     cells_agree,
     cells_mostly_agree,
-    resembles,
+    fits_pattern,
 )
 from perchctl.vision.markers.search import FoundMarkers, Look, search, search_halved
-from perchctl.vision.target_selection import AsideOf
+from perchctl.vision.target_selection import OwnOffset
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -56,7 +62,7 @@ from perchctl.vision.types import (
 
 _SEARCHED_SIDE_PX = 13.0  # smaller markers are not found by a search
 _SHIFT_PICTURES = 5  # for which a measured shift of all edges holds: light changes slowly
-_Seen = dict[MarkerName, RefinedCorners]
+_Found = dict[MarkerName, RefinedCorners]
 
 
 def detect_markers(
@@ -66,22 +72,23 @@ def detect_markers(
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: AsideOf | None = None,
+    own: OwnOffset | None = None,
 ) -> Detections:
-    """Find and refine the target's markers in one frame, first at `expected`, corners (4, 2) px by
-    the vehicle's motion, else where `previous` leads, of the last frame that saw something.
-    `empty_frames` is how many in a row saw nothing: in a stream the searches take turns by it; None
-    searches by all. `own` chooses among targets if none is expected. Two fields give their mean."""
+    """Find and refine the target's markers in one frame. The first place searched is at the
+    `expected` corners (4, 2) px, by the vehicle's motion, or else near the `previous` detections.
+    `empty_frames`, the number of frames in a row without markers, alternates the kinds of search;
+    None: all kinds. `own` chooses among several targets where none is expected. For a frame of
+    two fields the result is their mean."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     both = with_missing_marker(expected, setup.ratio, camera)
-    look = _look(empty_frames, bool(expected), setup.by_lines)
+    look = _look(empty_frames, bool(expected), setup.fits_lines)
     turn = None
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
     # A part of the target is known again where it was measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     lately = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
-    lately = lately and setup.by_lines and bool(last)
+    lately = lately and setup.fits_lines and bool(last)
     was_cut = lately and not may_be_whole(last, frame.image.shape)
     shift = None if previous is None else previous.edge_shift
     if shift is not None:
@@ -90,10 +97,10 @@ def detect_markers(
 
     def detected(frame: Frame) -> Detections:
         hidden = hidden_area(frame, setup.mask)
-        image = frame.image if hidden is None else filled(frame.image, hidden)
+        image = frame.image if hidden is None else fill_hidden(frame.image, hidden)
         picture, found = Picture(image, hidden, setup, camera), FoundMarkers()
-        seen: _Seen = {}
-        if look != "fits" and both and setup.by_lines:
+        seen: _Found = {}
+        if look != "fits" and both and setup.fits_lines:
             seen, found = _followed(picture, both, shift)
         if not seen and lately and is_target_cut(both, image.shape, hidden):
             seen = fit_cut_markers(picture, expected)
@@ -104,7 +111,7 @@ def detect_markers(
             found = search(picture, expected, look, own)
             if len(found.corners_px) >= len(seen):
                 seen = _refined(picture, found)
-        if not seen and look not in ("sharp", "window") and setup.by_lines:
+        if not seen and look not in ("sharp", "window") and setup.fits_lines:
             bare = replace(picture, hidden=None)
             seen = find_expected_blurred(bare, expected, turn) if expected else find_blurred(bare)
             seen = improve_corners(bare, seen)
@@ -120,15 +127,15 @@ def detect_markers(
         )
 
     if frame.fields == "woven":
-        return with_flow(between(*map(detected, field_frames(frame))), previous)
-    return with_flow(detected(frame), previous)
+        return add_marker_flow(mean_of_fields(*map(detected, field_frames(frame))), previous)
+    return add_marker_flow(detected(frame), previous)
 
 
-def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
+def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
     """Return how to search this frame. After a loss the ways take turns."""
     if empty_frames is None:
         return "all"
-    if not by_lines or (expected and empty_frames % 2):
+    if not fits_lines or (expected and empty_frames % 2):
         return "sharp"
     if expected:
         if empty_frames == 0:
@@ -141,7 +148,7 @@ def _look(empty_frames: int | None, expected: bool, by_lines: bool) -> Look:
 
 def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
-) -> tuple[_Seen, FoundMarkers]:
+) -> tuple[_Found, FoundMarkers]:
     """Return what is where both are expected, or nearby: where no side was met, a near target has
     most often moved on further than a side is looked for."""
     seen = follow_markers(picture, expected, shift)
@@ -150,34 +157,34 @@ def _followed(
         again = {} if found is None else _refined(picture, found)
         if found is not None and again:
             return again, found
-    seen = follow_partly(picture, expected, seen, shift)
+    seen = add_partly_visible(picture, expected, seen, shift)
     if any(lines_suffice(r, picture.setup.patterns[name]) for name, r in seen.items()):
         return seen, FoundMarkers()
     return improve_corners(picture, seen), FoundMarkers()
 
 
-def _missing(picture: Picture, seen: _Seen, expected: Mapping[MarkerName, Array]) -> bool:
-    """True if a marker that should be found was not verified."""
+def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array]) -> bool:
+    """Return True if a marker that should be found was not verified."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
         and side_lengths_px(corners).min() > _SEARCHED_SIDE_PX
-        and not hides(picture.hidden, corners)
+        and not is_hidden(picture.hidden, corners)
         for name, corners in expected.items()
     )
 
 
-def _refined(picture: Picture, found: FoundMarkers) -> _Seen:
+def _refined(picture: Picture, found: FoundMarkers) -> _Found:
     """Return what the search found with better corners. Those without four lines for sides are
     measured by what of these is seen: a search takes the picture's edge for a side."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
-    lines = fit_lines(picture, raw) if setup.by_lines else {}
+    lines = fit_lines(picture, raw) if setup.fits_lines else {}
     seen = {
         name: lines.get(name) or refine_subpix(image, corners, setup.patterns[name].rim.cells)
         for name, corners in raw.items()
     }
-    if not setup.by_lines:
+    if not setup.fits_lines:
         return seen
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
@@ -185,20 +192,21 @@ def _refined(picture: Picture, found: FoundMarkers) -> _Seen:
             continue
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
-            starts.insert(0, picture.nested(small.corners_px, "large"))
+            starts.insert(0, picture.other_corners(small.corners_px, "large"))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
         tried = (fit_partly_seen(picture, name, start, known_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(
+        elif not within(r.corners_px, image.shape, ROOM_PX) or is_hidden(
             picture.hidden, r.corners_px, 1.0
         ):
             del fitted[name]
     return improve_corners(picture, fitted, searched=True)
 
 
-def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
+def _detection(name: MarkerName, seen: _Found, fields: PictureKind | None) -> Detection | None:
+    """Return the marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -223,7 +231,7 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """Return the last corners (4, 2) px, moved on as they moved before."""
+    """Return the last corners (4, 2) px, extrapolated to `t_s` by their flow."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -235,8 +243,8 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
     return corners
 
 
-def with_flow(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with the flow of its markers since a short time before."""
+def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
+    """Return `now` with the velocity of its markers, px/s, since `previous`."""
     if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
     flow: dict[MarkerName, Array] = {}
@@ -270,17 +278,17 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
-def improve_corners(picture: Picture, seen: _Seen, searched: bool = False) -> _Seen:
-    """Return the seen markers with better corners, and the other marker if it shows. What a search
-    found stays only where lines suffice, the drawing confirms it, or both were seen."""
+def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
+    """Return the seen markers with better corners, and the other marker if it is visible. A marker
+    found by a search alone is dropped unless its lines suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
-        large = around(picture, better["small"])
+        large = large_around(picture, better["small"])
         if large is not None:
             better["large"] = large
     for name in MARKERS:
         start = _start(picture, name, better)
-        if start is None or not within(start, image.shape) or hides(picture.hidden, start):
+        if start is None or not within(start, image.shape) or is_hidden(picture.hidden, start):
             continue
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
@@ -290,7 +298,7 @@ def improve_corners(picture: Picture, seen: _Seen, searched: bool = False) -> _S
             better[name] = exact
         elif alone and searched:
             better.pop(name, None)
-        elif name not in better and resembles(image, start, patterns[name]):
+        elif name not in better and fits_pattern(image, start, patterns[name]):
             better[name] = RefinedCorners(start, NESTED_SIGMA_PX, False)
     return better
 
@@ -302,8 +310,8 @@ def _blur_px(seen: RefinedCorners | None) -> float:
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
-def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
-    """The corners (4, 2) px from which to align the drawing, if any."""
+def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
+    """Return the corners (4, 2) px from which to align the drawing, if any."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -313,7 +321,7 @@ def _start(picture: Picture, name: MarkerName, seen: _Seen) -> Array | None:
         enough = enough or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
     if name == "small" and other is not None and other.refined:
-        return picture.nested(other.corners_px, "small")
+        return picture.other_corners(other.corners_px, "small")
     return None
 
 
@@ -326,8 +334,8 @@ _ANCHOR = 0.12  # of the small marker's side
 
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
-) -> _Seen:
-    """Return the markers near to corners (4, 2) px that have lines for sides."""
+) -> _Found:
+    """Return the markers near the given corners (4, 2) px whose sides are straight edges."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -338,8 +346,8 @@ def fit_lines(
 
 def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
-) -> _Seen:
-    """Return the expected markers that all sides and cells verify."""
+) -> _Found:
+    """Return the expected markers whose sides and cells are all confirmed in the picture."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]
@@ -355,17 +363,17 @@ def follow_markers(
     }
 
 
-def follow_partly(
+def add_partly_visible(
     picture: Picture,
     expected: Mapping[MarkerName, Array],
-    seen: _Seen,
+    seen: _Found,
     shift: EdgeShift | None = None,
-) -> _Seen:
-    """Return the markers of `follow_markers` with the others by what is seen of them. Where the
-    small marker was met, the large one is looked for around it."""
+) -> _Found:
+    """Return the `seen` markers of `follow_markers` plus those fitted to their visible part. If
+    the small marker was seen, the large one is expected around it."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
-        places["large"] = picture.nested(seen["small"].corners_px, "large")
+        places["large"] = picture.other_corners(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
             partly = fit_partly_seen(picture, name, places[name], "track", shift)
@@ -373,23 +381,25 @@ def follow_partly(
                 seen[name] = partly
     if "large" in seen and "small" not in seen:
         # Too small for lines, but where it must be: enough to know that it is there.
-        small_px = picture.nested(seen["large"].corners_px, "small")
-        if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(
+        small_px = picture.other_corners(seen["large"].corners_px, "small")
+        if mean_side_px(small_px) > LEAST_SIDE_PX and fits_pattern(
             picture.image, small_px, picture.setup.patterns["small"]
         ):
             seen["small"] = RefinedCorners(small_px, NESTED_SIGMA_PX, False)
     return seen
 
 
-def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """Return the large marker around a small one; a part may be covered or cut off."""
+def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
+    """Return the large marker around a detected small one; the large one may be partly covered or
+    cut off."""
     image, pattern = picture.image, picture.setup.patterns["large"]
-    start = picture.nested(small.corners_px, "large")
+    start = picture.other_corners(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        centre = picture.nested(large.corners_px, "small")
+        """Return True if the small marker is where the large one has it."""
+        centre = picture.other_corners(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
 
@@ -413,9 +423,9 @@ def around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
 _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
-def between(a: Detections, b: Detections) -> Detections:
-    """Return the mean of both fields' corners, which is right for either order of the fields. A
-    marker that only one field shows is left out where the other is in both."""
+def mean_of_fields(a: Detections, b: Detections) -> Detections:
+    """Return the mean of both fields' corners, which holds for either order of the fields. If one
+    marker is in both fields, another that is in a single field is left out."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = a.get(name), b.get(name)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
-from perchctl.vision.markers.corners import nested
+from perchctl.vision.markers.corners import scale_square
 from perchctl.vision.markers.pattern import Pattern, make_drawing, make_pattern, make_rim
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
@@ -36,14 +36,14 @@ _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """What `detect_markers` needs, made once by `make_aruco_detector`. `dictionaries` are the large
-    and the small marker's; `ratio` is the small marker's side over the large one's, `mask` what
-    the vehicle covers. Without `by_lines` there are no fits, and no place is looked at first."""
+    """Constants of `detect_markers`, made by `make_aruco_detector`. `dictionaries` are the large
+    and the small marker's; `ratio` is the small side over the large one, `mask` the pixels
+    covered by the vehicle. Without `fits_lines` there are no fits and no tracking by them."""
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
     ratio: float
-    by_lines: bool
+    fits_lines: bool
     mask: Covered | None = None
 
 
@@ -69,7 +69,7 @@ def make_aruco_detector(
             ),
         },
         ratio=ratio,
-        by_lines=config.refinement == "line",
+        fits_lines=config.refinement == "line",
         mask=mask,
     )
 
@@ -77,7 +77,7 @@ def make_aruco_detector(
 def make_marker_decoder(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
-    """Return OpenCV's detector of markers for a pass."""
+    """Return OpenCV's marker detector for pictures of that size."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
     parameters.minDistanceToBorder = 0
@@ -132,15 +132,15 @@ _TINY = 1e-4
 
 
 def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
-    """Return where a frame shows the vehicle, which covers `mask` (h, w) of a whole picture: in a
-    single field, whose missing rows are interpolated, beside it too."""
+    """Return the mask (h, w) of the vehicle in a frame; for a single field it is widened, as the
+    missing rows are interpolated."""
     if mask is None or frame.fields not in ("top", "bottom"):
         return mask
     return cv2.dilate(mask.astype(np.uint8), np.ones((_FIELD_ROWS, 1), np.uint8)) > 0
 
 
-def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """Return the picture with what is hidden filled from around it."""
+def fill_hidden(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
+    """Return the picture with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
@@ -155,8 +155,8 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
     return np.where(hidden, np.rint(smooth).astype(np.uint8), image)
 
 
-def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """True if a part of the marker up to `reach` half sides is hidden."""
+def is_hidden(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
+    """Return True if a part of the marker is hidden, up to `reach` half sides."""
     if hidden is None:
         return False
     h, w = hidden.shape
@@ -176,15 +176,15 @@ def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture of one moment, and what is needed to measure markers in it. `hidden` (h, w) is
-    where something is before the target."""
+    """A picture with the setup and camera to measure markers in it. `hidden` (h, w): pixels where
+    the vehicle covers the view."""
 
     image: NDArray[np.uint8]
     hidden: Covered | None
     setup: DetectorSetup
     camera: CameraModel
 
-    def nested(self, corners_px: Array, name: MarkerName) -> Array:
-        """Return where the other marker's corners (4, 2) put those of this one."""
+    def other_corners(self, corners_px: Array, name: MarkerName) -> Array:
+        """Return the corners of marker `name` that follow from the other's corners (4, 2)."""
         ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
-        return nested(corners_px, ratio, self.camera)
+        return scale_square(corners_px, ratio, self.camera)

@@ -56,8 +56,9 @@ _SLOPES: Array = (np.arange(1, 5) * ALONG[:, None] ** np.arange(4)) @ _INVERSE[1
 _TO_THE_LEFT = np.array(-1j)
 
 
-def places(lengths_px: Array) -> Array:
-    """Return profile places along sides (rows,) as shares (rows, n), not near blurred corners."""
+def profile_places(lengths_px: Array) -> Array:
+    """Return the places of the profiles along sides of these lengths (rows,), as shares of the
+    side (rows, n), away from the corners, where the next side blurs."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -71,7 +72,7 @@ def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> 
 
     Args:
         starts, ends: of the sides in normalised coordinates, (rows, 2).
-        s: places of the profiles along them, (rows, n), as of `places`.
+        s: places of the profiles along them, (rows, n), as of `profile_places`.
     """
     first, last = s[:, :1], s[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODES)[..., None]
@@ -151,8 +152,9 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2), None where they are no marker's; measure the
-    edges' shift unless `known`. Wide or off-centre edges are fitted again on centred profiles."""
+    """Fit lines to the sides of m markers (m, 4, 2); None where these are not a marker's sides. The
+    shift of all edges is measured unless it is `known`. A marker with wide edges, or with edges
+    near the ends of the profiles, is fitted again with the profiles centred on its edges."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -223,8 +225,9 @@ def _refined_once(
     return found
 
 
-def _fit_lines(markers: Markers, sides: Samples) -> tuple[Array, Array]:
-    """Return lines (4m, 3): nx, ny, c, n.x = c, |n| = 1; and weighted RMS residuals, px (4m,)."""
+def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
+    """Return the lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
+    RMS distance of the points from these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -254,14 +257,14 @@ def _intersect(lines: Array) -> Array:
 
 
 def shift_prior_px(white_grey: float) -> float:
-    """Return the spread of a shift that is not measured, by how white paper is."""
+    """Return the spread of an unmeasured edge shift, by the grey level of white paper."""
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
 def _measured_shift(
-    markers: Markers,
-    sides: Samples,
-    inner: Samples | None,
+    markers: Sides,
+    sides: EdgeData,
+    inner: EdgeData | None,
     lines: Array,
     residual_px: Array,
     corners: Array,
@@ -308,8 +311,9 @@ def _measured_shift(
     )
 
 
-def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) -> float:
-    """How much farther out the widest marker's side ends lie than middles, beyond noise."""
+def _bow_px(markers: Sides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
+    """Return how far the ends of the widest marker's sides lie further out than their middles, as
+    far as noise does not explain it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -320,7 +324,7 @@ def _bow_px(markers: Markers, sides: Samples, lines: Array, residual_px: Array) 
     return mean_px if abs(mean_px) > _BOWED * noise_px else 0.0
 
 
-def _outwards(markers: Markers, lines: Array) -> Array:
+def _outwards(markers: Sides, lines: Array) -> Array:
     """Return +1 where a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
@@ -328,7 +332,7 @@ def _outwards(markers: Markers, lines: Array) -> Array:
 
 
 def _accepted(
-    markers: Markers, sides: Samples, residual_px: Array, corners_px: Array
+    markers: Sides, sides: EdgeData, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
     """Return which of the m markers have lines for sides, as expected."""
     inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
@@ -378,11 +382,11 @@ _SIDES = np.arange(4)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class Markers:
-    """What is to be measured: raw_px (m, 4, 2), the same normalised, the sides' lengths and the
-    width of the cells behind each (m, 4), the mean width of cells (m,), the number of the marker
-    with the widest, +1 or -1 as corners run (m,), and pixels for a normalised unit along sides
-    (4m,)."""
+class Sides:
+    """Sides of m markers: raw_px (m, 4, 2) and the same normalised, `corners`; lengths of the sides
+    and depth of the cells behind them (m, 4); mean cell width (m,); index of the marker with the
+    widest cells; winding of the corners, +1 or -1 (m,); and pixels per normalised unit along
+    each side (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
@@ -391,14 +395,14 @@ class Markers:
     depth_px: Array
     cell_px: Array
     widest: int
-    turn: Array
+    winding: Array
     px_per_unit: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
-    """grey (rows, n, steps + 1), near_px (rows,) the windows' reach in it, the edges' points
-    (rows, n, 2), normalised, their weight (rows, n) and their blur (rows,)."""
+class EdgeData:
+    """Edges on profiles: grey values (rows, n, steps + 1), reach of the windows in them, near_px
+    (rows,), edge points (rows, n, 2), normalised, their weight (rows, n) and blur (rows,)."""
 
     grey: Floats
     near_px: Array
@@ -407,8 +411,8 @@ class Samples:
     blur_px: Array
 
 
-def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Markers | None:
-    """Return what is to be measured; None where a marker is no square."""
+def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Sides | None:
+    """Return the sides of markers for measuring; None if one is not a quadrilateral."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -419,7 +423,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
     cell_px = sides_px @ _QUARTERS / cells
-    return Markers(
+    return Sides(
         raw_px=raw_px,
         rims=rims,
         corners=corners,
@@ -428,15 +432,16 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
         depth_px=0.5 * across_px / cells[:, None],
         cell_px=cell_px,
         widest=int(cell_px.argmax()),
-        turn=turn,
+        winding=turn,
         px_per_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
 def measure_edges(
-    image: NDArray[np.uint8], markers: Markers, camera: CameraModel, with_inner: bool
-) -> tuple[Samples, Samples | None]:
-    """Return samples of all sides and, if asked and wide enough, of inner edges."""
+    image: NDArray[np.uint8], markers: Sides, camera: CameraModel, with_inner: bool
+) -> tuple[EdgeData, EdgeData | None]:
+    """Return the edges' places on profiles across all sides and, on request, across the inner edges
+    of the border with the widest cells, if these are wide enough."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -450,10 +455,10 @@ def measure_edges(
         depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
         of = np.append(of, (widest, widest, widest, widest))
     # Normals point out of a marker whose corners run clockwise; dark must come first.
-    sign = markers.turn[of]
+    sign = markers.winding[of]
     if with_inner:
         sign[-4:] *= -1.0
-    s = places(lengths_px.ravel())
+    s = profile_places(lengths_px.ravel())
     ends = starts.take(NEXT, axis=1).reshape(-1, 2)
     origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
@@ -466,14 +471,14 @@ def measure_edges(
     points = points if finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_px)
     sides, inner_edges = (
-        Samples(grey[part], near_px[part], points[part], weight[part], blur_px[part])
+        EdgeData(grey[part], near_px[part], points[part], weight[part], blur_px[part])
         for part in (slice(0, n), slice(n, None))
     )
     return sides, inner_edges if with_inner else None
 
 
 def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return the reach of the windows around edges, and of the profiles."""
+    """Return the half lengths of the windows around the edges and of the profiles, px."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
@@ -523,7 +528,7 @@ _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.flo
 
 @dataclass(frozen=True, eq=False)
 class NeighbourEdges:
-    """The neighbouring edges that blur into the one that is measured.
+    """The neighbouring edges that blur into a measured edge.
 
     depth_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 where another
     edge of the same contrast lies one cell further in or out, (rows, n). possible: False where no
@@ -638,10 +643,10 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
     """Return straight lines (rows, n) with Tukey's weights, and these."""
-    line = median(edge, usable)[:, None]
+    line = row_medians(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
-        size /= np.maximum(_TUKEY * median(size, usable), _TUKEY_FLOOR_PX)[:, None]
+        size /= np.maximum(_TUKEY * row_medians(size, usable), _TUKEY_FLOOR_PX)[:, None]
         size *= size
         weight = np.maximum(1.0 - size, 0.0)
         weight *= weight
@@ -656,7 +661,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
     return line, weight
 
 
-def median(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+def row_medians(values: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Return each row's median over its usable values, (rows,); 0 without any."""
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)

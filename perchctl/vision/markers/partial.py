@@ -24,15 +24,15 @@ from perchctl.vision.markers.corners import (
     UNIT,
     RefinedCorners,
     apply_homography,
-    corner_jacobian,
     doubled_area,
     homography_from_unit,
+    homography_jacobian,
     increment_homography,
     mean_side_px,
     side_lengths_px,
     within,
 )
-from perchctl.vision.markers.detector import Picture, hides
+from perchctl.vision.markers.detector import Picture, is_hidden
 from perchctl.vision.markers.edge_fit import (
     MIN_LINE_SIGMA_PX,
     PROFILES,
@@ -41,7 +41,7 @@ from perchctl.vision.markers.edge_fit import (
     NeighbourEdges,
     locate_edges,
     neighbour_edges,
-    places,
+    profile_places,
     profile_reaches_px,
     sample_profiles,
     shift_prior_px,
@@ -88,7 +88,7 @@ def fit_partly_seen(
         seen = seen_edges(picture, H, pattern)
         if seen is None:
             return None
-        A, N, g = _equations(seen, known or EdgeShift(0.0, shift_prior_px(seen.white)))
+        A, N, g = _equations(seen, known or EdgeShift(0.0, shift_prior_px(seen.white_grey)))
         step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
@@ -97,7 +97,7 @@ def fit_partly_seen(
         if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _STILL_PX:
             break
     assert seen is not None
-    left_px = seen.far_px - (step @ A).reshape(seen.far_px.shape)
+    left_px = seen.offset_px - (step @ A).reshape(seen.offset_px.shape)
     found = _corners(H, seen, left_px, N, pattern, camera)
     if found is None or not _cells_agree(picture, found.corners_px, pattern, known_by):
         return None
@@ -105,17 +105,18 @@ def fit_partly_seen(
 
 
 def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
-    """True if nothing of the marker is hidden or beyond the edge."""
+    """Return True if no part of the marker is hidden or outside of the picture."""
     room_px = ROOM_PX + found.blur_px
-    return within(found.corners_px, picture.image.shape, room_px) and not hides(
+    return within(found.corners_px, picture.image.shape, room_px) and not is_hidden(
         picture.hidden, found.corners_px
     )
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """The edges' changes (9, rows * n) with the terms of `corner_jacobian` and the shift of
-    all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's spread."""
-    u, v = seen.own[..., 0], seen.own[..., 1]
+    """Return the changes (9, rows * n) of the edges with the terms of `homography_jacobian` and the
+    shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
+    spread."""
+    u, v = seen.points[..., 0], seen.points[..., 1]
     nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
     A[0], A[1], A[2] = nx * u, nx * v, nx
@@ -123,12 +124,12 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the seen one by the shift.
-    A[8] = np.where(seen.at < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(seen.side_distance < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles nearer to each other than a pixel measure the same.
-    worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.at / PROFILES)
+    worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.side_distance / PROFILES)
     weighted = A * (seen.weight * worth[:, None]).ravel()
-    N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
+    N, g = weighted.dot(A.T), weighted.dot(seen.offset_px.ravel())
     # An edge's spread is about a tenth of a pixel while it is not known.
     certain = (0.1 / prior.sigma_px) ** 2
     N[8, 8] += certain
@@ -159,7 +160,7 @@ def _corners(
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.rim.cells
     # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
-    J = corner_jacobian(H)
+    J = homography_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
     floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
@@ -171,7 +172,9 @@ def _corners(
         corners_px=corners_px,
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
         refined=True,
-        shift_sigma_px=min(max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), shift_prior_px(seen.white)),
+        shift_sigma_px=min(
+            max(shift_sigma_px, _LEAST_SHIFT_SIGMA_PX), shift_prior_px(seen.white_grey)
+        ),
         cov_px2=cov_px2,
     )
 
@@ -197,7 +200,7 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
     if hidden is not None:
         seen &= ~hidden[near[:, 1], near[:, 0]]
     grey = image[near[:, 1], near[:, 0]].astype(np.float64)
-    white_spots = pattern.white[pattern.owner]
+    white_spots = pattern.white[pattern.spot_cells]
     if not ((seen & white_spots).any() and (seen & ~white_spots).any()):
         return False
     high = float(np.median(grey[seen & white_spots]))
@@ -208,8 +211,8 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
     seen &= grey <= high + _GLARE * contrast
     if high < _BRIGHTEST_GREY - _GLARE * contrast:
         seen &= grey < _BRIGHTEST_GREY
-    count = np.bincount(pattern.owner, weights=seen)
-    means = np.bincount(pattern.owner, weights=grey * seen) / np.maximum(count, 1.0)
+    count = np.bincount(pattern.spot_cells, weights=seen)
+    means = np.bincount(pattern.spot_cells, weights=grey * seen) / np.maximum(count, 1.0)
     known = _known(seen, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.white, 1.0, -1.0)
     wrong = np.count_nonzero(known & (share < CELL_MARGIN))
@@ -241,7 +244,7 @@ def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.
 def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
     """Return which cells (cells,) show half of their spots (n,) or more."""
     known: NDArray[np.bool_] = (
-        np.bincount(pattern.owner, weights=seen) >= 0.5 * pattern.spots_per_cell
+        np.bincount(pattern.spot_cells, weights=seen) >= 0.5 * pattern.spots_per_cell
     )
     return known
 
@@ -271,23 +274,23 @@ _SEARCH_STEPS: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class SeenEdges:
-    """Edges of one round: of each profile (rows, n) its place in own coordinates (rows, n, 2), how
-    far outwards it is of the square's, and its weight; of each row (rows,) the side that it belongs
-    to, its distance from the centre in half sides, pixels for a half side across it, and its blur
-    in terms of the window; and how white the paper is."""
+    """Edges of one round. Per profile (rows, n): point in the marker's coordinates (rows, n, 2),
+    outward offset from the square's edge, weight. Per row (rows,): number of its side, distance
+    from the centre in half sides, pixels per half side across it, blur in units of the window.
+    And the grey level of white paper."""
 
-    own: Array
-    far_px: Array
+    points: Array
+    offset_px: Array
     weight: Array
     side: NDArray[np.intp]
-    at: Array
+    side_distance: Array
     scale_px: Array
     blur: Array
-    white: float
+    white_grey: float
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """Return the edges near the square H, if enough are seen."""
+    """Return the edges near those of the square of homography H; None if too few are visible."""
     camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -299,7 +302,7 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     to_rays: Array = np.linalg.inv(camera.K) @ H
     starts = np.stack([apply_homography(to_rays, r * UNIT) for r in rings])
     scale_px = (0.25 * (sides_px[BEFORE] + sides_px[NEXT]))[side]
-    s = places(sides_px[side] * at)
+    s = profile_places(sides_px[side] * at)
     ends = starts[:, NEXT].reshape(-1, 2)
     origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
     if not (np.abs(origin) < _FAR_PX).all():
@@ -334,14 +337,14 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
         return None
     far = np.einsum("rni,ri->rn", own, OUT[side]) - at[:, None]
     return SeenEdges(
-        own=own,
-        far_px=far * scale_px[:, None],
+        points=own,
+        offset_px=far * scale_px[:, None],
         weight=weight,
         side=side,
-        at=at,
+        side_distance=at,
         scale_px=scale_px,
         blur=blur_px / near_px,
-        white=white,
+        white_grey=white,
     )
 
 

@@ -26,11 +26,11 @@ _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0
 
 @dataclass(frozen=True, eq=False)
 class Rim:
-    """What lies inside of a marker's border, side by side in the order of the corners,
-    the cells at both ends being the border's own: (4, n) each.
+    """The cells next to a marker's border, for its four sides in the order of the corners, (4, n)
+    each; the first and last cell of a side are the border's.
 
-    white: the row next to the border; open: where a white cell follows behind a
-    white one; tolerance: of a printed edge's place, in cells.
+    white: 1 for a white cell next to the border; open: 1 if the cell behind it is white
+    too; tolerance: print error of an edge's position, in cells.
     """
 
     white: Array
@@ -48,24 +48,24 @@ class Pattern:
 
     rim: inside of its border. drawing: all of it. spots (n, 2): points in its own
     coordinates (see `perchctl.vision.markers.corners`) at which its cells are read; owner
-    (n,): the cell of each; white (cells,): what they must be; soft (4, n):
-    what blur of half a cell makes of them at the spots, without mean and of unit length,
-    for a marker whose corners are numbered on by 0 to 3; inner (cells,): those within its
-    border.
+    (n,): the cell of each; blurred_spots (4, n): expected grey at the spots with a blur of half
+    a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; white (cells,): whether a
+    cell is white; inner (cells,): whether it is within the border.
     """
 
     rim: Rim
     drawing: Drawing
     spots: Array
-    owner: NDArray[np.intp]
+    spot_cells: NDArray[np.intp]
     spots_per_cell: Array
-    soft: Array
+    blurred_spots: Array
     white: NDArray[np.bool_]
     inner: NDArray[np.bool_]
 
 
 def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """Return the rim of inner bits (n, n), 1 = white, whose blur may reach the edge."""
+    """Return the rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
+    the border's edges."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -82,7 +82,7 @@ def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return how a marker looks, with spots in all uncovered cells."""
+    """Return the pattern of a marker, with spots in all cells that the other leaves free."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -102,9 +102,9 @@ def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
         rim=rim,
         drawing=drawing,
         spots=np.ascontiguousarray(spots[free]),
-        owner=own,
+        spot_cells=own,
         spots_per_cell=np.bincount(own).astype(np.float64),
-        soft=np.stack(turns),
+        blurred_spots=np.stack(turns),
         white=drawing.cells.ravel()[kept] > 0.5,
         inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
@@ -136,12 +136,12 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
     return bool(high - low >= MIN_CONTRAST and right.mean() > MOST_CELLS)
 
 
-def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if the grey values in the cells go with the pattern."""
-    return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
+def fits_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Return True if the grey values in the cells correlate with the pattern."""
+    return float(correlations(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
-def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+def correlations(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
     """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
     rolled on by 0 to 3; 0 without contrast."""
     grey = _read(image, corners_px, pattern)
@@ -152,7 +152,7 @@ def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     # Black and white each on about half of the spots are 2 spreads apart.
     if spread < 0.5 * MIN_CONTRAST * math.sqrt(len(grey)):
         return np.zeros(4)
-    return np.asarray(pattern.soft @ grey / spread)
+    return np.asarray(pattern.blurred_spots @ grey / spread)
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
@@ -160,7 +160,7 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
-    return np.asarray(np.bincount(pattern.owner, weights=grey) / pattern.spots_per_cell)
+    return np.asarray(np.bincount(pattern.spot_cells, weights=grey) / pattern.spots_per_cell)
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
@@ -232,8 +232,8 @@ def _wide(axis: Array, half_node: float) -> Array:
 
 
 @lru_cache(maxsize=64)
-def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """Return the drawing at n by n nodes, and perhaps what is beyond its sheet."""
+def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
+    """Return the drawing at n by n nodes, and if its sheet ends, the share beyond it."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = render_cells(drawing, axis, half_node)
@@ -244,9 +244,9 @@ def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
 
 
 @lru_cache(maxsize=64)
-def square(cells: int, n: int) -> NDArray[np.float32]:
-    """Return a black square of so many cells at n by n nodes over their reach."""
-    return sheets(Drawing(np.zeros((cells, cells))), n)[0]
+def black_square(cells: int, n: int) -> NDArray[np.float32]:
+    """Return a black square of `cells` cells a side at n by n nodes over its reach."""
+    return render_sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
 def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:

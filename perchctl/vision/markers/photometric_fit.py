@@ -23,11 +23,18 @@ from perchctl.vision.lens import distort, undistort_px
 from perchctl.vision.markers.corners import (
     UNIT,
     apply_homography,
-    corner_jacobian,
     homography_from_unit,
+    homography_jacobian,
     increment_homography,
 )
-from perchctl.vision.markers.pattern import EDGE, Drawing, blur_nodes, sheets, soft_cells, square
+from perchctl.vision.markers.pattern import (
+    EDGE,
+    Drawing,
+    black_square,
+    blur_nodes,
+    render_sheets,
+    soft_cells,
+)
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
@@ -58,7 +65,7 @@ _PRIOR: Array = (
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A drawing that was laid over the picture, and how well it fits.
+    """Result of fitting a drawing to the picture, and how well it fits.
 
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their spread.
@@ -66,8 +73,8 @@ class Alignment:
         pattern, strength: correlation and height of the inner bits, beyond what a black square
             of the same size explains; the height in units of the border's.
         cell_departure: largest mean departure of a cell, in units of the gain.
-        flip, flip_sigma: by how much the cell that is most against it has the other colour, 0
-            (drawn as it is seen) to 1 (the bit is wrong), and the least certain cell's spread.
+        flip, flip_sigma: how far the worst-fitting cell has the other colour, 0 (as drawn) to 1
+            (wrong bit), and the spread of the least certain cell.
         blur_px: the blur's sigma.
         moved_px: how far the corner that moved most is from its start.
     """
@@ -98,15 +105,15 @@ class _Equations:
     g: Array
 
 
-def align(
+def align_drawing(
     image: NDArray[np.uint8],
     start_px: Array,
     drawing: Drawing,
     camera: CameraModel,
     blur_px: float = 1.0,
 ) -> Alignment | None:
-    """Lay the drawing over the picture, starting with corners `start_px` (4, 2) and a blur. None
-    where the marker leaves the picture, is not alike at all, or the fit breaks down."""
+    """Fit the drawing to the picture, starting with corners `start_px` (4, 2) and a blur. None if
+    the marker leaves the picture, looks different, or the fit diverges."""
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all():
         return None
@@ -164,7 +171,7 @@ def align(
     many = _repeated(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
     flip, flip_sigma = _cells_seen(seen, equations, inverse, many)
-    J = corner_jacobian(H)
+    J = homography_jacobian(H)
     variance = float(np.trace(J @ (inverse[_SHAPE, _SHAPE] * many) @ J.T)) / 8.0
     return Alignment(
         corners_px=corners_px,
@@ -181,8 +188,9 @@ def align(
 
 
 def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
-    """The next increment's equations after the sum `total` (8,); None without contrast."""
-    rows, products = seen.light
+    """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
+    the increments so far."""
+    rows, products = seen.light_rows
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
     light = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
@@ -232,10 +240,10 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
-    """The correlation and height of the inner pattern in grey (n * n,)."""
-    rows, products = drawing.plain
+    """Return the correlation and height of the inner pattern in grey (n * n,)."""
+    rows, products = drawing.square_light_rows
     A = products + 1e-9 * np.eye(len(products))
-    both = drawing.light[0][GAIN], grey
+    both = drawing.light_rows[0][GAIN], grey
     b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
     shares = np.linalg.solve(A, b)
     bits, seen = (each - np.einsum("kn,k->n", rows, shares[:, k]) for k, each in enumerate(both))
@@ -299,7 +307,7 @@ _FEW = 9  # a side
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """n by n nodes, `axis` (n,) in both directions; u (across), v (down), 1 of each, (3, n * n)."""
+    """n by n nodes, at `axis` (n,) in both directions; `uv1` (3, n * n): (u, v, 1) of each."""
 
     n: int
     axis: Array
@@ -411,13 +419,15 @@ class RenderedDrawing:
 
     @cached_property
     def sheets(self) -> tuple[tuple[Array, Array], ...]:
-        """Sheets at the nodes (n * n,), and changes (9, n * n) with increment and squared blur."""
-        sharp = sheets(self.drawing, self.grid.n)
+        """Each sheet at the nodes (n * n,), and its changes (9, n * n) with the eight terms of a
+        homography's increment and with the blur's square."""
+        sharp = render_sheets(self.drawing, self.grid.n)
         return tuple(_blurred_with_slope(each, self.sigma, self.grid.axis) for each in sharp)
 
     @cached_property
-    def light(self) -> tuple[Array, Array]:
-        """Rows (7 or 8, n * n) of the lit drawing, the last with a sheet's end; their products."""
+    def light_rows(self) -> tuple[Array, Array]:
+        """Basis of the drawing's grey values under any light: rows (7 or 8, n * n), the eighth if
+        the sheet ends, and their Gram matrix."""
         u, v, one = self.grid.uv1
         (white, _), *others = self.sheets
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -425,11 +435,12 @@ class RenderedDrawing:
         return stacked, gram_matrix(stacked)
 
     @cached_property
-    def plain(self) -> tuple[Array, Array]:
-        """As `light`, (4 or 5, n * n), for a black square of that size without slopes and bend."""
-        soft = blur_nodes(square(len(self.drawing.cells), self.grid.n), self.sigma)
+    def square_light_rows(self) -> tuple[Array, Array]:
+        """The same basis for a black square of the drawing's size, without slopes of the gain and
+        bend: rows (4 or 5, n * n), and their Gram matrix."""
+        soft = blur_nodes(black_square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
-        lit, _ = self.light
+        lit, _ = self.light_rows
         rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
         return rows, gram_matrix(rows)
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import mean_side_px, nested, within
+from perchctl.vision.markers.corners import mean_side_px, scale_square, within
 from perchctl.vision.markers.detector import (
     MIRROR_INDEX,
     OPENCV_THRESHOLDS,
@@ -20,7 +20,7 @@ from perchctl.vision.markers.detector import (
     Thresholds,
     make_marker_decoder,
 )
-from perchctl.vision.target_selection import AsideOf
+from perchctl.vision.target_selection import OwnOffset
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
@@ -53,13 +53,14 @@ def search(
     picture: Picture,
     expected: Mapping[MarkerName, Array],
     look: Look = "all",
-    own: AsideOf | None = None,
+    own: OwnOffset | None = None,
 ) -> FoundMarkers:
-    """Search the window, if any, and the whole picture where that gave too little; only one of them
-    if `look` is "near", "window" or "sharp". `own` chooses among several where none is expected."""
+    """Search the window around the expected markers, then the whole picture if that found too
+    little; with `look` "near" or "window" the window only, with "sharp" the picture only. `own`
+    chooses among several targets where none is expected."""
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
-    if setup.by_lines and expected and look != "sharp":
+    if setup.fits_lines and expected and look != "sharp":
         quickly = search_halved(picture, expected, own)
         if quickly is not None:
             return quickly
@@ -77,7 +78,7 @@ def search(
 
 
 def search_halved(
-    picture: Picture, expected: Mapping[MarkerName, Array], own: AsideOf | None = None
+    picture: Picture, expected: Mapping[MarkerName, Array], own: OwnOffset | None = None
 ) -> FoundMarkers | None:
     """Search the window at half size, a millisecond; None where anything whole is missed."""
     shape = picture.image.shape
@@ -119,7 +120,7 @@ def _pass(
     window: Window,
     expected: Mapping[MarkerName, Array],
     thresholds: Thresholds,
-    own: AsideOf | None,
+    own: OwnOffset | None,
     halved: bool = False,
 ) -> FoundMarkers:
     """Return what one pass of OpenCV's detector over the window gives."""
@@ -143,19 +144,19 @@ def _pass(
         # A pixel of half the size has its centre between two.
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_wholes(candidates, setup.ratio))
-    chosen = choose(candidates, expected, setup.ratio, own)
+    chosen = choose_markers(candidates, expected, setup.ratio, own)
     return FoundMarkers(chosen, mirrored, targets)
 
 
-def choose(
+def choose_markers(
     candidates: Mapping[MarkerName, list[Array]],
     expected: Mapping[MarkerName, Array],
     ratio: float,
-    own: AsideOf | None = None,
+    own: OwnOffset | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one of each marker. A small marker in the centre of a large one, of the right
-    size and turn, verifies both. What goes on from the last detections counts more than a pair
-    elsewhere; of lone ones that counts which `own` has nearest."""
+    size and turn, verifies both. Markers at their expected places win over a pair elsewhere;
+    among single ones, the nearest by `own`."""
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
@@ -188,7 +189,7 @@ def choose(
 
 
 def _nearest_first(
-    candidates: Mapping[MarkerName, list[Array]], own: AsideOf
+    candidates: Mapping[MarkerName, list[Array]], own: OwnOffset
 ) -> Mapping[MarkerName, list[Array]]:
     """The candidates that are least far aside first, without those that are too far. A lone
     one is left to the pipeline, which says why it is not taken."""
@@ -207,7 +208,9 @@ def _wholes(
 ) -> list[tuple[float, int, int]]:
     """The pairs that belong together, misfit and indices, best first."""
     large, small = candidates["large"], candidates["small"]
-    pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
+    pairs = [
+        (nesting_error(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)
+    ]
     best: dict[int, tuple[float, int, int]] = {}
     for pair in sorted(pairs):
         if pair[0] <= 1.0:
@@ -215,9 +218,9 @@ def _wholes(
     return list(best.values())
 
 
-def misfit(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return how far the small marker is off its place; at most 1 is allowed."""
-    mapped = nested(large_px, ratio)
+def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
+    """Return the distance of the small marker from its place in the large one; at most 1."""
+    mapped = scale_square(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
     return float(np.linalg.norm(mapped - small_px, axis=1).max()) / allowed_px

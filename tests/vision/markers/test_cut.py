@@ -166,7 +166,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     image = render(*LINE, plain, noise=4.0, blur_px=1.0)
     found = fit_pose(image, _pose("line"), outline, plain)
-    assert found.shown == found.in_view
+    assert found.points_shown == found.points_in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert fit_cut_markers(Picture(image, None, SETUP, plain), expected) == {}
     assert nothing(look("width", waved(picture("width")))), "nor do edges that fit badly"
@@ -198,7 +198,7 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
     fit = fit_pose(image, _pose("height"), outline, CAMERA, own)
-    assert fit.shown == fit.in_view
+    assert fit.points_shown == fit.points_in_view
     found = fit_cut_markers(Picture(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0

@@ -8,9 +8,14 @@ import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.detect import around, between, detect_markers, follow_markers
+from perchctl.vision.markers.detect import (
+    detect_markers,
+    follow_markers,
+    large_around,
+    mean_of_fields,
+)
 from perchctl.vision.markers.detector import Picture, make_aruco_detector
-from perchctl.vision.markers.search import misfit
+from perchctl.vision.markers.search import nesting_error
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -46,7 +51,7 @@ def test_a_decoy_of_either_marker_is_dropped() -> None:
     paste(image, "DICT_ARUCO_ORIGINAL", 5, (450, 300), 60)
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert np.abs(found.large.corners_px - true_large).max() < 0.2
-    assert misfit(found.large.corners_px, found.small.corners_px, SETUP.ratio) < 0.5
+    assert nesting_error(found.large.corners_px, found.small.corners_px, SETUP.ratio) < 0.5
 
 
 def test_one_wrong_cell_of_the_small_marker_is_corrected_and_no_more() -> None:
@@ -120,7 +125,7 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     assert found.small is not None
     assert found.large is None
     seen = follow_markers(Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)})
-    assert around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
+    assert large_around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
 
 
 # --- Motion from picture to picture ------------------------------------------------------------
@@ -132,5 +137,5 @@ def test_nothing_is_between_two_targets() -> None:
         Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, refined=True))
         for x in (100.0, 400.0)
     ]
-    mean = between(*fields)
+    mean = mean_of_fields(*fields)
     assert mean.large.corners_px[:, 0].mean() == pytest.approx(100.0)

@@ -15,11 +15,11 @@ from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig, load_profile
 from perchctl.vision import Frame, make_pipeline
-from perchctl.vision.fields import field_picture
+from perchctl.vision.fields import interpolate_field
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.markers.corners import RefinedCorners, apply_homography, homography_from_unit
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import Picture, hidden_area, hides, make_aruco_detector
+from perchctl.vision.markers.detector import Picture, hidden_area, is_hidden, make_aruco_detector
 from perchctl.vision.markers.partial import KnownBy, fit_partly_seen, seen_edges
 from perchctl.vision.markers.search import search
 from perchctl.vision.types import Detections, MarkerName
@@ -157,7 +157,7 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
 def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.inner & ~LARGE.white)[0]
-    spots = apply_homography(homography_from_unit(true), LARGE.spots[LARGE.owner == black])
+    spots = apply_homography(homography_from_unit(true), LARGE.spots[LARGE.spot_cells == black])
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
     found = partly(bright, true, "track")
@@ -221,7 +221,7 @@ LEGS = {
 def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
-    assert hides(covered, TRUE)
+    assert is_hidden(covered, TRUE)
     bare, at = render(*POSE, noise=2.0), homography_from_unit(undistort_px(TRUE, CAMERA))
     seen = [seen_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE) for gear in (None, covered)]
     whole, rest = (edges.weight.sum() for edges in seen)
@@ -243,7 +243,7 @@ def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
     covered = LEGS["corner"]
     image = np.where(covered, 0, 200).astype(np.uint8)
     for first_row, name in ((0, "top"), (1, "bottom")):
-        field = field_picture(image, first_row)
+        field = interpolate_field(image, first_row)
         hidden = hidden_area(Frame(0, 0.0, field, fields=name), covered)
         assert hidden is not None
         assert (field[~hidden] == 200).all()

@@ -22,7 +22,7 @@ from perchctl.vision.markers.blurred import (
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
 from perchctl.vision.markers.pattern import Drawing, make_drawing
-from perchctl.vision.markers.photometric_fit import Alignment, align
+from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
@@ -72,7 +72,7 @@ def test_corners_of_small_and_blurred_markers(
     squares = []
     for seed in range(6):
         image, true = view(name, side_px, seed, blur_px=blur_px, noise=3.0)
-        found = align(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
+        found = align_drawing(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
         assert is_verified(found)
         error = found.corners_px - true
         squares.append((error**2).mean())
@@ -90,7 +90,7 @@ def test_no_light_moves_the_corners(tone: str) -> None:
             image = np.clip(image * 1.6, 0, 255).astype(np.uint8)
         else:
             image = (image * np.linspace(0.45, 1.0, image.shape[1])).astype(np.uint8)
-        found = align(image, off(true, seed), DRAWINGS["small"], CAMERA, 1.0)
+        found = align_drawing(image, off(true, seed), DRAWINGS["small"], CAMERA, 1.0)
         out = true - true.mean(axis=0)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         assert abs(((found.corners_px - true) * out).sum(axis=1).mean()) < 0.05
@@ -115,7 +115,7 @@ def test_other_markers_are_not_verified(
     image = render(*pose, markers=(other,), sheet_m=0.6, blur_px=blur_px, noise=2.0)
     true = project(square_corners(SIDES[name]), *pose, CAMERA)
     for k in range(4):
-        found = align(image, np.roll(true, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
+        found = align_drawing(image, np.roll(true, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
         assert found is None or not is_verified(found)
 
 
@@ -129,9 +129,9 @@ def test_other_markers_are_not_verified(
 )
 def test_impossible_starts_and_flat_pictures_give_nothing(corners: Array) -> None:
     flat = np.full((480, 640), 130, np.uint8)
-    assert align(flat, corners, DRAWINGS["large"], CAMERA) is None
+    assert align_drawing(flat, corners, DRAWINGS["large"], CAMERA) is None
     middle = np.array([[300.0, 200.0], [340.0, 200.0], [340.0, 240.0], [300.0, 240.0]])
-    assert align(flat, middle, DRAWINGS["large"], CAMERA) is None
+    assert align_drawing(flat, middle, DRAWINGS["large"], CAMERA) is None
 
 
 # --- Which codeword it is ----------------------------------------------------------------------
@@ -147,7 +147,7 @@ DOTS = 12
 def seen(cells: Array, cell_px: float, blur_px: float, noise: float, seed: int) -> Alignment:
     """The small marker's drawing laid over a picture of these cells."""
     image, corners = picture(cells, cell_px, blur_px, noise, seed)
-    found = align(image, corners, SETUP.patterns["small"].drawing, PINHOLE, blur_px)
+    found = align_drawing(image, corners, SETUP.patterns["small"].drawing, PINHOLE, blur_px)
     assert found is not None
     return found
 

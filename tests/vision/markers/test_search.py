@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.vision import Frame, Pipeline, PipelineState, step
-from perchctl.vision.markers.search import choose
+from perchctl.vision.markers.search import choose_markers
 from tests.helpers.markers import SETUP, box
 from tests.helpers.target_picture import pose_of, render
 
@@ -48,7 +48,7 @@ Build = Callable[..., Pipeline]
     ],
 )
 def test_choice_among_candidates(large, small, expected, result) -> None:
-    chosen = choose({"large": large, "small": small}, expected, RATIO)
+    chosen = choose_markers({"large": large, "small": small}, expected, RATIO)
     pools = {"large": large, "small": small}
     assert set(chosen) == set(result)
     for name, index in result.items():
@@ -58,14 +58,14 @@ def test_choice_among_candidates(large, small, expected, result) -> None:
 def test_a_whole_target_elsewhere_does_not_stand_in_for_the_own_one() -> None:
     """Of which the search sees one marker only: large of one, and small of the other, never."""
     large, small = [box(100, 100, 60), box(400, 200, 60)], [box(400, 200, 10)]
-    near = choose({"large": large, "small": small}, {"large": box(104, 98, 60)}, RATIO)
+    near = choose_markers({"large": large, "small": small}, {"large": box(104, 98, 60)}, RATIO)
     assert list(near) == ["large"]
     assert near["large"] is large[0]
     # Not a look-alike of another size: that goes on from nothing.
     other = {"large": [box(100, 100, 20), large[1]], "small": small}
-    assert choose(other, {"large": box(104, 98, 60)}, RATIO)["large"] is large[1]
+    assert choose_markers(other, {"large": box(104, 98, 60)}, RATIO)["large"] is large[1]
     small = [box(100, 100, 10), box(400, 200, 10)]
-    near = choose({"large": large[1:], "small": small}, {"small": box(104, 98, 10)}, RATIO)
+    near = choose_markers({"large": large[1:], "small": small}, {"small": box(104, 98, 10)}, RATIO)
     assert list(near) == ["small"]
     assert near["small"] is small[0]
 
