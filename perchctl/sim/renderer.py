@@ -190,7 +190,10 @@ class Renderer:
         nodes, misses = trace_rays(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
         # At the ray grids' padded size.
-        picture = self._background(nodes, misses, motion_px, length_px)
+        if any(view.covers_all for view in views):
+            picture = np.zeros(self._pixels.xy.shape[:2], np.uint8)
+        else:
+            picture = self._background(nodes, misses, motion_px, length_px)
         for view in views:
             self._add_sheet(picture, view, maps)
         lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
@@ -235,15 +238,22 @@ class Renderer:
         return np.asarray(cv2.resize(picture, None, fx=step, fy=step), np.uint8)
 
     def _add_sheet(self, picture: Picture, view: SheetView, maps: Array) -> None:
-        rows, cols = pixel_slices(view.box)
         pixels = self._pixels
-        here = np.ascontiguousarray(pixels.xy[rows, cols])
-        rays = RayGrid(here, pixels.row_share[rows], pixels.boundary_xy)
-        texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
-        seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
-        alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
-        rest: Any = cv2.multiply(picture[rows, cols], ~alpha, scale=1.0 / 255.0)
-        picture[rows, cols] = cv2.add(rest, seen)
+        if maps.ndim > 3:  # a rolling shutter: each row has a map of its own
+            rows, cols = pixel_slices(view.box)
+            xy = np.ascontiguousarray(pixels.xy[rows, cols])
+            rays = RayGrid(xy, pixels.row_share[rows], pixels.boundary_xy)
+            picture[rows, cols] = cover(picture[rows, cols], view, maps, rays)
+            return
+        blocks, is_paper = by_block(picture)[view.box], view.is_plain & (view.alpha > 0)
+        blocks[is_paper] = view.value[is_paper][:, None, None]
+        if view.is_plain.all():
+            return
+        below = blocks[~view.is_plain]
+        xy = by_block(pixels.xy)[view.box][~view.is_plain].reshape(len(below), -1, 2)
+        rays = RayGrid(xy, pixels.row_share, pixels.boundary_xy)
+        covered = cover(below.reshape(len(below), -1), view, maps, rays)
+        blocks[~view.is_plain] = covered.reshape(below.shape)
 
     # -- motion -------------------------------------------------------------
 
@@ -271,6 +281,22 @@ class Renderer:
 
 
 # --- Sums, look-ups and shading of whole pictures ---------------------
+
+
+def by_block(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of a picture (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
+    height, width, *rest = pixels.shape
+    shape = (height // COARSE_PX, COARSE_PX, width // COARSE_PX, COARSE_PX, *rest)
+    return pixels.reshape(shape).swapaxes(1, 2)
+
+
+def cover(below: Picture, view: SheetView, maps: Array, rays: RayGrid) -> Picture:
+    """Return what the rays show, the sheet over `below`, as the mean over the exposure's maps."""
+    texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
+    seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
+    alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
+    rest: Any = cv2.multiply(below, ~alpha, scale=1.0 / 255.0)
+    return np.asarray(cv2.add(rest, seen), np.uint8)
 
 
 def mean_picture(pictures: Sequence[Picture]) -> Picture:

@@ -55,7 +55,8 @@ _BYTE_SIGMA = math.sqrt((256.0**2 - 1.0) / 12.0)
 
 
 class SheetTexture(NamedTuple):
-    """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage.
+    """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage, and `clear`
+    the distance to the next change of either, in texels along x or y, at most 255.
 
     A point (x, y) of the target's plane (target axes) is at column
     ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``.
@@ -63,6 +64,7 @@ class SheetTexture(NamedTuple):
 
     value: Picture
     alpha: Picture
+    clear: Picture
     px_per_m: float
     center_px: float
 
@@ -96,7 +98,12 @@ class Sheet:
         value += sheet
         grey = np.rint(value, out=value).astype(np.uint8)
         del sheet, value
-        return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0)
+        square = np.ones((3, 3), np.uint8)
+        changes = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, square)
+        changes |= cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, square)
+        away = cv2.distanceTransform(np.equal(changes, 0).astype(np.uint8), cv2.DIST_C, 3)
+        clear = np.minimum(away, 255.0, out=away).astype(np.uint8)
+        return SheetTexture(grey, alpha, clear, px_per_m, (size - 1) / 2.0)
 
 
 class CeilingTexture:
@@ -146,13 +153,22 @@ Box = tuple[slice, slice]
 """Rows and columns of blocks of `COARSE_PX` pixels."""
 
 
+_LOOK_UP_TEXELS = 2.5  # from a block's middle, rounded, to what a bilinear look-up reads
+
+
 class SheetView(NamedTuple):
     """A sheet in one exposure: `box` is its part of the picture, `to_texels` (3, 3) maps the plane
-    of the vehicle's own target to the texture's columns and rows."""
+    of the vehicle's own target to the texture's columns and rows. Of the box's blocks (rows,
+    columns), `is_plain` are those whose pixels all show one `value` and `alpha`. `covers_all`:
+    nothing else is in the picture."""
 
     texture: SheetTexture
     box: Box
     to_texels: Array
+    covers_all: bool
+    is_plain: NDArray[np.bool_]
+    value: Picture
+    alpha: Picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +202,15 @@ class PlacedSheet:
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
         if self.to_sheet is not None:
             to_texels = to_texels @ self.to_sheet
-        return SheetView(texture, (rows, cols), to_texels)
+        at = nodes[1:-1, 1:-1][rows, cols] * scale + centre
+        inside = np.clip(np.rint(at), 0, len(texture.value) - 1).astype(int)
+        u, v = inside[..., 0], inside[..., 1]
+        clear = np.maximum(np.abs(at - inside).max(axis=-1), texture.clear[v, u])
+        value, alpha = texture.value[v, u], texture.alpha[v, u]
+        is_plain = clear > reach_m[rows, cols] * scale + _LOOK_UP_TEXELS
+        is_plain &= (alpha == 0) | (alpha == 255)
+        covers_all = bool((off_m + reach_m < half_m - 2.0 / scale).all())
+        return SheetView(texture, (rows, cols), to_texels, covers_all, is_plain, value, alpha)
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:

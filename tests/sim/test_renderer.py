@@ -14,6 +14,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, r
 from perchctl.profile import TargetConfig
 from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.sim.optics import shared_lens
+from perchctl.sim.sheets import PlacedSheet, SheetView
 from perchctl.target.drawing import marker_corners_m
 from perchctl.vision import CameraModel
 
@@ -225,6 +226,27 @@ def test_a_neighbour_s_target_hangs_where_it_is_said(renderer: Renderer) -> None
     assert np.array_equal(both.render([low]), renderer.render([low]))
     assert 145 in read_ids(both.render([pose]))
     assert {997, 5} <= set(read_ids(renderer.render([camera_pose(0.3)])))
+
+
+def test_blocks_of_one_grey_are_what_each_pixel_s_look_up_gives(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At any distance and motion, on paper, print and ceiling; and so a near sheet costs little."""
+    exposures = [
+        [camera_pose(below_m, 0.02 + x, -0.03, (0.1, -0.05, turn)) for x in (0.0, way_m)]
+        for below_m in (0.04, 0.09, 0.2, 0.6, 1.5)
+        for way_m, turn in ((0.0, 0.3), (1e-4, 1.0), (0.05 * below_m, 2.2))
+    ]
+    pictures = [renderer.render(poses) for poses in exposures]
+    view = PlacedSheet.view
+
+    def each_pixel(*args: Any) -> SheetView | None:
+        seen = view(*args)
+        return seen and seen._replace(is_plain=np.zeros_like(seen.is_plain), covers_all=False)
+
+    monkeypatch.setattr(PlacedSheet, "view", each_pixel)
+    for poses, picture in zip(exposures, pictures, strict=True):
+        assert np.array_equal(renderer.render(poses), picture)
 
 
 def test_noise_has_its_spread_no_memory_and_hangs_on_seed_and_index() -> None:
