@@ -99,9 +99,9 @@ class Sheet:
         grey = np.rint(value, out=value).astype(np.uint8)
         del sheet, value
         square = np.ones((3, 3), np.uint8)
-        changes = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, square)
-        changes |= cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, square)
-        away = cv2.distanceTransform(np.equal(changes, 0).astype(np.uint8), cv2.DIST_C, 3)
+        change = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, square)
+        change = cv2.max(change, cv2.morphologyEx(alpha, cv2.MORPH_GRADIENT, square))
+        away = cv2.distanceTransform(np.equal(change, 0).astype(np.uint8), cv2.DIST_C, 3)
         clear = np.minimum(away, 255.0, out=away).astype(np.uint8)
         return SheetTexture(grey, alpha, clear, px_per_m, (size - 1) / 2.0)
 
