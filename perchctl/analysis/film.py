@@ -208,7 +208,7 @@ def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
     return place_m, target_z_m
 
 
-# --- The file ---------------------------------------------------------
+# --- The file ---
 
 
 def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:

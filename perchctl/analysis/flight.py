@@ -227,7 +227,7 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-# --- what was sent in the loop's place --------------------------------
+# --- what was sent in the loop's place ---
 
 APART_S = 2.0
 """Commands of one sender that are farther apart are two goes."""

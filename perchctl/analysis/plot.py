@@ -111,7 +111,7 @@ def figure_title(flight: FlightAnalysis) -> str:
     return "   |   ".join(parts).replace("$", r"\$")
 
 
-# --- panels -----------------------------------------------------------
+# --- panels ---
 
 
 def _draw_raw_and_filtered(
@@ -222,7 +222,7 @@ def _most(values: Array) -> float:
     return float(known.max()) if known.size else 0.0
 
 
-# --- phases -----------------------------------------------------------
+# --- phases ---
 
 
 def _shade_spans(ax: Axes, spans: Sequence[Span]) -> None:

@@ -242,7 +242,7 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 
 
-# --- What the pictures show -------------------------------------------
+# --- What the pictures show ---
 
 
 def _seen(

@@ -142,7 +142,7 @@ class ReportedFlight:
         return found
 
 
-# --- the page ---------------------------------------------------------
+# --- the page ---
 
 POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""

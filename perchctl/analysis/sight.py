@@ -25,7 +25,7 @@ def percentile(values: Array, percent: float) -> float:
     return float(np.percentile(known, percent)) if known.size else math.nan
 
 
-# --- frames -----------------------------------------------------------
+# --- frames ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
     return gaps_s
 
 
-# --- losses -----------------------------------------------------------
+# --- losses ---
 
 LEAST_LOSS_S = 0.3
 """A shorter gap is coasted through and changes nothing."""

@@ -147,7 +147,7 @@ def _upper(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]
 
 
-# --- Figures as people read them --------------------------------------
+# --- Figures as people read them ---
 
 
 def length_text(metres: float) -> str:

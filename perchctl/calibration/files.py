@@ -161,7 +161,7 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
     return CameraModel((width, height), K, dist, "fisheye" if model == "equidistant" else model)
 
 
-# --- Writing ----------------------------------------------------------
+# --- Writing ---
 # FileStorage wants ``dt: d`` and a first line ``%YAML 1.0``; PyYAML reads ``1e-05`` as a string.
 
 

@@ -30,7 +30,7 @@ from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, decode_grey
 from perchctl.camera.source import Clock, LiveSource
 from perchctl.errors import NotFound
 
-# --- Motion-JPEG over HTTP --------------------------------------------
+# --- Motion-JPEG over HTTP ---
 
 
 READ_BYTES = 65536

@@ -42,7 +42,7 @@ _LIBRARIES = ("numpy", "mujoco-core", "filterpy", "distributed")
 """Compute a flight's figures or carry them; OpenCV, of several names, is compared apart."""
 
 
-# --- What each worker must have ---------------------------------------
+# --- What each worker must have ---
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
     return fn(*args, **named)
 
 
-# --- The executor -----------------------------------------------------
+# --- The executor ---
 
 
 class ClusterExecutor(Executor):

@@ -62,7 +62,7 @@ def results_by_seed(
     ]
 
 
-# --- What is compared -------------------------------------------------
+# --- What is compared ---
 
 
 Pair = tuple[FlightResult, FlightResult]
@@ -184,7 +184,7 @@ def _verdict(better: str | None, by: str = "") -> str:
     return NOT_PROVEN if better is None else f"{better} is better{by}"
 
 
-# --- A key of a profile at several values -----------------------------
+# --- A key of a profile at several values ---
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ OUTCOMES: dict[Phase, FlightEnd] = {
 }
 
 
-# --- One flight -------------------------------------------------------
+# --- One flight ---
 
 
 def fly_measured(profile: Profile, seed: int, fly: Callable[[Scenario], R]) -> R:
@@ -93,7 +93,7 @@ def seed_log_path(seed: int, log_dir: Path) -> Path:
     return log_dir / f"flight_seed{seed}.jsonl"
 
 
-# --- Many flights -----------------------------------------------------
+# --- Many flights ---
 
 
 def fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:

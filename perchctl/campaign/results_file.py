@@ -95,7 +95,7 @@ def campaign_results(
         yield CampaignResults(seeds, earlier, file)
 
 
-# --- The header -------------------------------------------------------
+# --- The header ---
 
 
 SOURCE = Path(perchctl.__file__).resolve().parent
@@ -139,7 +139,7 @@ def source_sha256(root: Path = SOURCE) -> str:
     return whole.hexdigest()
 
 
-# --- Lines ------------------------------------------------------------
+# --- Lines ---
 
 
 def _write(file: BinaryIO, record: dict[str, Any]) -> None:

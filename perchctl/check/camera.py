@@ -81,7 +81,7 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
     return rows
 
 
-# --- The pictures -----------------------------------------------------
+# --- The pictures ---
 
 
 def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
@@ -183,7 +183,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 }
 
 
-# --- Where the target is the positioning system -----------------------
+# --- Where the target is the positioning system ---
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
@@ -211,7 +211,7 @@ def picture_row_names(profile: Profile) -> tuple[str, ...]:
     return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
 
 
-# --- The computer that looks at the pictures --------------------------
+# --- The computer that looks at the pictures ---
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:

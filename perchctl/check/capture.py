@@ -96,7 +96,7 @@ def collect_samples(
     return CaptureSamples(tuple(telemetry), tuple(frames), source.problem(clock()))
 
 
-# --- At rest ----------------------------------------------------------
+# --- At rest ---
 
 
 BODY_ROWS = ("body", "body place")
@@ -173,7 +173,7 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
     return passed(f"x {x:.2f}, y {y:.2f}, z {z:.2f} m")
 
 
-# --- In a hand --------------------------------------------------------
+# --- In a hand ---
 
 HOW_TO_TURN = (
     "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and aside, put it back"
@@ -368,7 +368,7 @@ def _body_finding(turns: FrameAlignment, moved: PairedMotion, config: Positionin
     return passed(f"{found}; rose by {risen_m:.2f} m")
 
 
-# --- What the hand found, written down for `fly` ----------------------
+# --- What the hand found, written down for `fly` ---
 
 COMPARED = "compared"
 

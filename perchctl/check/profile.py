@@ -149,7 +149,7 @@ def _limits(name: str, profile: Profile) -> Finding:
     return warned(sentences, f"change {' or '.join(keys)}")
 
 
-# --- Where the target is the positioning system -----------------------
+# --- Where the target is the positioning system ---
 
 
 def _latency(plan: _Plan) -> Finding:
@@ -162,7 +162,7 @@ def _latency(plan: _Plan) -> Finding:
     )
 
 
-# --- The computer's disk ----------------------------------------------
+# --- The computer's disk ---
 
 
 def log_finding(folder: Path) -> Finding:

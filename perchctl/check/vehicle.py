@@ -91,7 +91,7 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
     )
 
 
-# --- Its rows ---------------------------------------------------------
+# --- Its rows ---
 
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
@@ -229,7 +229,7 @@ VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
 """The rows of a vehicle that answers, in their order."""
 
 
-# --- Lifted by hand and put back, motors off --------------------------
+# --- Lifted by hand and put back, motors off ---
 
 LIFTED = "lifted"
 LIFT_S = 20.0
@@ -268,7 +268,7 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
     return passed(found)
 
 
-# --- Which vehicles answer --------------------------------------------
+# --- Which vehicles answer ---
 
 
 def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:

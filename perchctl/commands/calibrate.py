@@ -211,7 +211,7 @@ def convert(
     print_result(file)
 
 
-# -- files -------------------------------------------------------------
+# --- files ---
 
 
 def _file(output: Path | None, size_px: tuple[int, int]) -> Path:
@@ -222,7 +222,7 @@ def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
-# -- the source --------------------------------------------------------
+# --- the source ---
 
 
 def _source(text: str, view: bool = False) -> str:
@@ -233,7 +233,7 @@ def _source(text: str, view: bool = False) -> str:
     return source.spec
 
 
-# -- the board and its views -------------------------------------------
+# --- the board and its views ---
 
 
 def _find_views(

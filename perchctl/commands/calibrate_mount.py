@@ -127,7 +127,7 @@ def mount(
     return 0 if problem is None else problem.exit_code
 
 
-# -- what is refused at once -------------------------------------------
+# --- what is refused at once ---
 
 
 def _live_sources(
@@ -162,7 +162,7 @@ def _free_place(name: str) -> Path:
     return place
 
 
-# -- recordings of files -----------------------------------------------
+# --- recordings of files ---
 
 
 def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
@@ -188,7 +188,7 @@ def _check_unchanged(name: str, then: Profile) -> None:
         )
 
 
-# -- a live recording --------------------------------------------------
+# --- a live recording ---
 
 
 def _record_live(

@@ -99,7 +99,7 @@ def fit(
     return 0 if problem is None else problem.exit_code
 
 
-# --- collect ----------------------------------------------------------
+# --- collect ---
 
 
 @command(

@@ -78,7 +78,7 @@ def _say_doubts(profile: Profile) -> None:
             say(f"{row.name}: {row.found}; {row.advice}")
 
 
-# --- A new profile ----------------------------------------------------
+# --- A new profile ---
 
 EXAMPLE = "example_640x480.yaml"
 SIMULATED = "sim://"

@@ -96,7 +96,7 @@ def _bar(
         yield partial(progress.update, progress.add_task("", total=total))
 
 
-# --- A person is guided -----------------------------------------------
+# --- A person is guided ---
 
 _BAR_WIDTH = 30
 _GUIDE_HZ = 8

@@ -278,7 +278,7 @@ def _require_simulator() -> None:
         raise no_simulator()
 
 
-# --- Who flies, and how it may end ------------------------------------
+# --- Who flies, and how it may end ---
 
 
 def make_executor(
@@ -373,7 +373,7 @@ def stop_handler(
     return press
 
 
-# --- What is printed --------------------------------------------------
+# --- What is printed ---
 
 
 def print_log_folder(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:

@@ -173,7 +173,7 @@ def poll_until_stopped(
         stop.requested.wait(POLL_S)
 
 
-# --- Results ----------------------------------------------------------
+# --- Results ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ def target_in_camera(
     return TargetInCamera(rvec, target.e_m, target.e_yaw_rad, target.sigma_m, target.sigma_yaw_rad)
 
 
-# --- What is printed --------------------------------------------------
+# --- What is printed ---
 
 
 def track_record(tracked: TrackResult) -> dict[str, Any]:

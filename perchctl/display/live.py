@@ -81,7 +81,7 @@ class LivePage:
         )
         self._thread.start()
 
-    # --- for the loop: neither waits nor raises ------------------------------
+    # --- for the loop: neither waits nor raises ---
 
     def show(self, sketch: Sketch) -> None:
         """Show this picture from now on."""
@@ -105,7 +105,7 @@ class LivePage:
             if read_s is not None and self._clock() - read_s < READS_S:
                 self._changed.wait_for(lambda: self.closed, LAST_READ_S)
 
-    # --- for the server's threads --------------------------------------------
+    # --- for the server's threads ---
 
     def state(self) -> dict[str, Any]:
         """Return the JSON that the page polls: the keys of `describe` (rows of name, text and

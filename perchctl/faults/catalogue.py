@@ -25,7 +25,7 @@ LONGEST_S, EVER_SHARE = 30.0, 0.25
 """A loss lasts for 0.1 s to `LONGEST_S`, and a part of them for ever."""
 
 
-# --- Draws ------------------------------------------------------------
+# --- Draws ---
 
 
 class DrawInputs(NamedTuple):
@@ -209,7 +209,7 @@ LOW_STATE = effect(e.log_reads, names=("pm.state",), value=3.0, for_s=duration_s
 STATE = tuple(f"stateEstimate.{axis}" for axis in ("x", "y", "z", "vx", "vy", "vz"))
 
 
-# --- The faults -------------------------------------------------------
+# --- The faults ---
 
 
 AIR = (

@@ -20,7 +20,7 @@ from perchctl.link import MockLink, Packet, Port, Radio
 from perchctl.sim import SimulatedVehicle
 from perchctl.vision import Frame
 
-# --- The radio: what arrives, what does not, and what comes late ------
+# --- The radio: what arrives, what does not, and what comes late ---
 
 
 def packet_kind(packet: Packet) -> str:
@@ -89,7 +89,7 @@ class FaultyRadio(Radio):
         return None if math.isinf(delay_s) else delay_s
 
 
-# --- The camera -------------------------------------------------------
+# --- The camera ---
 
 
 SNOW_STREAM = 512
@@ -260,7 +260,7 @@ class FaultyClock:
             self.kill()
 
 
-# --- All of them ------------------------------------------------------
+# --- All of them ---
 
 
 @dataclass

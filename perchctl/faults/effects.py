@@ -36,7 +36,7 @@ CAPTURE_FAULTS = {
 }
 
 
-# --- The radio --------------------------------------------------------
+# --- The radio ---
 
 
 def radio_loss(
@@ -70,7 +70,7 @@ def reboots(rig: FaultRig, t_s: float, boots_s: float) -> None:
     rig.radio.lose(t_s + (boots_s + MockLink.BLOCKS_BACK_AFTER_S), uplink=False, block="all")
 
 
-# --- The camera and the positions -------------------------------------
+# --- The camera and the positions ---
 
 
 def camera_fault(rig: FaultRig, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
@@ -93,7 +93,7 @@ def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> N
     rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
 
-# --- The vehicle ------------------------------------------------------
+# --- The vehicle ---
 
 
 def estimate_error(
@@ -177,7 +177,7 @@ def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
     rig.vehicle.move_target((x + by_m[0], y + by_m[1]))
 
 
-# --- The operator and the program -------------------------------------
+# --- The operator and the program ---
 
 
 def operator(
@@ -222,7 +222,7 @@ def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
     rig.set_until(t_s + for_s, rig.disk, "problem", "No space left on device", None)
 
 
-# --- What holds from the start ----------------------------------------
+# --- What holds from the start ---
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
@@ -271,7 +271,7 @@ def latency_drop_s(effect: Effect) -> float:
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
 
-# --- When they begin --------------------------------------------------
+# --- When they begin ---
 
 
 class Injector:

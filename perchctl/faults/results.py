@@ -67,7 +67,7 @@ class FaultResult(CampaignFlight):
         return len(self.counted) < len(self.flags)
 
 
-# --- A campaign's figures ---------------------------------------------
+# --- A campaign's figures ---
 
 
 WORST = 20

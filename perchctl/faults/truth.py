@@ -89,7 +89,7 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
     )
 
 
-# --- The facts --------------------------------------------------------
+# --- The facts ---
 
 
 LEAST_LIFT = 1.02
@@ -217,7 +217,7 @@ class FactsRecorder(Facts):
             self.battery_low_s, self.battery_low_m = s.t_s, s.height_m
 
 
-# --- What a flight is held to -----------------------------------------
+# --- What a flight is held to ---
 
 
 Place = tuple[float, float]

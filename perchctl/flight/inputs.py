@@ -223,7 +223,7 @@ class FlightInputs:
         return f"the picture is {age_s:.1f} s late" if is_late else None
 
 
-# --- The target as positioning system, tick by tick -------------------
+# --- The target as positioning system, tick by tick ---
 # Standing, pressed or hanging, the place is known better than by any picture, and is sent instead;
 # only while the accelerometer shows that something carries the vehicle, up to the first sample that
 # does not: what falls while it gets the position of a hanging vehicle would look as if it hung.

@@ -91,7 +91,7 @@ class Watchdog:
         self._held: PositionSetpoint | None = None
         self._way_down: PlannerState | None = None
 
-    # --- the loop's side ---------------------------------------------------------------
+    # --- the loop's side ---
 
     def tick(self, due_s: float, state: PlannerState, command: Command, obs: Observation) -> None:
         """Note a tick of the loop whose command is on its way."""
@@ -114,7 +114,7 @@ class Watchdog:
         """The planner's state after the last tick that was sent; None before the first."""
         return None if self._last is None else self._last.state
 
-    # --- the link's side ---------------------------------------------------------------
+    # --- the link's side ---
 
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
@@ -220,7 +220,7 @@ def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
             return PositionSetpoint(x, y, z, sample.yaw_rad)
 
 
-# --- After an error: the last resort of every error path --------------
+# --- After an error: the last resort of every error path ---
 
 
 def rescue(

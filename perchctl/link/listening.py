@@ -120,7 +120,7 @@ class AttitudeLink(ReadOnlyLink):
             )
 
 
-# --- What a vehicle holds, and how good the radio is ------------------
+# --- What a vehicle holds, and how good the radio is ---
 
 
 ANSWER_S = 0.5

@@ -139,7 +139,7 @@ class Sender:
         for thread in (self._worker, self._keeper):
             thread.join(timeout=1.0)
 
-    # --- the first thread ------------------------------------------------------------------
+    # --- the first thread ---
 
     def _start_worker(self) -> None:
         worker = threading.Thread(target=self._work, name="perchctl-sender", daemon=True)
@@ -234,7 +234,7 @@ class Sender:
             return True
         return not last.begun and type(last.command) is type(command)
 
-    # --- the second thread -----------------------------------------------------------------
+    # --- the second thread ---
 
     def _keep(self) -> None:
         while True:

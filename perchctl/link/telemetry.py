@@ -69,7 +69,7 @@ def telemetry_from(
     )
 
 
-# --- The vehicle's milliseconds on the loop's clock -------------------
+# --- The vehicle's milliseconds on the loop's clock ---
 
 
 WRAP_MS = 1 << 24

@@ -36,7 +36,7 @@ PRESS_DIP_V = 0.3  # below `safety.min_load_v`, for a press shorter than the deb
 BACK_OFF_S = 3.0  # until it is steady and sees the target again
 
 
-# --- The battery's state, fitted reading by reading -------------------
+# --- The battery's state, fitted reading by reading ---
 
 
 def read_battery(c: Context) -> EnergyState:
@@ -139,7 +139,7 @@ def _towards(value: float, goal: float, part: float) -> float:
     return value + min(1.0, part) * (goal - value)
 
 
-# --- What that is enough for ------------------------------------------
+# --- What that is enough for ---
 
 
 def battery_outlook(c: Context) -> BatteryOutlook:

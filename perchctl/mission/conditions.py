@@ -323,7 +323,7 @@ def _void(c: Context) -> frozenset[Condition]:
     return void | {C.HANGING} if late else void - {C.HANGING}
 
 
-# --- What both the table and the way down ask -------------------------
+# --- What both the table and the way down ask ---
 
 
 def has_slipped(c: Context) -> bool:

@@ -47,7 +47,7 @@ POSITION_GAIN_PER_S = 2.0  # the firmware's `posCtlPid.xKp` and `yKp`
 CAUGHT_MPS = -0.1  # by then the thrust is above the weight
 
 
-# --- Setpoints --------------------------------------------------------
+# --- Setpoints ---
 
 
 def hold_here(c: Context) -> PositionSetpoint:
@@ -163,7 +163,7 @@ def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     )
 
 
-# --- The press, its release, and the catch of a slip ------------------
+# --- The press, its release, and the catch of a slip ---
 
 
 def is_pressing(c: Context) -> bool:

@@ -168,7 +168,7 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
     return give_up_position(c) if blind else c
 
 
-# --- What is known ----------------------------------------------------
+# --- What is known ---
 
 
 def _knows_its_place(c: Context) -> bool:
@@ -271,7 +271,7 @@ def hangs_with_motors_off(c: Context) -> bool:
     return is_still_hanging(c)
 
 
-# --- What is remembered -----------------------------------------------
+# --- What is remembered ---
 
 
 def remember_observation(c: Context) -> Context:
@@ -447,7 +447,7 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
     return state.hover_thrust or obs.imu.hover_thrust or measured
 
 
-# --- What is commanded ------------------------------------------------
+# --- What is commanded ---
 
 
 def act(c: Context) -> Action:

@@ -233,7 +233,7 @@ def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
     return None
 
 
-# --- What each phase sends --------------------------------------------
+# --- What each phase sends ---
 
 
 def act(c: Context) -> Action:

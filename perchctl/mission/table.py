@@ -244,7 +244,7 @@ def lacks_press_thrust(c: Context) -> bool:
     return near and c.state.hover_thrust > SATURATED * max_press_thrust(c.profile)
 
 
-# --- Attempts, the press and the release ------------------------------
+# --- Attempts, the press and the release ---
 
 
 def is_aligned(c: Context) -> bool:
@@ -290,7 +290,7 @@ def rests_as(state: RestState) -> Predicate:
     return lambda c: c.held_s(C.DOWN) >= 0.1 and find_rest_state(c) is state
 
 
-# --- Why the vehicle is held in place ---------------------------------
+# --- Why the vehicle is held in place ---
 
 
 def hold_reason(c: Context) -> str:
@@ -324,7 +324,7 @@ def unconfirmed_reason(c: Context) -> str:
     return f"the landing was not confirmed in time: {cause}"
 
 
-# --- The ways out of the mission --------------------------------
+# --- The ways out of the mission ---
 
 
 def cut_row(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
@@ -359,7 +359,7 @@ def give_up_row(name: str, when: Predicate, reason: Reason) -> Transition:
 
 
 TABLE: tuple[Transition, ...] = (
-    # --- the safety rows, gravest first ------------------------------------------
+    # --- the safety rows, gravest first ---
     cut_row(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
@@ -482,7 +482,7 @@ TABLE: tuple[Transition, ...] = (
         "the perching time is over",
         O.ATTEMPTS_USED_UP,
     ),
-    # --- the magnet may catch early ---------------------------------------------
+    # --- the magnet may catch early ---
     Transition("caught", BEFORE_COMPLETION, is_held, P.COMPLETE, "hanging on the magnet already"),
     land_row(
         HELD, BEFORE_COMPLETION, is_held_elsewhere, "something holds it where the target is not"
@@ -496,7 +496,7 @@ TABLE: tuple[Transition, ...] = (
             f"that may be its magnet"
         ),
     ),
-    # --- something is in the way -----------------------------------------------
+    # --- something is in the way ---
     land_row(
         "cannot-rise",
         {P.APPROACH},
@@ -519,7 +519,7 @@ TABLE: tuple[Transition, ...] = (
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
         "something is above",
     ),
-    # --- phase 1: approach ---------------------------------------------------
+    # --- phase 1: approach ---
     Transition(
         "approached",
         {P.APPROACH},
@@ -533,7 +533,7 @@ TABLE: tuple[Transition, ...] = (
         lambda c: c.in_phase_s > c.planner.approach_timeout_s,
         lambda c: f"take-off reached only {c.height_m:.2f} m",
     ),
-    # --- phase 2: search -----------------------------------------------------
+    # --- phase 2: search ---
     Transition(
         "found",
         {P.SEARCH},
@@ -548,7 +548,7 @@ TABLE: tuple[Transition, ...] = (
         not_found_reason,
         O.TARGET_NOT_FOUND,
     ),
-    # --- phase 3: estimate ---------------------------------------------------
+    # --- phase 3: estimate ---
     Transition(
         "estimate-lost",
         {P.ESTIMATE},
@@ -564,7 +564,7 @@ TABLE: tuple[Transition, ...] = (
         P.ALIGN,
         "pose is steady",
     ),
-    # --- phase 4: align ------------------------------------------------------
+    # --- phase 4: align ---
     Transition(
         "align-lost",
         {P.ALIGN},
@@ -581,7 +581,7 @@ TABLE: tuple[Transition, ...] = (
     ),
     land_row("too-little-left", {P.ALIGN, P.RECOVER}, lacks_charge_to_begin, battery_shortfall),
     Transition("aligned", {P.ALIGN}, is_aligned, P.ASCEND, "aligned in position and heading"),
-    # --- phase 5: ascend -----------------------------------------------------
+    # --- phase 5: ascend ---
     back_off_row("ascend-lost", {P.ASCEND}, lambda c: not c.tracked, "target lost in ascent"),
     Transition(
         "outside-cone",
@@ -607,7 +607,7 @@ TABLE: tuple[Transition, ...] = (
         P.PERCH,
         "settled at the stand-off",
     ),
-    # --- phase 6: perch ------------------------------------------------------
+    # --- phase 6: perch ---
     back_off_row(
         "beside-the-magnet",
         {P.PERCH},
@@ -635,7 +635,7 @@ TABLE: tuple[Transition, ...] = (
         lambda c: c.in_phase_s + c.obs.loop_late_s > c.planner.perch.timeout_s,
         "no proof of contact",
     ),
-    # --- phase 7: completion -------------------------------------------------
+    # --- phase 7: completion ---
     back_off_row(
         "slipped",
         {P.COMPLETE},
@@ -665,7 +665,7 @@ TABLE: tuple[Transition, ...] = (
         lambda c: stopped_for_s(c) > c.planner.complete.watch_s + UNSTOPPED_S,
         lambda c: f"motors stopped, but their thrust still reads {c.telemetry.thrust:.0f}",
     ),
-    # --- the failed attempt --------------------------------------------------
+    # --- the failed attempt ---
     land_row(
         "attempts-used",
         {P.RECOVER},
@@ -686,7 +686,7 @@ TABLE: tuple[Transition, ...] = (
         lambda c: c.in_phase_s > c.planner.recover.timeout_s,
         "the vehicle does not become steady",
     ),
-    # --- landing ---------------------------------------------------------------
+    # --- landing ---
     Transition(
         "hung",
         {P.LANDING},

@@ -80,7 +80,7 @@ def update_calibration(
     return replace(new, last_picture_s=t_s, applied_delay_s=used_s)
 
 
-# --- What a flight tells about the latency and the mounting -----------
+# --- What a flight tells about the latency and the mounting ---
 # Where the pictures are later than the profile says by d, the target is placed beside its place by
 # d times the speed at which the vehicle's motion and turning sweep the line of sight; where the
 # camera is turned, by the turn times the way to it. So its place in the estimate's world is linear

@@ -26,7 +26,7 @@ from perchctl.profile.base import split_constant_keys
 from perchctl.profile.load import check_profile, find_profile, key_and_reason
 from perchctl.profile.schema import Profile
 
-# --- Keys of a loaded profile -----------------------------------------
+# --- Keys of a loaded profile ---
 
 
 def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
@@ -86,7 +86,7 @@ def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
     values[key] = value
 
 
-# --- Numbers in a profile's file --------------------------------------
+# --- Numbers in a profile's file ---
 
 Value = float | int | str | tuple[float, ...]
 

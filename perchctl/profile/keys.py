@@ -89,7 +89,7 @@ def _span(number: dict[str, Any]) -> str:
     return low if least is None else f"at least {low}"
 
 
-# --- A profile as a commented file ------------------------------------
+# --- A profile as a commented file ---
 
 _WIDTH = 80
 

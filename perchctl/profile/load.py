@@ -89,7 +89,7 @@ def _checked(path: Path, own: dict[str, Any]) -> Profile:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
-# --- The weights file -------------------------------------------------
+# --- The weights file ---
 
 
 def _read_weights(name: str) -> WeightsConfig:
@@ -113,7 +113,7 @@ def _read_weights(name: str) -> WeightsConfig:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
-# --- The camera's calibration and mask --------------------------------
+# --- The camera's calibration and mask ---
 
 
 def find_calibration(name: str) -> Path:
@@ -175,7 +175,7 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     return covered
 
 
-# --- Reading ----------------------------------------------------------
+# --- Reading ---
 
 
 def _choices() -> str:

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
-# --- ArUco dictionaries by name, and the ids they hold ----------------
+# --- ArUco dictionaries by name, and the ids they hold ---
 
 
 @cache
@@ -56,7 +56,7 @@ def check_marker_id(name: str, marker_id: int) -> None:
         raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}")
 
 
-# --- The keys ---------------------------------------------------------
+# --- The keys ---
 
 
 class Mounting(Section):

@@ -154,7 +154,7 @@ def _array_from(data: Any) -> Any:
     return np.array(flat, dtype=np.dtype(data["dtype"])).reshape(data["shape"])
 
 
-# --- rounded, and as lines --------------------------------------------
+# --- rounded, and as lines ---
 
 DECIMALS = 6
 

@@ -88,7 +88,7 @@ def _packed(mask: NDArray[np.bool_]) -> str:
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
 
 
-# --- A fingerprint of how this computer calculates ---------------------------------------------
+# --- A fingerprint of how this computer calculates ---
 # Libraries choose their kernels by the processor: numpy's BLAS and vector functions, OpenCV's
 # filters, the sine of the C library. The last bits of a pose are a processor's own.
 

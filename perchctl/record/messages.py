@@ -73,7 +73,7 @@ TICK_SCHEMA = {
 """JSON schema of the ticks, for which Foxglove has none."""
 
 
-# --- Foxglove's messages ----------------------------------------------
+# --- Foxglove's messages ---
 
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 

@@ -254,7 +254,7 @@ TIMES = ("t_s", "frame_t_s")
 """On the loop's clock in the log, from the flight's first turn in a table."""
 
 
-# --- the file ---------------------------------------------------------
+# --- the file ---
 
 
 def read_log(path: Path | str) -> FlightLog:
@@ -365,7 +365,7 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k != "kind"}
 
 
-# --- turns, and what was sent in the loop's place ---------------------
+# --- turns, and what was sent in the loop's place ---
 
 
 def parse_turn(record: dict[str, Any]) -> Turn:

@@ -135,7 +135,7 @@ class SimCamera:
         self._under_way.append(DeliveredFrame(arrival_s, middle_s, self._last, self._index))
 
 
-# --- When each row of a frame is exposed and in what light ------------
+# --- When each row of a frame is exposed and in what light ---
 # A rolling shutter exposes its rows one by one within the read-out time; an interlaced camera takes
 # two pictures a frame, half its period apart, each with its own rows.
 

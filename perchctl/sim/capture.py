@@ -217,7 +217,7 @@ class SimCapture:
         return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
 
 
-# --- The server on loopback -------------------------------------------
+# --- The server on loopback ---
 # It speaks NatNet 3.1, as OptiTrack's server does, so `motioncapture` reads it.
 # Of a frame only the rigid bodies are filled in; a client steps over the empty lists.
 

@@ -131,7 +131,7 @@ def _plan(firmware: Firmware, data: bytes) -> int:
     return OK
 
 
-# --- C numbers --------------------------------------------------------
+# --- C numbers ---
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class Toc:
         return data[:3] + self._items[number] if number < len(self._items) else data[:1]
 
 
-# --- The server -------------------------------------------------------
+# --- The server ---
 # Limits of log blocks as measured: 26 bytes a block, period 10 ms x 1..254, 16 blocks,
 # 128 variables (docs/firmware.md, "Link").
 

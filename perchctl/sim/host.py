@@ -179,7 +179,7 @@ class VehicleHost:
         return self._bursts is None or not self._bursts.is_lost(self.elapsed_s)
 
 
-# --- The child process: runs the vehicle that the parent describes ----
+# --- The child process: runs the vehicle that the parent describes ---
 
 
 LOOP_PATIENCE_S = 2.0

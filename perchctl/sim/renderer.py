@@ -175,7 +175,7 @@ class Renderer:
         lit = cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U)
         return np.asarray(lit, np.uint8)
 
-    # -- through the lens ---------------------------------------------------
+    # --- through the lens ---
 
     def _projected(
         self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
@@ -255,7 +255,7 @@ class Renderer:
         covered = cover(below.reshape(len(below), -1), view, maps, rays)
         blocks[~view.is_plain] = covered.reshape(below.shape)
 
-    # -- motion -------------------------------------------------------------
+    # --- motion ---
 
     def _paths_px(self, poses: Array) -> Array:
         """The ceiling's path in the image during the exposure at five places, (5, n, 2) px,
@@ -280,7 +280,7 @@ class Renderer:
         return np.clip(bank, -255.0, 255.0).astype(np.int16), places
 
 
-# --- Sums, look-ups and shading of whole pictures ---------------------
+# --- Sums, look-ups and shading of whole pictures ---
 
 
 def by_block(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -323,7 +323,7 @@ def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
     into[:] = blurred[top : top + into.shape[0], left : left + into.shape[1]]
 
 
-# --- A camera that does not move --------------------------------------
+# --- A camera that does not move ---
 # Where the picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that
 # a vehicle at rest sees the same picture again and again but for the noise.
 

@@ -123,7 +123,7 @@ class Scenario:
         )
 
 
-# --- From a profile's ranges and a seed to a scenario -----------------
+# --- From a profile's ranges and a seed to a scenario ---
 
 
 _STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams

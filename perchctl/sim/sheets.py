@@ -146,7 +146,7 @@ def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
     return np.asarray(big[2 * zoom : -2 * zoom], np.float32)
 
 
-# --- Sheets on the ceiling, and where each is seen in one exposure ----
+# --- Sheets on the ceiling, and where each is seen in one exposure ---
 
 
 Box = tuple[slice, slice]

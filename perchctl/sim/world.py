@@ -326,7 +326,7 @@ class Magnet:
             self._came_off = True
 
 
-# --- The air in the room: a draught with smooth gusts -----------------
+# --- The air in the room: a draught with smooth gusts ---
 
 
 _TERMS = 5

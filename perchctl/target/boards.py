@@ -168,7 +168,7 @@ def _wrong(text: str, why: str) -> InvalidValue:
     return InvalidValue(f"board {text!r}: {why} (for example {EXAMPLES})")
 
 
-# --- What of a board is black -----------------------------------------
+# --- What of a board is black ---
 
 
 def board_rectangles(board: Board) -> list[Rectangle]:

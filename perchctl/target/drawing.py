@@ -210,7 +210,7 @@ def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
     return found
 
 
-# --- Lengths as people write them: with their unit --------------------
+# --- Lengths as people write them: with their unit ---
 
 
 MAX_SCALE_ERROR = 0.1

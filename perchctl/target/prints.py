@@ -49,7 +49,7 @@ def measured_target(
     return target, notes
 
 
-# --- The proportion of the two prints, as a camera sees it ------------
+# --- The proportion of the two prints, as a camera sees it ---
 
 
 CORNER_BIAS_PX = 0.02

@@ -46,7 +46,7 @@ def _single_marker_dictionary(marker: MarkerConfig) -> Any:
     )
 
 
-# --- The smallest side that is read through blur and noise ------------
+# --- The smallest side that is read through blur and noise ---
 
 
 FOUND_RATE = 0.9
@@ -129,7 +129,7 @@ def sample_pictures(
         yield np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
-# --- What is checked before ink is spent ------------------------------
+# --- What is checked before ink is spent ---
 
 
 MIN_DISTANCE = 3

@@ -117,7 +117,7 @@ def board_pdf(board: Board, page: str) -> bytes:
     return bytes(pdf.output())
 
 
-# --- Pages and their texts --------------------------------------------
+# --- Pages and their texts ---
 
 
 def parse_page(text: str) -> tuple[float, float]:
@@ -215,7 +215,7 @@ def _fitting_page(target: TargetConfig, texts: Sequence[str]) -> str:
     return _page_text(width, 2.0 * (half + _caption_room(texts, width)[1]))
 
 
-# --- Drawing ----------------------------------------------------------
+# --- Drawing ---
 
 
 class _Paper(FPDF):

@@ -207,7 +207,7 @@ def _directions(values: tuple[float, float], least: float, figures: str, unit: s
     )
 
 
-# --- Near the target: from where on a mounting is blind ---------------
+# --- Near the target: from where on a mounting is blind ---
 # With the gear under the target's centre, the vehicle level and its heading the target's, as in
 # an ascent: so the outline of the markers is upright in body axes.
 

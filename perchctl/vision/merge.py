@@ -135,7 +135,7 @@ def merge_tracks(
     )
 
 
-# --- Corners of a rolling shutter at one moment -----------------------
+# --- Corners of a rolling shutter at one moment ---
 # Rows are exposed one by one within the read-out time: each corner is moved along its own motion
 # to the middle row's moment, the frame's time.
 

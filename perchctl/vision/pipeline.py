@@ -245,7 +245,7 @@ def estimate(
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
-# --- from the tracks to the target ------------------------------------
+# --- from the tracks to the target ---
 
 
 def _at_frame(

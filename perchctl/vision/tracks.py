@@ -111,7 +111,7 @@ def update_tracks(
     return TrackedFrame(measured, tracks, verdict, lock, rival)
 
 
-# --- Whether a pose is the target's that was locked on ----------------
+# --- Whether a pose is the target's that was locked on ---
 # Another target, or a marker of another size, cannot be told from the target in a picture, but the
 # target does not jump. A pose that contradicts the lock by more than noise, motion and drift
 # explain is a rival's and feeds no filter.
@@ -228,7 +228,7 @@ def update_lock(
     )
 
 
-# --- how well a pose fits ---------------------------------------------
+# --- how well a pose fits ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +302,7 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     return calm and seen < _EXPLAINED * jumped
 
 
-# --- rivals -----------------------------------------------------------
+# --- rivals ---
 
 
 def _watched(
@@ -351,7 +351,7 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     )
 
 
-# --- Where the target should be in the next picture -------------------
+# --- Where the target should be in the next picture ---
 # The state estimate gives the vehicle's motion twice: by two positions and by speed times time.
 # Each is weighted by how little it was off of late in the target's own pictures.
 

@@ -180,7 +180,7 @@ class SessionFile:
         self.done, self.next_position = len(rows), max(rows, default=0) + 1
 
 
-# --- The actual pose --------------------------------------------------
+# --- The actual pose ---
 
 
 ActualPose = tuple[Array, Attitude | None]
@@ -266,7 +266,7 @@ def _median(
     return np.median([each.position_m for each in placed], axis=0), (roll, pitch, wrap_rad(yaw))
 
 
-# --- The dialogue -----------------------------------------------------
+# --- The dialogue ---
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,7 +128,7 @@ def closed_form_weights(sums: Array) -> Array:
     return np.where(fits, (var_b - cov) / np.where(fits, below, 1.0), np.nan)
 
 
-# --- Widrow and Hoff's LMS, the paper's way ---------------------------
+# --- Widrow and Hoff's LMS, the paper's way ---
 # ``w <- w + mu e d`` with d = large - small and e = actual - merged is, in the errors a and b,
 # ``w <- w - mu (d^2 w + b d)``. The step mu, in units of 1 / mean(d^2), begins at `START_STEP` and
 # falls as 1 / rows, so that LMS ends at the least-squares weight instead of wandering about it.

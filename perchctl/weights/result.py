@@ -93,7 +93,7 @@ def fit_weights(path: Path, chosen: str, test: Path | None = None) -> FitResult:
     )
 
 
-# --- The JSON record and the weights file -----------------------------
+# --- The JSON record and the weights file ---
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:

@@ -144,7 +144,7 @@ def lens_covariance(views: Sequence[BoardView], fit: CameraFit) -> Array:
     return jackknife_covariance(blocks, np.zeros((p, p)))
 
 
-# --- Outliers ---------------------------------------------------------
+# --- Outliers ---
 # A corner is left out when it is off by more than 5 times the spread of its view (at least that of
 # all views) and by more than 0.3 px. A view is left out when the RMS of its remaining corners is
 # above 2.5 times the median view's and above 0.1 px, when more than a quarter of its corners are

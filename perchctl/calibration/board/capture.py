@@ -19,7 +19,7 @@ from perchctl.geometry import Array
 from perchctl.target import Board
 from perchctl.vision import Frame
 
-# --- Pictures ---------------------------------------------------------
+# --- Pictures ---
 
 
 def find_views(
@@ -61,7 +61,7 @@ def find_views(
     return FoundViews(tuple(views), tuple(missing))
 
 
-# --- How alike two views are ------------------------------------------
+# --- How alike two views are ---
 
 
 AXES = ("x", "y", "size", "tilt")
@@ -107,7 +107,7 @@ def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
 
 
-# --- Guided capture ---------------------------------------------------
+# --- Guided capture ---
 
 
 _STILL_SHARE = 1.5 / 640.0  # of the width, between two frames

@@ -176,7 +176,7 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
         )
 
 
-# --- The vehicle's rotation, from its gyroscope -----------------------
+# --- The vehicle's rotation, from its gyroscope ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +252,7 @@ def _vectors(R: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
-# --- Turn of the camera and latency from nothing ----------------------
+# --- Turn of the camera and latency from nothing ---
 # No start is needed, whatever the camera's turn.
 # Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
 # ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam

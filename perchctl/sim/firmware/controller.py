@@ -18,7 +18,7 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S
 Motors = tuple[float, float, float, float]
 MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
 
-# --- Setpoints: which axes are controlled how -------------------------
+# --- Setpoints: which axes are controlled how ---
 
 DISABLED, ABSOLUTE, VELOCITY = 0, 1, 2
 
@@ -60,7 +60,7 @@ class Setpoint:
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
 
-# --- The loops --------------------------------------------------------
+# --- The loops ---
 
 ATTITUDE_DT_S = 0.002
 POSITION_DT_S = 0.01

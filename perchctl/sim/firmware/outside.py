@@ -98,7 +98,7 @@ class Imu:
         )
 
 
-# --- The filter -------------------------------------------------------
+# --- The filter ---
 
 
 POSITION, VELOCITY, ATTITUDE = 0, 3, 6

@@ -258,7 +258,7 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
     return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
-# --- What lines left vague or unseen, by the drawing --------------------
+# --- What lines left vague or unseen, by the drawing ---
 
 
 _GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster
@@ -325,7 +325,7 @@ def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
     return None
 
 
-# --- Markers where they are expected: no search, only verification ----
+# --- Markers where they are expected: no search, only verification ---
 
 
 _LEAST_CELL_PX = 2.5  # for lines

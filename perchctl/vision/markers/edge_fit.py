@@ -35,7 +35,7 @@ from perchctl.vision.markers.corners import (
 from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
 
-# --- Grey profiles across the sides of markers ------------------------
+# --- Grey profiles across the sides of markers ---
 
 
 PROFILES = 24  # across each side
@@ -113,7 +113,7 @@ def sample_profiles(
     return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
 
 
-# --- Lines fitted to a marker's sides, intersected --------------------
+# --- Lines fitted to a marker's sides, intersected ---
 
 
 MIN_LINE_SIGMA_PX = 0.015

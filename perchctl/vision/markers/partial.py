@@ -179,7 +179,7 @@ def _corners(
     )
 
 
-# --- Which marker it is, by the cells that are seen of it -------------
+# --- Which marker it is, by the cells that are seen of it ---
 
 
 KnownBy = Literal["bits", "track", "other"]

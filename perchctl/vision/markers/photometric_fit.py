@@ -384,7 +384,7 @@ def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) ->
     return np.asarray(grey, dtype=np.float64).ravel()
 
 
-# --- Products of long rows, a value for each node of a square grid ----
+# --- Products of long rows, a value for each node of a square grid ---
 # They are taken block by block: large products wake threads, which cost more than they save.
 
 
@@ -401,7 +401,7 @@ def gram_matrix(rows: Array) -> Array:
     return np.asarray(total + rest.dot(rest.T))
 
 
-# --- A marker's drawing at the nodes of a grid, blurred ---------------
+# --- A marker's drawing at the nodes of a grid, blurred ---
 
 
 _STEP = 0.02  # of the blur
