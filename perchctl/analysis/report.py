@@ -180,7 +180,7 @@ def _render(name: str, **values: Any) -> Markup:
 
 @cache
 def _templates() -> jinja2.Environment:
-    """Return the environment that escapes all text but that of the templates themselves."""
+    """The environment that escapes all text but that of the templates themselves."""
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("perchctl.analysis"),
         autoescape=True,
@@ -216,7 +216,7 @@ def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
 
 
 def _without_folder(error: PerchError, log_path: Path) -> str:
-    """Return the error's text without folders, as a page is sent on."""
+    """The error's text without folders, as a page is sent on."""
     return str(error).replace(f"{log_path.parent}{os.sep}", "")
 
 

@@ -107,7 +107,7 @@ class _Given:
         return image
 
     def _repeated_picture(self, seen: FrameRecord) -> NDArray[np.uint8]:
-        """Return a picture that the source repeated, which is not recorded."""
+        """A picture that the source repeated, which is not recorded."""
         if self._shown is None:
             raise PictureMissing(f"the picture that frame {seen.index} repeats was not recorded")
         checksum, image = self._shown

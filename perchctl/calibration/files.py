@@ -89,7 +89,7 @@ def _values(path: Path, raw: Any, is_opencv: bool) -> _Values:
 
 
 def _kalibr_values(cam: str, camera: Any) -> _Values:
-    """Return the values of a camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
+    """The values of a camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
     if not isinstance(camera, dict):
         raise InvalidValue(f"{cam} must hold keys (intrinsics, resolution, ...)")
     projection = camera.get("camera_model", "pinhole")
@@ -127,7 +127,7 @@ def _opencv_values(path: Path) -> _Values:
 
 
 def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> CameraModel:
-    """Return the camera model. Raises InvalidValue."""
+    """The camera model. Raises InvalidValue."""
     width, height = size
     if width is None or height is None:
         raise InvalidValue(

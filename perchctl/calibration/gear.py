@@ -73,7 +73,7 @@ def learn_mask(
 
 
 def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts that reach the picture's edge, without specks and gaps."""
+    """The parts that reach the picture's edge, without specks and gaps."""
     clean = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     gap = np.ones((_CLOSED_PX, _CLOSED_PX), np.uint8)
     clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, gap)

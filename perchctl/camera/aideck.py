@@ -130,7 +130,7 @@ class AiDeckSource(LiveSource):
 
 
 def _header_of(data: bytes, came_s: float) -> _Picture | None:
-    """Return the picture whose header that packet is; None where it is none."""
+    """The picture whose header that packet is; None where it is none."""
     if len(data) != _HEADER.size:
         return None
     magic, width, height, depth, kind, size = _HEADER.unpack(data)

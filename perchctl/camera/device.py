@@ -135,7 +135,7 @@ def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[Connected
 
 
 def _video_numbers(paths: Iterable[Path]) -> list[int]:
-    """Return the N of each path that is a videoN."""
+    """The N of each path that is a videoN."""
     numbers = (path.name.removeprefix("video") for path in paths)
     return [int(n) for n in numbers if n.isascii() and n.isdigit()]
 

@@ -69,7 +69,7 @@ class MjpegSource(LiveSource):
         return "the stream ended"
 
     def _opened(self) -> HTTPResponse:
-        """Return the response; credentials go once, when asked, as cameras lock out repeaters."""
+        """The response; credentials go once, when asked, as cameras lock out repeaters."""
         opener, request = build_opener(ProxyHandler({})), Request(self._bare, headers=_HEADERS)
         response: HTTPResponse
         try:
@@ -85,7 +85,7 @@ class MjpegSource(LiveSource):
         return response
 
     def _answer(self, asked: str, request: Request) -> str | None:
-        """Return the Authorization header, by a digest where the camera takes one, since basic
+        """The Authorization header, by a digest where the camera takes one, since basic
         shows the password; None if the library knows none of its digests."""
         digests = _DIGEST.split(asked)[1:]
         if not digests:

@@ -150,7 +150,7 @@ def _live(
     clock: Clock,
     config: CameraConfig | None,
 ) -> LiveSource:
-    """Return a camera or stream that is not opened yet."""
+    """A camera or stream that is not opened yet."""
     if name.scheme == "camera":
         opener = partial(open_video_capture, name.place, size_px, config)
         return DeviceSource(str(name), latency_s, clock, opener)

@@ -139,7 +139,7 @@ def cluster_pool(address: str, profiles: Sequence[Profile]) -> Iterator[Executor
 
 
 def _connected(address: str) -> Client:
-    """Return a client of the scheduler. Errors: UsageError, ConnectionFailed."""
+    """A client of the scheduler. Errors: UsageError, ConnectionFailed."""
     problem: PerchError
     try:
         with defer_interrupts():

@@ -247,7 +247,7 @@ def make_sweep(profile: Profile, sweep: str) -> Sweep:
 
 
 def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
-    """Return the figures of one value's flights."""
+    """The figures of one value's flights."""
     good = sum(not r.is_bad for r in results)
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
     rate = rate_record(good, len(results))

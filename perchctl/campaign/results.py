@@ -147,7 +147,7 @@ def _cells(r: FlightResult) -> tuple[str, ...]:
 
 
 def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[tuple[str, str]]:
-    """Return the name and the text of each figure of `campaign_summary`."""
+    """The name and the text of each figure of `campaign_summary`."""
     rows = [("flights", str(figures["flights"]))]
     rows += [
         (end, rate_text(figures[end], figures["flights"]))

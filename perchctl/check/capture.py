@@ -285,7 +285,7 @@ def _has_many_axes(turns: Array) -> bool:
 
 
 def _turned_rad(attitudes: Rotation) -> Array:
-    """Return each attitude's turn from the first, (n,)."""
+    """Each attitude's turn from the first, (n,)."""
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
@@ -317,7 +317,7 @@ def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) ->
 
 
 def _risen_m(turns: FrameAlignment, moved: PairedMotion) -> Array:
-    """Return the way (3,) from the first place to the one farthest along the capture's vertical,
+    """The way (3,) from the first place to the one farthest along the capture's vertical,
     or, where that is too near for a lift, to the farthest of all."""
     displacements_m = moved.displacements_m
     risen_m = displacements_m[int(np.argmax(np.abs(displacements_m @ turns.vertical)))]
@@ -327,7 +327,7 @@ def _risen_m(turns: FrameAlignment, moved: PairedMotion) -> Array:
 
 
 def _world_finding(turns: FrameAlignment, moved: PairedMotion) -> Finding | None:
-    """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
+    """What is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > UPRIGHT_DEG:

@@ -137,7 +137,7 @@ JUDGES: dict[str, Callable[[_Plan], Finding]] = {
 
 
 def _limits(name: str, profile: Profile) -> Finding:
-    """Return one finding for all limits of a kind."""
+    """One finding for all limits of a kind."""
     limits = DOUBTFUL[name]
     if profile.planner.perch.mode == "position":
         limits = tuple(limit for limit in limits if "planner.perch.thrust" not in limit.keys)

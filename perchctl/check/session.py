@@ -139,7 +139,7 @@ class VehicleChecks:
         return self.probe.telemetry
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
-        """Return the rows of the motion capture; none with decks."""
+        """The rows of the motion capture; none with decks."""
         config = self.profile.positioning
         if self.mocap is None:
             return []

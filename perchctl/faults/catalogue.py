@@ -97,7 +97,7 @@ def key_press_times(period: float | Draw, duration: Draw) -> Draw:
 
 
 def _value(value: Any, source: DrawInputs) -> Any:
-    """Return a value that is given, or drawn; of a tuple each of its parts."""
+    """A value that is given, or drawn; of a tuple each of its parts."""
     if isinstance(value, tuple):
         return tuple(_value(part, source) for part in value)
     return value(source) if callable(value) else value

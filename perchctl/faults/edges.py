@@ -176,7 +176,7 @@ class FaultyCamera(WrappedSource):
         return replace(old, t_s=old.t_s + late_s, t_arrival_s=old.t_arrival_s + late_s)
 
     def _swapped(self, frame: Frame | None) -> Frame | None:
-        """Return the frames in pairs, the newer one of each first."""
+        """The frames in pairs, the newer one of each first."""
         if self._overtaken is not None:
             older, self._overtaken = self._overtaken, None
             if frame is not None:

@@ -218,7 +218,7 @@ class Oracle:
         self.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
-        """Return True if it hung a moment ago, so that it may still be caught."""
+        """True if it hung a moment ago, so that it may still be caught."""
         return self._hung is not None and s.t_s - self._hung.t_s <= FROM_HANGING_S
 
     def _watch_unpowered(self, s: Sample) -> None:

@@ -98,7 +98,7 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
 
 
 def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
-    """Return the numbers of the flights of `SHARES`."""
+    """The numbers of the flights of `SHARES`."""
     return {
         "wrong": sum(r.is_bad for r in results),
         "not_known": sum(r.row == NOT_KNOWN for r in results),

@@ -278,7 +278,7 @@ class PositionBound:
         return min(math.dist(spot, place) for spot in self._nearest(place))
 
     def _nearest(self, place: Place) -> list[Place]:
-        """Return the nearest point of each line that the vehicle may be on."""
+        """The nearest point of each line that the vehicle may be on."""
         if self._down_at is not None:
             return [self._down_at]
         if self._phase in (None, Phase.APPROACH):
@@ -291,7 +291,7 @@ class PositionBound:
 
 
 def _nearest_between(a: Place, b: Place, place: Place) -> Place:
-    """Return the point of the line from `a` to `b` that is nearest to `place`."""
+    """The point of the line from `a` to `b` that is nearest to `place`."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     long_m2 = dx * dx + dy * dy
     if long_m2 == 0.0:

@@ -121,7 +121,7 @@ def fly(parts: FlightParts) -> FlightReport:
 
 
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    """Return a callback that shows watchers what is sent in the loop's place."""
+    """A callback that shows watchers what is sent in the loop's place."""
     told = [watcher for watcher in parts.watchers if isinstance(watcher, TurnWatcher)]
 
     def tell(sent: SentCommand) -> None:
@@ -251,7 +251,7 @@ def _mission(
 
 
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
-    """Return the status of the external positions, or of those by the target; None with decks."""
+    """The status of the external positions, or of those by the target; None with decks."""
     if inputs.target_positioning is not None:
         return inputs.target_positioning.feed.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)

@@ -123,7 +123,7 @@ def still_waiting_for(
 
 
 def _first(problems: Mapping[str, Problem | None]) -> str:
-    """Return the first that has a problem, and in brackets which; empty without any."""
+    """The first that has a problem, and in brackets which; empty without any."""
     found = (f"{what} ({problem.sentence})" for what, problem in problems.items() if problem)
     return next(found, "")
 
@@ -187,7 +187,7 @@ def target_view_from(
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """Return the view of a vehicle that leans so that the target moves to the picture's edge."""
+    """The view of a vehicle that leans so that the target moves to the picture's edge."""
     level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.whole and aside_m > 1e-9):

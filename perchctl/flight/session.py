@@ -145,7 +145,7 @@ def fly_session(
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:
-    """Return the gear's miss by the simulator; None without one, or if it is gone."""
+    """The gear's miss by the simulator; None without one, or if it is gone."""
     if simulated is None:
         return None
     with contextlib.suppress(ConnectionFailed, TimedOut):

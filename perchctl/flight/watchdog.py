@@ -144,7 +144,7 @@ class Watchdog:
         return self._hold(now_s, last, newest)
 
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
-        """Return the emergency stop until the vehicle is seen to be locked. Bounded."""
+        """The emergency stop until the vehicle is seen to be locked. Bounded."""
         due = now_s - self._cut_s >= CUT_PERIOD_S - 1e-9
         if is_emergency_stopped(newest, now_s) or not due or self._cuts >= MAX_CUTS:
             return None
@@ -158,7 +158,7 @@ class Watchdog:
         newest: Telemetry | None,
         waiting: Sequence[Telemetry],
     ) -> Observation:
-        """Return the present observation: the newest telemetry, and no picture."""
+        """The present observation: the newest telemetry, and no picture."""
         if self._history is None:
             self._history = History((last.obs.telemetry,), imu=last.obs.imu)
         new = [*waiting, *([] if newest is None else [newest])]
@@ -179,13 +179,13 @@ class Watchdog:
         )
 
     def _land(self, obs: Observation, last: LastTick) -> Command | None:
-        """Return the next command of the way down, from the loop's own state on."""
+        """The next command of the way down, from the loop's own state on."""
         state = self._way_down or last.state
         self._way_down, command = step_landing(state, obs, self._profile)
         return None if isinstance(command, Idle) else command
 
     def _hold(self, now_s: float, last: LastTick, newest: Telemetry | None) -> Command | None:
-        """Return the last safe setpoint; None where there is none to hold."""
+        """The last safe setpoint; None where there is none to hold."""
         known = newest if has_fresh_position(newest, now_s) else None
         if self._held is None and known is not None:
             match last.command:
@@ -210,7 +210,7 @@ def _is_on_its_way_down(state: PlannerState) -> bool:
 
 
 def _held_place(last: LastTick, known: Telemetry | None) -> PositionSetpoint:
-    """Return the last setpoint's place, or the vehicle's, and not above where the vehicle is."""
+    """The last setpoint's place, or the vehicle's, and not above where the vehicle is."""
     sample = known or last.obs.telemetry
     x, y, z = sample.position_m
     match last.command:

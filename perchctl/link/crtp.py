@@ -122,7 +122,7 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
 
 
 def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
-    """Return a raw setpoint without yaw rate; its pitch is negated on its way out."""
+    """A raw setpoint without yaw rate; its pitch is negated on its way out."""
     roll_deg, pitch_deg = math.degrees(roll_rad), math.degrees(pitch_rad)
     return Packet(Port.COMMANDER, 0, struct.pack("<fffH", roll_deg, -pitch_deg, 0.0, thrust))
 

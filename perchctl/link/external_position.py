@@ -114,7 +114,7 @@ def _agree(
     clock: Callable[[], float],
     wait: Callable[[float], None],
 ) -> bool:
-    """Return True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S`, and the
+    """True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S`, and the
     vehicle has stood at `start`."""
     end_s = clock() + AGREE_WITHIN_S
     since_s: float | None = None

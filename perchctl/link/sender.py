@@ -178,7 +178,7 @@ class Sender:
         return self._running and self._worker is threading.current_thread()
 
     def _next(self) -> _Waiting | None:
-        """Return the first command; it stays queued until the library has all of it."""
+        """The first command; it stays queued until the library has all of it."""
         while self._queue:
             first = self._queue[0]
             stale = self._clock() - first.put_s > STALE_S

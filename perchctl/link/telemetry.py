@@ -167,7 +167,7 @@ class SampleAssembler:
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
-    """Return the values with the position carried on to the attitude block's time."""
+    """The values with the position carried on to the attitude block's time."""
     carried = dict(values)
     step_s = max(-MOST_CARRIED_S, min(MOST_CARRIED_S, ahead_s))
     for axis in "xyz":
@@ -302,7 +302,7 @@ def start_block(
 
 
 def _starting(log: Any, block: Any) -> list[Packet]:
-    """Return the packets by which cflib has a new block created and started (docs/firmware.md, "Log
+    """The packets by which cflib has a new block created and started (docs/firmware.md, "Log
     blocks"): one each, since none of perchctl's has more than nine variables."""
     variables = b"".join(
         struct.pack(

@@ -196,7 +196,7 @@ def _values_of(text: str) -> dict[str, Any]:
 
 
 def _flow(value: Value) -> str:
-    """Return a value in YAML: with a point and without an exponent, which would be read as text."""
+    """A value in YAML: with a point and without an exponent, which would be read as text."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(_flow, value))}]"
     if not isinstance(value, float):

@@ -183,7 +183,7 @@ def _choices() -> str:
 
 
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
-    """Return what the file at `path` holds itself, on top of what it extends."""
+    """What the file at `path` holds itself, on top of what it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _without_constants(own, path)

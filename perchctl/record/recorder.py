@@ -213,7 +213,7 @@ class Recorder:
         self._remember(f"the recording has ended ({why}): the flight and its log go on")
 
     def _ns(self, t_s: float) -> int:
-        """Return a time on the loop's clock as nanoseconds since 1970, where a flight in lockstep
+        """A time on the loop's clock as nanoseconds since 1970, where a flight in lockstep
         begins; what was before that is at 0, which MCAP begins at."""
         return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
 

@@ -160,7 +160,7 @@ class Renderer:
         return picture
 
     def _exposed(self, shot: Exposure, defocus_px: float | None) -> Picture:
-        """Return what falls onto the sensor in one shot, before noise."""
+        """What falls onto the sensor in one shot, before noise."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.row_poses]
         motion_px = self._paths_px(rows[len(rows) // 2])
         length_px = longest_path_px(motion_px)

@@ -205,7 +205,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
 
 
 def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
-    """Return a turn and shift the profile lacks, up to `mount_error_deg` and `mount_error_m`."""
+    """A turn and shift the profile lacks, up to `mount_error_deg` and `mount_error_m`."""
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))

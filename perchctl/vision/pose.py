@@ -114,7 +114,7 @@ def estimate_pose(
 def _continued(
     points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> ScoredPose | None:
-    """Return the solution next to a start, if it leaves `most_px` RMS or less."""
+    """The solution next to a start, if it leaves `most_px` RMS or less."""
     solution = None if start is None else refine_pose(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
@@ -319,7 +319,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
 
 
 def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
-    """Return what each kind of curl does to the whitened errors."""
+    """What each kind of curl does to the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.curl_lift_m

@@ -308,7 +308,7 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
 def _watched(
     before: RivalTrack | None, sight: FramePose, fit: _Fit, constants: FilterSetup
 ) -> RivalTrack:
-    """Return the rival with one more pose, or a new one."""
+    """The rival with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
@@ -334,7 +334,7 @@ def _watched(
 
 
 def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
-    """Return True if the target is where the rival is now."""
+    """True if the target is where the rival is now."""
     if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
         return True
     if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both:

@@ -352,7 +352,7 @@ class Experiment:
 
 
 def _mismatch(actual: Array, readings: list[MarkerReading]) -> str | None:
-    """Return a sentence if the camera measures another pose."""
+    """A sentence if the camera measures another pose."""
     poses = np.array([r.large for r in readings if r.large is not None])
     poses[:, 3] = np.unwrap(poses[:, 3])
     seen = np.median(poses, axis=0)

@@ -127,7 +127,7 @@ def weights_record(result: FitResult) -> dict[str, Any]:
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
-    """Return each set of weights' RMS error (x, y, z, yaw) and its interval's half width."""
+    """Each set of weights' RMS error (x, y, z, yaw) and its interval's half width."""
     record = {}
     for name in found.squares:
         rms, half = found.rms(name)
@@ -187,7 +187,7 @@ def report_text(result: FitResult) -> str:
 
 
 def _verdict(result: FitResult) -> str:
-    """Return the weights to fly with, and why, in a line for each axis."""
+    """The weights to fly with, and why, in a line for each axis."""
     if not any(result.proven):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "

@@ -106,7 +106,7 @@ def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | No
 
 
 def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> CameraFit:
-    """Return the fit of a camera and poses, with its residuals."""
+    """The fit of a camera and poses, with its residuals."""
     residuals = tuple(
         view.corners_px - project(view.corners_m, pose[:3], pose[3:], camera)
         for view, pose in zip(views, poses, strict=True)

@@ -209,7 +209,7 @@ class GuidedCapture:
 
 
 def _moved_px(before: BoardView, now: BoardView) -> float:
-    """Return the median motion in px of the corners that both views show; infinite without any."""
+    """The median motion in px of the corners that both views show; infinite without any."""
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)
     ways = np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)
     return float(np.median(ways)) if len(a) else float("inf")

@@ -100,7 +100,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
 
 
 def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
-    """Return the numbers (n,) and places (n, 2) px of a ChArUco board's corners, or why not."""
+    """The numbers (n,) and places (n, 2) px of a ChArUco board's corners, or why not."""
     # A detector of its own for each call: pictures are searched on several threads.
     detector = cv2.aruco.CharucoDetector(board.cv2_board())
     finding = detector.getDetectorParameters()
@@ -122,7 +122,7 @@ def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
 
 
 def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
-    """Return the numbers (n,) and places (n, 2) px of a chessboard's corners, or why not."""
+    """The numbers (n,) and places (n, 2) px of a chessboard's corners, or why not."""
     size = board.corner_count
     found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
     if not found:
@@ -133,7 +133,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
 
 
 def _without_board(image: Grey) -> str:
-    """Return why a picture shows no board: the target is the other print that lies about."""
+    """Why a picture shows no board: the target is the other print that lies about."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)
@@ -143,12 +143,12 @@ def _without_board(image: Grey) -> str:
 
 
 def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
-    """Return the places of inner corners in squares, (n, 2)."""
+    """The places of inner corners in squares, (n, 2)."""
     return np.asarray(board.corners_m()[ids, :2] / board.square_m)
 
 
 def _local_axes(cells: Array, corners: Array) -> Array:
-    """Return a square's two sides at each corner, the columns of (n, 2, 2) px.
+    """A square's two sides at each corner, the columns of (n, 2, 2) px.
 
     They are the homography's derivative, which smooths over single bad corners.
     """
@@ -244,7 +244,7 @@ def fit_saddles(
 
 
 def _sample(image: NDArray[np.uint8], places: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the grey levels (n, m) at places (n, m, 2), and which of these are in the picture."""
+    """The grey levels (n, m) at places (n, m, 2), and which of these are in the picture."""
     h, w = image.shape
     inside = np.asarray(((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2))
     xy = places.astype(np.float32)
@@ -266,7 +266,7 @@ def _is_blank(uv: Array, grey: Array, white: float, size_px: Array) -> Array:
 
 
 def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Return the best contrast c (n,) for the state (n, 6), the weighted residuals (n, m), and the
+    """The best contrast c (n,) for the state (n, 6), the weighted residuals (n, m), and the
     derivative of the modelled grey (n, m, 6), freed of what a, gx, gy, c, hx, hy can take up."""
     x = offsets[..., 0] - state[:, 0, None]
     y = offsets[..., 1] - state[:, 1, None]

@@ -97,7 +97,7 @@ def position_errors_mm(
 
 
 def _marker_m(camera: CameraModel, z_m: float) -> Array:
-    """Return the corners (4, 3) of the marker measured at that distance, in its own axes."""
+    """The corners (4, 3) of the marker measured at that distance, in its own axes."""
     large_m = _SQUARE * LARGE_M
     return (
         large_m

@@ -121,7 +121,7 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
 
 
 def _known(knots_s: Array) -> Array:
-    """Return the prior information (p, p) on the sensor's errors and the knots' walk."""
+    """The prior information (p, p) on the sensor's errors and the knots' walk."""
     steps = np.diff(np.eye(len(knots_s)), axis=0)[:, 1:]
     steps /= WALK_RAD * np.sqrt(np.diff(knots_s))[:, None]
     p = KNOTS + 3 * (len(knots_s) - 1)
@@ -135,7 +135,7 @@ def _known(knots_s: Array) -> Array:
 def _middle_target(
     body: GyroRotation, poses: PoseArrays, R_body_cam: Array, latency_s: float
 ) -> Array:
-    """Return the target's turn in the world, the middle one of all pictures'."""
+    """The target's turn in the world, the middle one of all pictures'."""
     each = (
         interpolate_rotation(body, poses.t_s - latency_s).R_world_body
         @ R_body_cam
@@ -215,7 +215,7 @@ def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Arra
 
 
 def _integral(values: Array, dt: Array) -> Array:
-    """Return the integral (n, 3, 3) from the first sample on, by trapezia."""
+    """The integral (n, 3, 3) from the first sample on, by trapezia."""
     steps = 0.5 * dt[:, :, None] * (values[1:] + values[:-1])
     return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
 
@@ -410,7 +410,7 @@ def _weights(distance2: Array) -> Array:
 
 
 def _robust_shares(distance2: Array) -> tuple[float, float]:
-    """Return what the weights make of the normal equations: by which factor the cost is truly
+    """What the weights make of the normal equations: by which factor the cost is truly
     curved, as a weight sinks with the distance, and by which the information is then less or more
     than the inverse of the estimate's spread (an M-estimator's sandwich)."""
     w = _weights(distance2)

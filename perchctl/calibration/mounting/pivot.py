@@ -87,7 +87,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
 
 
 def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
-    """Return the covariance (n, 3, 3) of what each pose's error does to the tip."""
+    """The covariance (n, 3, 3) of what each pose's error does to the tip."""
     way_m = poses.R_cam_target @ point_m
     across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
     J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
@@ -124,5 +124,5 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
 
 
 def _size(rows: PoseResiduals) -> float:
-    """Return the size of all misfits together; single wrong ones add little."""
+    """The size of all misfits together; single wrong ones add little."""
     return float(np.log1p(rows.chi2 / 3.0).mean())

@@ -122,7 +122,7 @@ class MountingRecording:
 
 
 def _numbers(record: Mapping[str, Any], key: str, *shape: int) -> Any:
-    """Return a key's numbers, a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
+    """A key's numbers, a float if `shape` is (). Raises KeyError, TypeError, ValueError."""
     values = np.array(record[key], dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"{key} must hold {math.prod(shape)} numbers")

@@ -92,7 +92,7 @@ class MountingReport:
         return "\n".join(lines)
 
     def _values(self) -> list[_Value]:
-        """Return what was measured."""
+        """What was measured."""
         camera, values = self.profile.camera, []
         if (rotation := self.rotation) is not None:
             angles = np.array(rotation.rpy_deg)

@@ -219,7 +219,7 @@ class ExternalFilter:
         np.fill_diagonal(self.covariance, bounded)
 
     def _force(self, acceleration_mps2: Sequence[float], *, flying: bool) -> Vector:
-        """Return what is believed of the specific force, in world axes."""
+        """What is believed of the specific force, in world axes."""
         w, x, y, z = self.quaternion
         ax, ay, az = acceleration_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)

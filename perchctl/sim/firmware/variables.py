@@ -86,7 +86,7 @@ def _field(path: str, scale: float = 1.0, ctype: str = "float") -> LogVariable:
 
 
 def _item(path: str, place: int, ctype: str = "float") -> LogVariable:
-    """Return a variable that reads one element of a sequence."""
+    """A variable that reads one element of a sequence."""
     read = attrgetter(path)
     return LogVariable(ctype, lambda firmware: float(read(firmware)[place]))
 

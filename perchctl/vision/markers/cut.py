@@ -116,7 +116,7 @@ def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
 
 
 def _stands_for(found: PoseFit) -> MarkerName:
-    """Return the marker that was seen: the small one, if enough of it was."""
+    """The marker that was seen: the small one, if enough of it was."""
     return "small" if found.small_points >= _SMALL_PLACES else "large"
 
 
@@ -571,7 +571,7 @@ def _in_view(
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return how far along its normal each place's edge is (n,) px, if it is."""
+    """How far along its normal each place's edge is (n,) px, if it is."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample_profiles(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -588,7 +588,7 @@ def _offsets(
 def _solved(
     places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
 ) -> _Round | None:
-    """Return a robust step, after those before, in `total` (7,)."""
+    """A robust step, after those before, in `total` (7,)."""
     J, weight = places.J, shows.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):

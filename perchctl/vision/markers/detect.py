@@ -132,7 +132,7 @@ def detect_markers(
 
 
 def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
-    """Return how to search this frame. After a loss the ways take turns."""
+    """How to search this frame. After a loss the ways take turns."""
     if empty_frames is None:
         return "all"
     if not fits_lines or (expected and empty_frames % 2):
@@ -149,7 +149,7 @@ def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
 def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Found, FoundMarkers]:
-    """Return what is where both are expected, or nearby: where no side was met, a near target has
+    """What is where both are expected, or nearby: where no side was met, a near target has
     most often moved on further than a side is looked for."""
     seen = follow_markers(picture, expected, shift)
     if not seen:
@@ -164,7 +164,7 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array]) -> bool:
-    """Return True if a marker that should be found was not verified."""
+    """True if a marker that should be found was not verified."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -175,7 +175,7 @@ def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array
 
 
 def _refined(picture: Picture, found: FoundMarkers) -> _Found:
-    """Return what the search found with better corners. Those without four lines for sides are
+    """What the search found with better corners. Those without four lines for sides are
     measured by what of these is seen: a search takes the picture's edge for a side."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
@@ -206,7 +206,7 @@ def _refined(picture: Picture, found: FoundMarkers) -> _Found:
 
 
 def _detection(name: MarkerName, seen: _Found, fields: PictureKind | None) -> Detection | None:
-    """Return the marker's detection in a picture of that kind."""
+    """The marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -311,7 +311,7 @@ def _blur_px(seen: RefinedCorners | None) -> float:
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
-    """Return the corners (4, 2) px from which to align the drawing, if any."""
+    """The corners (4, 2) px from which to align the drawing, if any."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:

@@ -107,7 +107,7 @@ def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
 
 
 def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
-    """Return a dictionary of the marker and perhaps its mirror image."""
+    """A dictionary of the marker and perhaps its mirror image."""
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
     distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
     if distance > 2 * correction_bits + 1:

@@ -226,7 +226,7 @@ def _refined_once(
 
 
 def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
-    """Return the lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
+    """The lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
     RMS distance of the points from these, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
@@ -243,7 +243,7 @@ def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
 
 
 def _intersect(lines: Array) -> Array:
-    """Return where side i - 1 of each marker meets side i: (m, 4, 2)."""
+    """Where side i - 1 of each marker meets side i: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -269,7 +269,7 @@ def _measured_shift(
     residual_px: Array,
     corners: Array,
 ) -> EdgeShift | None:
-    """Return how far white has grown over black, by the width of a border, of which `corners` (m,
+    """How far white has grown over black, by the width of a border, of which `corners` (m,
     4, 2) are the outer edge's; None where no inner edge was sampled.
 
     Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
@@ -312,7 +312,7 @@ def _measured_shift(
 
 
 def _bow_px(markers: Sides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides lie further out than their middles, as
+    """How far the ends of the widest marker's sides lie further out than their middles, as
     far as noise does not explain it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
@@ -334,7 +334,7 @@ def _outwards(markers: Sides, lines: Array) -> Array:
 def _accepted(
     markers: Sides, sides: EdgeData, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
-    """Return which of the m markers have lines for sides, as expected."""
+    """Which of the m markers have lines for sides, as expected."""
     inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)

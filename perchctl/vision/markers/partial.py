@@ -113,7 +113,7 @@ def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Return the changes (9, rows * n) of the edges with the terms of `homography_jacobian` and the
+    """The changes (9, rows * n) of the edges with the terms of `homography_jacobian` and the
     shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
     spread."""
     u, v = seen.points[..., 0], seen.points[..., 1]
@@ -235,14 +235,14 @@ def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array
 
 
 def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.bool_]:
-    """Return which points (n, 2) are in the picture, or no farther outside."""
+    """Which points (n, 2) are in the picture, or no farther outside."""
     h, w = shape[:2]
     inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
     return np.asarray(inside.all(axis=1))
 
 
 def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
-    """Return which cells (cells,) show half of their spots (n,) or more."""
+    """Which cells (cells,) show half of their spots (n,) or more."""
     known: NDArray[np.bool_] = (
         np.bincount(pattern.spot_cells, weights=seen) >= 0.5 * pattern.spots_per_cell
     )
@@ -349,7 +349,7 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
 
 
 def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> NDArray[np.bool_]:
-    """Return which profiles (rows, n) are in the picture, and not hidden."""
+    """Which profiles (rows, n) are in the picture, and not hidden."""
     hidden, (h, w) = picture.hidden, picture.image.shape
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)

@@ -188,7 +188,7 @@ def align_drawing(
 
 
 def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
-    """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
+    """The equations of the next increment; None without contrast. `total` (8,) is the sum of
     the increments so far."""
     rows, products = seen.light_rows
     A = products + 1e-6 * np.eye(len(products))
@@ -240,7 +240,7 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
-    """Return the correlation and height of the inner pattern in grey (n * n,)."""
+    """The correlation and height of the inner pattern in grey (n * n,)."""
     rows, products = drawing.square_light_rows
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.light_rows[0][GAIN], grey
@@ -255,7 +255,7 @@ def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[f
 
 
 def _repeated(error: Array) -> float:
-    """Return how many neighbouring nodes measure the same."""
+    """How many neighbouring nodes measure the same."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
     for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
@@ -460,7 +460,7 @@ def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
 def _blurred_with_slope(
     sharp: NDArray[np.float32], sigma: float, axis: Array
 ) -> tuple[Array, Array]:
-    """Return a sheet blurred by sigma nodes, and its changes."""
+    """A sheet blurred by sigma nodes, and its changes."""
     soft = blur_nodes(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)

@@ -123,7 +123,7 @@ def _pass(
     own: OwnOffset | None,
     halved: bool = False,
 ) -> FoundMarkers:
-    """Return what one pass of OpenCV's detector over the window gives."""
+    """What one pass of OpenCV's detector over the window gives."""
     setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
