@@ -36,12 +36,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 
 # Time is an argument here.
-CLOCKLESS = (
-    "perchctl.geometry",
-    "perchctl.vision",
-    "perchctl.mission",
-    "perchctl.perception",
-)
+CLOCKLESS = ("perchctl.geometry", "perchctl.vision", "perchctl.mission", "perchctl.perception")
 CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 
 # From the innermost room outwards. A module imports from its own room and from those
@@ -69,12 +64,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.sim", "perchctl.record"),
     ("perchctl.flight",),
     ("perchctl.campaign",),
-    (
-        "perchctl.weights",
-        "perchctl.faults",
-        "perchctl.check",
-        "perchctl.analysis",
-    ),
+    ("perchctl.weights", "perchctl.faults", "perchctl.check", "perchctl.analysis"),
     ("perchctl.display",),
     ("perchctl.commands",),
     ("perchctl.__main__",),

@@ -245,10 +245,7 @@ def notebook(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("number", range(len(blocks(TEXT[DOCS / "python.md"], "python"))))
 def test_every_example_runs(
-    number: int,
-    notebook: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    number: int, notebook: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = blocks(TEXT[DOCS / "python.md"], "python")[number]
     assert len(source.strip().splitlines()) <= 10

@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
-from perchctl.camera.aideck import (
-    STALLED_S,
-    AiDeckSource,
-    MosaicFilter,
-    has_mosaic,
-    remove_mosaic,
-)
+from perchctl.camera.aideck import STALLED_S, AiDeckSource, MosaicFilter, has_mosaic, remove_mosaic
 from perchctl.camera.source import LiveSource
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario

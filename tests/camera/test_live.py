@@ -68,10 +68,7 @@ def test_the_newest_frame_is_stamped_at_arrival_less_the_latency_and_given_once(
     jpeg(60)[:300], *(resized(jpeg(60), *px) for px in ((40_000, 40_000), (4097, 4096), (0, 64))),
 ])  # fmt: skip
 def test_a_picture_that_is_cut_or_of_no_size_or_above_the_largest_is_not_decoded(
-    bad: bytes,
-    server: MjpegServer,
-    opened: list[LiveSource],
-    monkeypatch: pytest.MonkeyPatch,
+    bad: bytes, server: MjpegServer, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor does it cost the connection."""
     whole, tried = jpeg(160), list[bytes]()

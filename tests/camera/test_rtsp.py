@@ -15,11 +15,7 @@ import pytest
 
 from perchctl.camera import open_camera
 from perchctl.camera.jpeg import MOST_STREAM_PX
-from perchctl.camera.network import (
-    WINDOW_S,
-    RtspSource,
-    TransferDelay,
-)
+from perchctl.camera.network import WINDOW_S, RtspSource, TransferDelay
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound, TimedOut
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame

@@ -60,9 +60,7 @@ def test_without_the_library_one_sentence_says_what_to_install(
     assert said.complaint.endswith("-m pip install 'perchctl[cluster]'")
 
 
-def test_an_address_that_nobody_answers_is_told_in_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_address_that_nobody_answers_is_told_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "ANSWER_S", 0.3)
     with socket.socket() as deaf:  # is bound, and takes no call
         deaf.bind(("127.0.0.1", 0))

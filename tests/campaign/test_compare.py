@@ -14,11 +14,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.campaign import (
-    FlightResult,
-    comparison_text,
-    make_sweep,
-)
+from perchctl.campaign import FlightResult, comparison_text, make_sweep
 from perchctl.campaign.compare import (
     FEWEST_PAIRS,
     FIGURES,

@@ -20,10 +20,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import defer_interrupts, flight_processes, fly_all
 from perchctl.campaign.flights import fly_seed
-from perchctl.commands.simulate import (
-    AGAIN_S,
-    stop_handler,
-)
+from perchctl.commands.simulate import AGAIN_S, stop_handler
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.profile import Profile
 from tests.helpers.ended import ended

@@ -19,15 +19,7 @@ from perchctl.check.vehicle import VEHICLE, VehicleStatus, query_vehicle
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
-from perchctl.vehicle import (
-    CAN_FLY,
-    CRASHED,
-    DECK_FAULT,
-    FLYING,
-    LOCKED,
-    LOW_POWER,
-    TUMBLED,
-)
+from perchctl.vehicle import CAN_FLY, CRASHED, DECK_FAULT, FLYING, LOCKED, LOW_POWER, TUMBLED
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
 from tests.helpers.mission import READY
 

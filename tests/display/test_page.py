@@ -110,8 +110,7 @@ def test_stop_needs_the_token(page: LivePage, stops: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "host",
-    ["127.0.0.1.evil.example", "127.0.0.1@evil.example", "127.0.0.2", "[", ""],
+    "host", ["127.0.0.1.evil.example", "127.0.0.1@evil.example", "127.0.0.2", "[", ""]
 )
 def test_a_foreign_host_is_refused(page: LivePage, host: str) -> None:
     for path in ("/", "/state", "/stream"):

@@ -18,13 +18,7 @@ from perchctl.display.live import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.flight.operator import AGAIN_S, HELD_S
-from perchctl.mission import (
-    FlightReport,
-    Operator,
-    Outcome,
-    Phase,
-    Watcher,
-)
+from perchctl.mission import FlightReport, Operator, Outcome, Phase, Watcher
 from perchctl.profile import load_profile
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage

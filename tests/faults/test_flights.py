@@ -101,11 +101,7 @@ def flown(
     ("name", "phase", "by"),
     [
         pytest.param(
-            n,
-            p,
-            by,
-            id=f"{n}-{p.value}-{by}",
-            marks=[pytest.mark.guard] * ((n, p, by) in GUARD),
+            n, p, by, id=f"{n}-{p.value}-{by}", marks=[pytest.mark.guard] * ((n, p, by) in GUARD)
         )
         for by in POSITIONINGS
         for n, p in CELLS
@@ -221,8 +217,7 @@ def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: fl
 
 
 @pytest.mark.parametrize(
-    ("name", "heard"),
-    [("kick", True), ("state-block-dead", False), ("thrust-frozen", False)],
+    ("name", "heard"), [("kick", True), ("state-block-dead", False), ("thrust-frozen", False)]
 )
 def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> None:
     scenario = draw_scenario(profile(), SEED)

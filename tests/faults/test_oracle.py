@@ -7,14 +7,7 @@ from typing import Any
 
 import pytest
 
-from perchctl.faults.oracle import (
-    SAY_OFF,
-    Claim,
-    Oracle,
-    Sample,
-    drop_limit_m,
-    emergency_stop_s,
-)
+from perchctl.faults.oracle import SAY_OFF, Claim, Oracle, Sample, drop_limit_m, emergency_stop_s
 
 DT_S = 0.01
 G = 9.81
@@ -175,8 +168,7 @@ def test_a_slip_to_the_floor_is_a_fall(height_m: float, acc: float, ended: bool)
 
 
 @pytest.mark.parametrize(
-    ("times", "press_s", "pause_s", "flags"),
-    [(3, 3.0, 0.3, set()), (50, 0.05, 0.05, {"pressed"})],
+    ("times", "press_s", "pause_s", "flags"), [(3, 3.0, 0.3, set()), (50, 0.05, 0.05, {"pressed"})]
 )
 def test_what_bounces_off_presses_on(
     times: int, press_s: float, pause_s: float, flags: set[str]

@@ -16,14 +16,7 @@ from perchctl.mission import EventKind, Operator, Outcome, Phase, Tick
 from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS
 from perchctl.perception import perception
 from perchctl.profile import Profile
-from perchctl.vehicle import (
-    HL_ACTIVE,
-    EmergencyStop,
-    Land,
-    PositionSetpoint,
-    RawThrust,
-    StopMotors,
-)
+from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.loop_rig import (
     HANG_AT_S,
     PROFILE,

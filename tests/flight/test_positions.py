@@ -15,12 +15,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
 
-from perchctl.errors import (
-    ConnectionFailed,
-    InvalidValue,
-    TimedOut,
-    UsageError,
-)
+from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError
 from perchctl.flight import FlyOptions, WallClock, check_options, session
 from perchctl.flight.session import start_position_feed
 from perchctl.link import CflibLink

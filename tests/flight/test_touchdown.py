@@ -8,13 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import (
-    ImuMotion,
-    Observation,
-    Operator,
-    Phase,
-    Touchdown,
-)
+from perchctl.mission import ImuMotion, Observation, Operator, Phase, Touchdown
 from perchctl.mission.context import Context
 from perchctl.mission.imu import DeadReckoning, Impact, advance_reckoning
 from perchctl.mission.report import HARD_MPS, find_touchdown

@@ -17,11 +17,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import fly_lockstep, view_problem
-from perchctl.flight.preflight import (
-    LEAN_DEG,
-    still_waiting_for,
-    target_view_from,
-)
+from perchctl.flight.preflight import LEAN_DEG, still_waiting_for, target_view_from
 from perchctl.geometry import Place, rot_z
 from perchctl.positioning import FeedStatus
 from perchctl.positioning.feed import UNSEEN

@@ -129,10 +129,7 @@ class Vehicle:
         if self.motors and self.by_itself:
             bits |= HL_ACTIVE
         sample = telemetry(
-            self.now_s,
-            self.z_m,
-            supervisor=bits,
-            thrust=HOVER_THRUST if self.motors else 0.0,
+            self.now_s, self.z_m, supervisor=bits, thrust=HOVER_THRUST if self.motors else 0.0
         )
         changed = self._changed(sample)
         if changed is not None:

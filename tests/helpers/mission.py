@@ -8,24 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.mission import (
-    Event,
-    EventKind,
-    ImuMotion,
-    Observation,
-    Phase,
-    PlannerState,
-)
+from perchctl.mission import Event, EventKind, ImuMotion, Observation, Phase, PlannerState
 from perchctl.mission.state import EnergyState, Severity
 from perchctl.profile import Profile
-from perchctl.vehicle import (
-    ARMED,
-    AUTO_ARM,
-    CAN_FLY,
-    FLYING,
-    PositionSetpoint,
-    Telemetry,
-)
+from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
 from perchctl.vision import TargetEstimate
 from perchctl.vision.types import Stage
 

@@ -36,11 +36,7 @@ def hand(
 
 
 def seen(
-    held: Hand,
-    errors: bool = True,
-    wrong: float = 0.0,
-    claimed: float = 1.0,
-    salt: int = 0,
+    held: Hand, errors: bool = True, wrong: float = 0.0, claimed: float = 1.0, salt: int = 0
 ) -> MountingRecording:
     """The part as a pipeline would have seen it.
 

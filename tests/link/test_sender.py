@@ -280,8 +280,7 @@ def test_a_guard_is_not_asked_for_what_cannot_go_out(library: Library) -> None:
     stuck: list[float] = []
     polls: list[float] = []
     sender = library.sender(
-        guard=lambda: polls.append(library.now_s),
-        tend=lambda stuck_s, hangs: stuck.append(stuck_s),
+        guard=lambda: polls.append(library.now_s), tend=lambda stuck_s, hangs: stuck.append(stuck_s)
     )
     library.room = False
     sender.put(LAND)

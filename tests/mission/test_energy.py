@@ -12,12 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
-from perchctl.mission.battery import (
-    battery_outlook,
-    hover_left_s,
-    read_battery,
-    update_energy,
-)
+from perchctl.mission.battery import battery_outlook, hover_left_s, read_battery, update_energy
 from perchctl.mission.context import Context
 from perchctl.mission.state import EnergyState
 from perchctl.profile import Profile

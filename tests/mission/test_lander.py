@@ -29,15 +29,7 @@ from perchctl.mission.lander import PEEL_S
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountingMonitor
 from perchctl.mission.state import FLYING_PHASES
 from perchctl.profile import Profile
-from perchctl.vehicle import (
-    HL_ACTIVE,
-    Command,
-    Idle,
-    Land,
-    PositionSetpoint,
-    RawThrust,
-    StopMotors,
-)
+from perchctl.vehicle import HL_ACTIVE, Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
     BY_TARGET,

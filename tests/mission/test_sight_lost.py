@@ -17,22 +17,12 @@ from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerSta
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.guidance import LOWEST_M, MOST_BRAKED_MPS, POSITION_GAIN_PER_S
 from perchctl.mission.imu import DeadReckoning
-from perchctl.mission.lander import (
-    BRAKE_RAD_PER_MPS,
-    MOST_BRAKE_RAD,
-    SINK_MPS,
-)
+from perchctl.mission.lander import BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD, SINK_MPS
 from perchctl.mission.planner import step_mission
 from perchctl.mission.state import Severity
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
-from tests.helpers.mission import (
-    CEILING_M,
-    HANG_Z_M,
-    HOVER_THRUST,
-    state_in,
-    target_at,
-)
+from tests.helpers.mission import CEILING_M, HANG_Z_M, HOVER_THRUST, state_in, target_at
 from tests.helpers.mission import PROFILE as DECKS
 from tests.mission.rig import BEGIN_S, TICK_S, Flight, Look, Motors, at, fly, is_setpoint
 

@@ -9,29 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import (
-    Observation,
-    Operator,
-    Outcome,
-    Phase,
-    PlannerState,
-    lander,
-    planner,
-)
+from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, lander, planner
 from perchctl.mission.conditions import CONDITIONS
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import FLOOR_M, limit_setpoint
 from perchctl.mission.state import FLYING_PHASES, Condition
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
-from tests.helpers.mission import (
-    CEILING_M,
-    PROFILE,
-    changed,
-    observation,
-    state_in,
-    target_at,
-)
+from tests.helpers.mission import CEILING_M, PROFILE, changed, observation, state_in, target_at
 from tests.mission.rig import BEGIN_S, Motors, at, fly, times
 
 CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]

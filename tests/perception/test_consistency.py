@@ -19,13 +19,7 @@ from perchctl.perception.online_calibration import (
     solve_consistency,
 )
 from perchctl.profile import Profile
-from perchctl.vision import (
-    Attitude,
-    CameraErrors,
-    CameraModel,
-    MarkerPose,
-    PoseSetup,
-)
+from perchctl.vision import Attitude, CameraErrors, CameraModel, MarkerPose, PoseSetup
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))

@@ -70,11 +70,7 @@ class Swing:
 
 
 def watched(
-    swing: Swing,
-    *,
-    later_s: float = 0.0,
-    turned_rad: float = 0.0,
-    offset_g: float = 0.0,
+    swing: Swing, *, later_s: float = 0.0, turned_rad: float = 0.0, offset_g: float = 0.0
 ) -> VisualInertialWindow:
     rng = np.random.default_rng(0)
     watch = VisualInertialWindow()

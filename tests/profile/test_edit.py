@@ -75,10 +75,7 @@ def test_an_alias_is_not_written_through() -> None:
 
 def test_the_old_file_is_kept_beside_and_never_lost(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text(
-        "extends: crazyflie\ncamera:\n  latency_s: 0.1  # a guess\n",
-        encoding="utf-8",
-    )
+    path.write_text("extends: crazyflie\ncamera:\n  latency_s: 0.1  # a guess\n", encoding="utf-8")
     first = path.read_text(encoding="utf-8")
     asides = [write_profile_values(path, {"camera.latency_s": number}) for number in (0.09, 0.08)]
     assert [aside.name for aside in asides] == ["mine.yaml.bak", "mine.yaml.bak2"]

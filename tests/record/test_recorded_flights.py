@@ -31,9 +31,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(
-    flown: Path,
-) -> None:
+def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(flown: Path) -> None:
     """World to body, body to camera, world to target, and the calibration, against the corners
     that were found: a frame turned about any axis would be off by the marker's side."""
     profile = load_profile(SHORT)

@@ -81,8 +81,7 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "at_m"),
-    [({}, (1.2, 0.3, 0.5)), ({"mirrored": True}, (1.2, -0.3, 0.5))],
+    ("fault", "at_m"), [({}, (1.2, 0.3, 0.5)), ({"mirrored": True}, (1.2, -0.3, 0.5))]
 )
 def test_a_body_is_where_the_capture_s_world_and_the_fault_put_it(
     fault: dict[str, Any], at_m: tuple[float, ...]

@@ -177,8 +177,7 @@ LARGE_JUMPS_M = [(0.5, 0.0, 0.0), (0.0, 0.0, 0.4), (0.1, -1.0, 0.0)]
 
 
 @pytest.mark.parametrize(
-    ("jump_m", "missed"),
-    [*product(SMALL_JUMPS_M, [0, 1, 2, 4, 8]), *product(LARGE_JUMPS_M, [0])],
+    ("jump_m", "missed"), [*product(SMALL_JUMPS_M, [0, 1, 2, 4, 8]), *product(LARGE_JUMPS_M, [0])]
 )
 def test_an_estimate_that_jumps_while_frames_are_missed_loses_no_target(
     build: Build, jump_m: tuple[float, float, float], missed: int

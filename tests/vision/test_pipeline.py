@@ -81,10 +81,7 @@ def fly(k: int) -> Attitude:
 
 
 def run(
-    setup: Pipeline,
-    frames: int,
-    lost: Callable[[int], bool] = lambda k: False,
-    blind: bool = False,
+    setup: Pipeline, frames: int, lost: Callable[[int], bool] = lambda k: False, blind: bool = False
 ) -> list[PipelineOutput]:
     state, outputs = PipelineState(), []
     for k in range(frames):
