@@ -24,7 +24,7 @@ def pair(tmp_path: Path) -> FlightComparison:
 
 def test_what_differs_is_in_the_table(pair: FlightComparison) -> None:
     found = pair
-    assert found.profile == {
+    assert found.changed_keys == {
         "camera.latency_s": (0.07, 0.1),
         "camera.mask": (None, "a.png"),
         "log.plot": (True, "not there"),

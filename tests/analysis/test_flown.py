@@ -41,7 +41,7 @@ def flown(outcome: str, folder: Path) -> tuple[ReportedFlight, float | None]:
     flight = read_reported_flight(path)
     assert flight.outcome == outcome
     begin_s = result.begin_s
-    return flight, None if begin_s is None else flight.flight.log.since(begin_s)
+    return flight, None if begin_s is None else flight.flight.log.to_flight_s(begin_s)
 
 
 def test_snow_is_told_with_its_true_times(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> N
         image, sides = crossing(at, square_px, 7.0 + 11.0 * k, slant_deg, 0.8)
         start = np.array([at]) + 0.4 * np.array([np.cos(k), np.sin(k)])
         fit = fit_saddles(image, start, sides)
-        assert fit.ok.all()
+        assert fit.is_valid.all()
         errors.append(fit.corners_px[0] - at)
     assert np.abs(errors).max() < (0.12 if square_px < 10 else 0.03)
 
@@ -56,7 +56,7 @@ def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> N
 def test_a_flat_patch_is_refused() -> None:
     image = np.full((64, 64), 120, np.uint8)
     fit = fit_saddles(image, np.array([[32.0, 32.0]]), 12.0 * np.eye(2)[None])
-    assert not fit.ok.any()
+    assert not fit.is_valid.any()
 
 
 def test_light_that_falls_off_does_not_pull() -> None:

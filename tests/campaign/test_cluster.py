@@ -98,7 +98,7 @@ def test_another_program_or_library_is_named_with_both_versions(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = worker_requirements([])
-    other = replace(own, state={**own.state, name: "0.1"})
+    other = replace(own, environment={**own.environment, name: "0.1"})
     with pytest.raises(
         InvalidValue, match=rf"^worker tcp://10\S+ on .* has {name} \S+.* instead of 0\.1: "
     ):

@@ -123,7 +123,7 @@ GOOD = VehicleStatus(
     uri="radio://0/80/2M/E7E7E7E7E7",
     parameters={"system.selftestPassed": 1, "stabilizer.estimator": 2},
     echoes_s=[0.004] * 100,
-    quality=99.0,
+    link_quality=99.0,
     telemetry=AT_REST,
     age_s=0.01,
     samples_hz=100.0,
@@ -134,13 +134,13 @@ GOOD = VehicleStatus(
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("packets", "warn", {"echoes_s": [0.004] * 97 + [math.inf] * 3}),
     ("packets", "fail", {"echoes_s": [0.004] * 80 + [math.inf] * 20}),
-    ("packets", "warn", {"quality": 80.0}),
-    ("packets", "fail", {"quality": 40.0}),
+    ("packets", "warn", {"link_quality": 80.0}),
+    ("packets", "fail", {"link_quality": 40.0}),
     ("packets", "fail", {"echoes_s": [math.inf] * 100}),
     ("telemetry", "fail", {"samples_hz": 40.0}),
     ("telemetry", "fail", {"age_s": 0.5}),
     ("firmware", "fail", {"protocol": 11}),
-    ("firmware", "fail", {"missing": ("stateEstimate.x",)}),
+    ("firmware", "fail", {"unlogged": ("stateEstimate.x",)}),
     ("firmware", "fail", {"parameters": {**GOOD.parameters, "system.selftestPassed": 0}}),
     *(
         ("supervisor", "fail", {"telemetry": said(supervisor=bits)})

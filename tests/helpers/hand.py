@@ -312,5 +312,5 @@ def record_hand(hand: Hand, profile: Profile, camera: CameraModel) -> MountingRe
         picture = Frame(frame.index, frame.t_arrival_s, frame.image, frame.t_arrival_s, "whole")
         if profile.camera.mirrored:
             picture = unmirror_frame(picture)
-        poses += reader.look(picture)
+        poses += reader.read_poses(picture)
     return MountingRecording(hand.part, attitudes(hand), poses, reader.mirrored)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.track import Tracker, TrackSummary, frames
+from perchctl.commands.track import Tracker, TrackSummary, poll_until_stopped
 from perchctl.errors import InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
@@ -297,7 +297,7 @@ def test_a_live_source_is_waited_for_and_its_end_is_told(
     source: Any = SimpleNamespace(
         finished=False, poll=lambda now_s: polled.pop(0), problem=lambda now_s: problems.pop(0)
     )
-    assert [frame.index for frame in frames(source, lambda: 5.0, Stopper())] == [0]
+    assert [frame.index for frame in poll_until_stopped(source, lambda: 5.0, Stopper())] == [0]
     said = capsys.readouterr().err
     assert said.startswith("perchctl: silent for 2 s; waiting")
     assert said.endswith("perchctl: the stream has ended\n")

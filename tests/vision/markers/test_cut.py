@@ -231,7 +231,7 @@ def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
     found = fit_pose(image, _pose("corner"), outline, CAMERA)
-    assert found.small == 0
+    assert found.small_points == 0
     assert fit_cut_markers(Picture(image, None, SETUP, CAMERA), both(POSES["corner"])) == {}
 
 
