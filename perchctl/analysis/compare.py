@@ -59,7 +59,7 @@ class FlightComparison:
         }
 
     def text(self) -> str:
-        """Return the comparison as a table, for people."""
+        """Return the comparison as a text table."""
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:

@@ -27,9 +27,9 @@ class ReplayedDecision:
     """Result of replaying the planner on one turn.
 
     Attributes:
-        tick: number of turns that were flown before it.
-        difference: first field that differs from the log, or None. Logs before version 4 do not
-            hold exceptions of the planner, so these are not compared.
+        tick: number of flown turns before this one.
+        difference: first field that differs from the log, or None. The planner's exceptions are not
+            compared for logs before version 4, which do not hold them.
         error: class name of the exception that the planner raised, or None.
     """
 

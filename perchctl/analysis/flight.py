@@ -73,7 +73,7 @@ class Measures:
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
 
     def value_text(self, name: str) -> str:
-        """Return a figure as text, in its display unit but without it; ``-`` if unknown."""
+        """Return the figure `name` in its display unit, without the unit; ``-`` if unknown."""
         (of,) = [f for f in fields(self) if f.name == name]
         value = getattr(self, name)
         if value is None:
@@ -110,8 +110,8 @@ class FlightAnalysis:
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
-        """Each stretch of turns of one phase held for one reason. Numbers in a reason may change
-        from turn to turn; the last turn's are kept."""
+        """Stretches of turns of one phase held for one reason, which is the last turn's where only
+        numbers in the reason changed."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -129,7 +129,7 @@ class FlightAnalysis:
 
     @property
     def notes(self) -> list[tuple[float, str]]:
-        """The log's notes, each with its time."""
+        """The log's notes, each after its time in s."""
         return [
             (self.log.to_flight_s(float(event["t_s"])), str(event.get("reason") or ""))
             for event in self.log.events
@@ -145,7 +145,7 @@ class FlightAnalysis:
 
     @cached_property
     def target_losses(self) -> tuple[TargetLoss, ...]:
-        """When the target was out of sight while it was needed."""
+        """Intervals in which the needed target was out of sight."""
         return target_losses(self.log, self.frames)
 
     @cached_property
@@ -155,7 +155,7 @@ class FlightAnalysis:
 
     @cached_property
     def measures(self) -> Measures:
-        """The numbers by which flights are shown and compared."""
+        """The flight's key figures."""
         end, log, frames = self.summary, self.log, self.frames
         findings = end.findings
         volts, used_mah = log.column("battery_v"), log.column("battery_used_mah")
@@ -209,7 +209,7 @@ class FlightAnalysis:
         return np.where(remembered, np.nan, self.log.column(log_field))
 
     def value_at(self, t_s: float, log_field: str) -> float:
-        """Return a log field at that time; NaN if it is missing or not a number."""
+        """Return a log field at `t_s`; NaN if it is missing or not a number."""
         records = self.log.records
         value = records[self.log.index_at(t_s)].get(log_field) if records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -252,7 +252,7 @@ class Takeover:
 
 
 def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
-    """Group the commands sent instead of the loop's by sender and time, oldest first."""
+    """Return the series of commands that other senders than the flight loop sent, oldest first."""
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None

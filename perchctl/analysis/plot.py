@@ -160,7 +160,7 @@ def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def draw_thrust(ax: Axes, flight: FlightAnalysis) -> Axes:
-    """Draw the commanded thrust in percent on a second y axis at the right, and return it."""
+    """Draw the commanded thrust in percent on a second y axis at the right; return that axis."""
     thrust_ax: Axes = ax.twinx()
     thrust = flight.log.column("thrust") * FULL_THRUST_PERCENT
     thrust_ax.plot(flight.log.t_s, thrust, color=ORANGE, linewidth=1.0, label="thrust [%], right")

@@ -57,9 +57,9 @@ class PerceptionReplay:
 
     Attributes:
         turns: the replayed turns, up to the first missing picture.
-        differences: one for each turn whose poses or observation differ.
+        differences: the first of each turn whose poses or observation differ.
         frames_flown: number of frames that the flight processed.
-        missing: why it ended before the flight did, or None.
+        missing: why the pictures ended the replay early, or None.
     """
 
     turns: Sequence[ReplayedInputs]
@@ -193,10 +193,10 @@ def replay(
     profile: Profile | None = None,
     pipeline: Pipeline | None = None,
 ) -> Replay:
-    """Replay the flight by its own profile; or, with `profile`, by another one.
+    """Replay the flight with its own profile or, if given, with `profile`.
 
-    By the flown profile the planner gets the recorded observations, and perception is compared by
-    itself; by another one it gets what that finds in the pictures. `pipeline`: by default the
+    With its own, the planner gets the recorded observations, and perception is compared separately.
+    With another, the planner gets what the replayed perception observes. `pipeline`: by default the
     profile's, with the flown calibration and mask. Errors: InvalidValue, NotFound.
     """
     flown = log.flown_profile

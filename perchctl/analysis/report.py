@@ -64,7 +64,7 @@ class Report:
         return f"{count_text(len(outcomes), 'flight')}: {each}"
 
     def record(self) -> list[dict[str, Any]]:
-        """The flights as JSON's own types."""
+        """The flights in JSON types."""
         return [
             {
                 "log": str(told.flight.log.path),
@@ -109,7 +109,7 @@ class ReportedFlight:
 
     @property
     def title(self) -> str:
-        """How it ended, and by how much it missed the target's centre."""
+        """The outcome and, if known, the miss distance."""
         miss_m = self.flight.summary.miss_m
         title = TITLES.get(self.outcome, self.outcome)
         return title if miss_m is None else f"{title}, {length_text(miss_m)} off centre"
@@ -234,7 +234,7 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 @dataclass(frozen=True)
 class DecisionPicture:
     """Last camera picture before a phase change, as a JPEG with the detected markers drawn. The
-    caption has its time, as the last centimetres are flown without pictures."""
+    caption has the picture's time, as the last centimetres are flown without pictures."""
 
     caption: str
     jpeg: bytes
@@ -245,8 +245,8 @@ class DecisionPicture:
 
 
 def read_reported_flight(log_path: Path) -> ReportedFlight:
-    """Read one flight from its log and from the recording beside it. A recording that cannot be
-    read costs only the pictures.
+    """Read one flight from its log and from the recording beside it. If the recording cannot be
+    read, only the pictures are missing.
 
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """

@@ -38,7 +38,8 @@ class _PictureIsAnother(PictureMissing):
 
 @dataclass(frozen=True, eq=False)
 class ReplayedInputs:
-    """Replayed inputs of a turn: the recorded `observation` with replayed perception, or None."""
+    """Replayed inputs of a turn: the markers' `poses`, and the recorded observation with replayed
+    perception, None if the turn had none."""
 
     turn: Turn
     poses: dict[str, UnfilteredPose]

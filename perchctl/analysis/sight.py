@@ -102,8 +102,8 @@ AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
 @dataclass(frozen=True)
 class TargetLoss:
-    """Interval without the needed target: from the last frame that showed it to the next frame that
-    does, or to the flight's end.
+    """Interval without the needed target: from the last frame that showed the target to the next
+    one that does (`is_regained`), or to the flight's end.
 
     Attributes:
         frames_without_target: 0 if no picture came at all.

@@ -25,7 +25,7 @@ REOPEN_EVERY_S = 1.0
 def open_video_capture(
     place: str, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> Any:
-    """Return an opened cv2.VideoCapture of `camera_number(place)`, set to that size and to the
+    """Return an opened cv2.VideoCapture of `camera_number(place)`, set to `size_px` and to the
     format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
@@ -103,8 +103,8 @@ NAMES = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class ConnectedCamera:
-    """A camera of this computer. `stable_path`: link that is the same at every port, if any;
-    `problem`: why it cannot be opened."""
+    """A camera of this computer. `stable_path`: link that is the same at every port, or empty;
+    `problem`: why the camera cannot be opened, or empty."""
 
     number: int
     name: str = ""

@@ -1,7 +1,4 @@
-"""Whether a frame can be a measurement at all: frozen, snow, uniform, dark, or the same once more.
-
-A frame judged bad gives no measurement; the detector need not search it.
-"""
+"""Whether a frame is a measurement, or frozen, snow, uniform, dark or repeated."""
 
 from __future__ import annotations
 

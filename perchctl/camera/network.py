@@ -1,8 +1,7 @@
 """Cameras over a network: ``http://`` (Motion-JPEG) and ``rtsp://``, each read by a thread.
 
-PyAV's mpjpeg reader is not used for Motion-JPEG: without a length in front of each picture it
-gives one out with the next one's first bytes, a whole period late (41 ms instead of 0.2 ms at
-25 Hz).
+PyAV's mpjpeg reader is not used for Motion-JPEG: if no length precedes a picture, the reader
+returns it only with the next one's first bytes, a whole period late.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ _DIGEST = re.compile(r"(?:^|,\s*)Digest\s+", re.IGNORECASE)
 class MjpegSource(LiveSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    It also gives up at once if the server rejects name and password. These are sent only when the
-    camera asks for them (digest with MD5, or basic), and never to a redirected address. Proxy
+    The source gives up at once if the server rejects name and password, which are sent only when
+    the camera asks for them (digest with MD5, or basic), and never to a redirected address. Proxy
     settings are ignored.
     """
 
@@ -148,7 +147,7 @@ class TransferDelay:
         self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
-        """Return the delay beyond the fastest picture's, s; 0 where the camera gives no time."""
+        """Return the transfer time beyond the fastest picture's, s; 0 if `camera_s` is None."""
         if camera_s is None:
             return 0.0
         if camera_s < self._camera_s:
@@ -166,7 +165,7 @@ class TransferDelay:
 class RtspSource(LiveSource):
     """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
 
-    It also gives up at once if the camera rejects name and password.
+    The source gives up at once if the camera rejects name and password.
     """
 
     connect_timeout_s = 5.0

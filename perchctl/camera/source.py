@@ -21,9 +21,9 @@ from perchctl.vision import CameraModel, Frame
 class NewestSlot:
     """Keeps the newest picture, with the time of its first arrival.
 
-    A picture that the receiver repeats does not replace one that was not taken yet, so its arrival
-    time stays. Once that was taken, the repeat is given with the same index and `Frame.repeated`:
-    a sign of life, not a measurement.
+    A picture that the receiver repeats does not replace the original while that is not yet taken,
+    so the arrival time stays. Afterwards the repeat is given with the same index and
+    `Frame.repeated`: a sign of life, not a measurement.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class NewestSlot:
     def put(
         self, image: Grey, t_s: float, t_arrival_s: float, encoded: bytes | None = None
     ) -> None:
-        """Keep a picture with its times of exposure and of arrival; `encoded` as `Frame` has it."""
+        """Keep a picture with its times of exposure and arrival; `encoded`: its JPEG, if any."""
         if self._last is None or not same_bytes(self._last, image):
             self._last = image
             self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
@@ -127,8 +127,8 @@ def describe_error(error: Exception) -> str:
 class LiveSource:
     """A live source: a thread reads the camera, and the loop polls the newest frame.
 
-    A subclass defines `_connection`, which opens and reads the camera. It is called again
-    `reconnect_wait_s` after it ended, until `max_failures` in a row brought no picture.
+    A subclass defines `_connection`, which opens and reads the camera. A connection that ended is
+    made again after `reconnect_wait_s`, until `max_failures` in a row brought no picture.
     """
 
     live = True
@@ -173,7 +173,7 @@ class LiveSource:
         return f"{self._name} ({size})"
 
     def begin(self) -> None:
-        """Connect, and read in a thread."""
+        """Start the thread that connects and reads."""
         self._thread.start()
 
     def wait_first_frame(self, timeout_s: float) -> bool:

@@ -1,7 +1,6 @@
 """The workers of a dask cluster as an executor of flights, by dask's own executor.
 
-A flight elsewhere is the flight here only by the same program, libraries and data. Each worker
-compares its own state with this computer's before its first flight.
+A flight elsewhere is the flight here only by the same program, libraries and data.
 """
 
 from __future__ import annotations
@@ -79,8 +78,10 @@ _differences: dict[str, str] = {}
 
 
 def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
-    """Run the pickled call of a flight, after verifying this worker once per campaign. Errors:
-    InvalidValue for a worker that must not fly; those of the flight."""
+    """Run the pickled call of a flight, after verifying this worker once per campaign.
+
+    Errors: InvalidValue if the worker differs from `requirements`; the flight's own errors.
+    """
     worker = get_worker()
     if requirements.campaign_id not in _differences:
         here = flight_environment(requirements.profiles, worker.state.nthreads)
@@ -104,7 +105,7 @@ def fly_verified(pickled_call: bytes, requirements: WorkerRequirements) -> Any:
 class ClusterExecutor(Executor):
     """An executor of flights on the workers of a dask cluster, which repeats the flights of a lost
     worker. A future fails with an error of `lost` if its workers were lost too often, with
-    InvalidValue if its worker must not fly; it is cancelled with the scheduler."""
+    InvalidValue if its worker lacks the requirements; the scheduler's end cancels it."""
 
     lost = (KilledWorker,)
 

@@ -100,8 +100,8 @@ def compare_variants(results: Iterable[FlightResult]) -> Comparison:
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """Return the comparison of two flights per seed. `comparisons`: how many share the 5 %
-    significance level."""
+    """Return the comparison of two flights per seed. `comparisons`: number of comparisons that
+    share the 5 % significance level."""
     questions = comparisons * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {

@@ -59,7 +59,7 @@ def _give_back_memory() -> None:
 def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
 ) -> FlightResult:
-    """Fly one seed of the profile's scenario; any executor can carry this function elsewhere.
+    """Fly one seed of the profile's scenario; any executor can send this function to a worker.
     `record` writes the pictures beside the log. A refused flight is a result, too, without a log.
     Errors: NotFound, InvalidValue (calibration, log)."""
 

@@ -70,7 +70,7 @@ class FlightResult(CampaignFlight):
 
     @property
     def is_bad(self) -> bool:
-        """True if it did not perch, is locked or fell."""
+        """True if the vehicle did not perch, is locked or fell."""
         return self.outcome != "perched" or self.locked or self.fell
 
 

@@ -1,6 +1,4 @@
-"""The motion capture that gives a vehicle its position: answers, body, rate, noise, axes.
-
-Pure.
+"""The motion capture that gives a vehicle its position: answers, body, rate, noise, axes. Pure.
 
 With R_own and R_seen the attitudes that vehicle and capture have of it, and A the capture's world,
 B the rigid body's axes, where they should be none:
@@ -195,23 +193,34 @@ STRANGER = 0.4
 
 @dataclass(frozen=True, eq=False)
 class PairedMotion:
-    """Attitudes at n common times by the vehicle and by the capture, its positions (n, 3), and
-    the accelerometer's largest deviation from 1 g."""
+    """Motion at n common times.
+
+    Attributes:
+        R_vehicle, R_capture: attitudes by the vehicle and by the capture.
+        positions_m: by the capture, (n, 3).
+        max_deviation_g: the accelerometer's largest deviation from 1 g.
+    """
 
     R_vehicle: Rotation
     R_capture: Rotation
-    places_m: Array
+    positions_m: Array
     max_deviation_g: float
 
     @property
     def displacements_m(self) -> Array:
         """Displacement of each position from the first, (n, 3)."""
-        return np.asarray(self.places_m - self.places_m[0])
+        return np.asarray(self.positions_m - self.positions_m[0])
 
 
 @dataclass(frozen=True, eq=False)
 class FrameAlignment:
-    """Rotations A and B of the module's text, and the mean relative residual."""
+    """Rotations A and B (see the module).
+
+    Attributes:
+        R_world: A, from the vehicle's world to the capture's.
+        R_body: B, from the capture's body axes to the vehicle's.
+        residual_share: mean share of a turn left unexplained.
+    """
 
     R_world: Rotation
     R_body: Rotation
@@ -255,7 +264,7 @@ def pair_motion(
 
 
 def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """Solve for both rotations from all pairs of times between which the vehicle turned; None if it
+    """Return the alignment by all pairs of times between which the vehicle turned; None if it
     turned about fewer than two axes."""
     i, j = np.triu_indices(len(moved.R_vehicle), 1)
     size = (moved.R_vehicle[j] * moved.R_vehicle[i].inv()).magnitude()
@@ -290,7 +299,7 @@ def _turned_rad(attitudes: Rotation) -> Array:
 
 
 def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) -> Finding:
-    """Compare vehicle and capture, and return the worst finding."""
+    """Judge whether vehicle and capture agree on the motion; return the worst finding."""
     if moved is None:
         return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
     own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.R_vehicle, moved.R_capture))

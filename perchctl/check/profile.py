@@ -1,7 +1,4 @@
-"""What a profile shows about a flight before anything is opened: the check's rows of it.
-
-`fly` asks the same before it connects.
-"""
+"""What a profile shows about a flight before anything is opened: the check's rows of it."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Rehearsal:
 
     Attributes:
         arrivals: index and arrival time of each picture.
-        repeats: number of repeated pictures, counted only here.
+        repeats: number of repeated pictures, which other counts leave out.
         work_s: processing time of each turn with a picture; late_s: delay of each turn.
         ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
         problems: number of pictures by problem.

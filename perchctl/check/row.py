@@ -35,7 +35,7 @@ class Row:
 
 
 class Finding(NamedTuple):
-    """Result of a check without its name: a `Row` adds that."""
+    """Result of a check without the check's name, which `Row` adds."""
 
     verdict: Verdict
     found: str
@@ -94,7 +94,7 @@ def skipped(why: str, advice: str = "") -> Finding:
 
 
 def problem_finding(problem: Problem | None, found: str) -> Finding:
-    """Return a failing finding for a problem of `fly`'s criteria; without one pass with `found`."""
+    """Return a failing finding for `problem`, by `fly`'s criteria; if None, one that passes."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 

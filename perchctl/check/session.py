@@ -105,8 +105,8 @@ def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack)
 
 @dataclass(frozen=True)
 class VehicleChecks:
-    """Checks of a vehicle and its motion capture. `uri` is the given one; the probe's may be a
-    simulated vehicle's."""
+    """Checks of a vehicle and its motion capture. `uri`: the given address; `probe` may have that
+    of a simulated vehicle."""
 
     probe: ProbeLink
     uri: str
@@ -115,7 +115,7 @@ class VehicleChecks:
     scope: CheckScope
 
     def rows(self) -> Generator[Row, None, TakeTelemetry]:
-        """Yield the rows; return the function that takes telemetry, which may give none."""
+        """Yield the rows; return the function that takes telemetry (none if nothing answers)."""
         self.scope.announce(f"connecting to {self.uri}")
         try:
             self.probe.connect()

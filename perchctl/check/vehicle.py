@@ -1,7 +1,4 @@
-"""The vehicle at the other end of the link: what it answers, holds and reports at rest.
-
-`query_vehicle` takes half a dozen seconds and sends nothing but questions.
-"""
+"""The vehicle at the other end of the link: what it answers, holds and reports at rest."""
 
 from __future__ import annotations
 
@@ -42,7 +39,7 @@ class VehicleStatus:
     """State of a vehicle, as the check queried it.
 
     `unlogged`: missing log variables; `echoes_s`: round-trip times, infinite if lost; `telemetry`:
-    the newest, `age_s` old; `moved_m`: motion during the check.
+    the newest sample, `age_s` old; `moved_m`: displacement during the check.
     """
 
     uri: str

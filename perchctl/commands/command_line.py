@@ -1,7 +1,4 @@
-"""What the subcommands share: the application, its failures as sentences, common options.
-
-A subcommand is one file of `perchctl.commands`: options, work and words together.
-"""
+"""What the subcommands share: the application, its failures as sentences, common options."""
 
 from __future__ import annotations
 

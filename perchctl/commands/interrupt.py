@@ -82,7 +82,7 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM a KeyboardInterrupt during the block."""
+    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt during the block."""
     with handle_signals(_interrupt):
         yield
 

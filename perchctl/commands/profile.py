@@ -414,8 +414,8 @@ UPRIGHT = math.cos(math.radians(30.0))
 
 
 def left_edges(front: str) -> tuple[str, str]:
-    """Return the edge of the vehicle's left side if its front is at `front`: in an unmirrored
-    picture, and in a mirrored one."""
+    """Return the picture's edge at the vehicle's left side if edge `front` is at its front: in an
+    unmirrored picture, and in a mirrored one."""
     x, y = PICTURE_EDGES[front]
     plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
     mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))

@@ -1,9 +1,4 @@
-"""`perchctl track`: the pipeline on any source, without a vehicle.
-
-Poses are in the OpenCV camera frame with cv2.aruco's marker axes
-(``X_cam = R(rvec) X_marker + tvec``). The marker's yaw is ``atan2(R[1, 0], R[0, 0])``: the
-heading of its x axis in the picture's plane, from right towards down.
-"""
+"""`perchctl track`: the pipeline on any source, without a vehicle."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class LivePage:
     # --- for the loop: neither waits nor raises ---
 
     def show(self, sketch: Sketch) -> None:
-        """Show this picture from now on."""
+        """Show this picture until the next call."""
         with self._changed:
             self._picture_s, self._sketch = self._clock(), sketch
             self._number += 1
@@ -361,7 +361,7 @@ class Sketch:
 
 
 def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
-    """Return the frame with its marker outlines and the axes of the target's pose; without either
+    """Return the frame with its marker outlines and the axes of the target's pose; only the frame
     if `output` is None. `large_side_m` is the side of the large marker."""
     if output is None or output.detections.frame_index != frame.index:
         return Sketch(frame.image)

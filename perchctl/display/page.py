@@ -86,8 +86,8 @@ class FlightPage:
 
 def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
     """Return the page's state for a tick: phase, battery, the rows of the terminal's panel, whether
-    the flight is over, and for its drawings height and error (m; None: no target) and the sizes
-    large_m (marker) and gear_m."""
+    the flight is over, and for the page's drawings the height, the target's offset and distance
+    above in m (None: no target), and `drawing_sizes`."""
     state, volts, target = tick.state, tick.telemetry.battery_v, tick.target
     off_m, below_m = (
         (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])

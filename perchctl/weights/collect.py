@@ -1,8 +1,7 @@
 """Collecting the data: a person places the camera, checked rows of the session's file come out.
 
 A session is a CSV (`perchctl.weights.data`) to which positions are appended in one write each: it
-can be stopped and continued at any time, less a line that a crash cut in two. Shaken and half-seen
-positions are refused and taken again.
+can be stopped and continued at any time, less a line that a crash cut in two.
 
 The actual pose of a position is given by a person or by motion capture. It is what the pipeline
 measures: the target relative to the gear's tip in the level frame, (x, y, z, yaw).
@@ -58,9 +57,10 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 
 @dataclass(frozen=True, eq=False)
 class MarkerReading:
-    """The poses (x, y, z, yaw) in one frame, each (4,) or None where it was not found.
+    """Both markers' poses (x, y, z, yaw; m and rad) in one frame, (4,) each, None if not found.
 
-    `center_px` (2,) is the mean of both markers' corners, None where a pose is missing."""
+    `center_px` (2,) is the mean of both markers' corners, None where a pose is missing.
+    """
 
     t_s: float
     large: Array | None
@@ -74,8 +74,8 @@ def read_markers(
     camera: CameraModel,
     attitude: Attitude | None = None,
 ) -> Iterator[MarkerReading]:
-    """Yield the poses in the frames of one place, relative to the gear in the level frame, by the
-    profile's pipeline with `merge.method` weights."""
+    """Yield the markers' poses in the frames of one position, relative to the gear in the level
+    frame, by the profile's pipeline with `merge.method` weights."""
     merge = profile.merge.model_copy(update={"method": "weights"})
     setup = make_pipeline(profile.model_copy(update={"merge": merge}), camera)
     state = PipelineState()
@@ -127,8 +127,8 @@ class SessionFile:
 
     Attributes:
         note: a sentence, if an unfinished end was taken off.
-        done: number of positions that are complete.
-        next_position: number of the one to take next, above all that the file holds.
+        done: number of complete positions.
+        next_position: number of the next position, above all numbers in the file.
     """
 
     def __init__(self, path: Path, frames: int) -> None:
@@ -191,7 +191,7 @@ class TypedPoses:
     """Actual poses, measured and typed by a person, in centimetres and degrees."""
 
     def actual_pose(self, ask: Ask) -> ActualPose:
-        """Ask the person for the pose. Raises InvalidValue for an answer that is no pose."""
+        """Ask the person for the pose. Raises InvalidValue if the answer is not four numbers."""
         text = ask("actual pose of the target from the gear, x y z [cm] and yaw [deg]: ")
         try:
             x, y, z, yaw = (float(cell) for cell in text.replace(",", " ").split())
@@ -204,14 +204,14 @@ class TypedPoses:
         return np.array([0.01 * x, 0.01 * y, 0.01 * z, wrap_rad(math.radians(yaw))]), None
 
     def close(self) -> None:
-        """Do nothing: a person needs no closing."""
+        """Do nothing."""
 
 
 class MocapPoses:
     """Actual poses from motion capture, read as in flights.
 
     Args:
-        config: names the capture and the vehicle's rigid body, and how that lies in body axes.
+        config: names the capture and the vehicle's rigid body, and gives that body's mounting.
         target: rigid body of the target; its x axis is the heading.
     """
 
@@ -271,7 +271,7 @@ def _median(
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Takes positions with a person until the session is full.
+    """Collects poses at positions to which a person moves the camera.
 
     `say` prints a sentence; `bar` shows progress; `now` and `wait` are the clock.
     """
@@ -288,8 +288,8 @@ class Experiment:
     wait: Callable[[float], None]
 
     def run(self, positions: int, frames: int) -> None:
-        """Take positions until the session holds so many. Raises Interrupted when the person stops
-        (the session keeps what is complete), and the errors of the source and the truth."""
+        """Collect positions until the session holds `positions`. Raises Interrupted when the person
+        stops (complete positions are kept), and the errors of the source and the truth."""
         while self.session.done < positions:
             number = self.session.next_position
             self.say(

@@ -42,10 +42,10 @@ class Measurements:
     """Poses of the target (x, y, z in m, yaw in rad), one row a frame, n rows.
 
     Attributes:
-        name: the file that they come from, for messages.
+        name: the data file, for messages.
         position: number of the place where the row was taken, (n,).
-        large, small: (n, 4), NaN where the marker was not seen.
-        actual: (n, 4), the truth.
+        large, small: pose by each marker, (n, 4); NaN where the marker was not seen.
+        actual: true pose, (n, 4).
     """
 
     name: str
@@ -58,18 +58,18 @@ class Measurements:
         return len(self.position)
 
     @property
-    def both(self) -> NDArray[np.bool_]:
+    def has_both(self) -> NDArray[np.bool_]:
         """True for rows in which both markers were seen, (n,)."""
         return ~(np.isnan(self.large[:, 0]) | np.isnan(self.small[:, 0]))
 
 
 def wrap_angles(angle_rad: Any) -> Any:
-    """Return the same angles in (-pi, pi], any shape."""
+    """Return the angles, of any shape, wrapped to (-pi, pi]."""
     return -((-angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
-    """Return one line of the CSV for large, small and actual, each (4,) or None."""
+    """Return the CSV line of a frame: the large, small and actual pose, each (4,) or None."""
     cells = [str(position), f"{t_s:.6f}"]
     for pose in poses:
         cells += [""] * 4 if pose is None else [f"{float(value):.8f}" for value in pose]
@@ -151,14 +151,14 @@ def _check_positions(data: Measurements) -> None:
     for source in ("large", "small"):
         if np.isnan(getattr(data, source)).all():
             raise InvalidValue(f"{data.name}: the {source} marker is never seen")
-    places = np.unique(data.position[data.both])
+    places = np.unique(data.position[data.has_both])
     if len(places) < 2:
         raise InvalidValue(
             f"{data.name}: {len(places)} positions show both markers; frames of one position are "
             f"not independent, so at least 2 are needed (10 are usual)"
         )
     for place in places:
-        rows = data.both & (data.position == place)
+        rows = data.has_both & (data.position == place)
         for source in ("large", "small"):
             apart = getattr(data, source)[rows] - data.actual[rows]
             apart[:, YAW] = wrap_angles(apart[:, YAW])

@@ -4,7 +4,7 @@ it approaches; and whether they help.
 With a = large - actual and b = small - actual the merged error of equation 8 is
 ``w a + (1 - w) b``. What is constant in a and b, the markers' bias, no weight can mend:
 it is reported apart, and the weights are fitted to the rest. Differences of yaw are wrapped
-about their mean direction, so that no seam and no constant turn changes a weight.
+about their mean direction.
 
 Frames of one position share its errors, so whole positions are held out in turn to test
 the weights, bias included, as it acts in a flight. Intervals are Student's t over positions
@@ -48,13 +48,13 @@ LABELS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
-    """Errors of the rows with both markers, sorted by position: n rows, g positions.
+class MarkerErrors:
+    """Pose errors (measured minus actual) of the n rows with both markers, sorted by position.
 
     Attributes:
-        name: the file, for messages.
-        positions: the positions' numbers, (g,); starts: the first row of each, (g,).
-        large, small: a and b, (n, 4).
+        name: the data file, for messages.
+        positions: numbers of the g positions, (g,); starts: the first row of each position, (g,).
+        large, small: each marker's errors in x, y, z (m) and yaw (rad), (n, 4).
         use: False where the row is an outlier on the axis, (n, 4).
     """
 
@@ -70,16 +70,16 @@ class Errors:
 
     @cached_property
     def sums(self) -> Array:
-        """Sums over the rows of each position: of 1, a, b, a^2, b^2 and a b, (6, g, 4)."""
+        """Each position's sums of 1, a, b, a^2, b^2, a b, (6, g, 4); a is `large`, b `small`."""
         use = self.use.astype(np.float64)
         a, b = self.large * use, self.small * use
         parts = np.stack([use, a, b, a * a, b * b, a * b])
         return np.asarray(np.add.reduceat(parts, self.starts, axis=1))
 
 
-def marker_errors(data: Measurements) -> Errors:
+def marker_errors(data: Measurements) -> MarkerErrors:
     """Return the errors of the rows with both markers."""
-    rows = np.flatnonzero(data.both)
+    rows = np.flatnonzero(data.has_both)
     rows = rows[np.argsort(data.position[rows], kind="stable")]
     positions, starts = np.unique(data.position[rows], return_index=True)
     actual = data.actual[rows]
@@ -88,7 +88,7 @@ def marker_errors(data: Measurements) -> Errors:
     reference = float(np.arctan2(np.sin(yaw).sum(), np.cos(yaw).sum()))
     for each in (large, small):
         each[:, YAW] = reference + wrap_angles(each[:, YAW] - reference)
-    return Errors(
+    return MarkerErrors(
         name=data.name,
         positions=positions,
         starts=starts,
@@ -120,7 +120,7 @@ def t_quantile(degrees: int) -> float:
 
 def closed_form_weights(sums: Array) -> Array:
     """Return the weights (..., 4) with the least variance of the merged error; NaN where all
-    weights fit alike. `sums` is (6, ..., 4), as `Errors.sums`."""
+    weights fit alike. `sums` is (6, ..., 4), as `MarkerErrors.sums`."""
     a, b, aa, bb, ab = sums[1:] / np.maximum(sums[0], 1.0)
     var_a, var_b, cov = aa - a * a, bb - b * b, ab - a * b
     below = var_a + var_b - 2.0 * cov
@@ -142,9 +142,9 @@ MOST_ROWS = 100_000
 _STREAM = (0, 601)
 
 
-def lms_weights(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
-    """Return the final weights of LMS, (4,), not clipped, and those with each position left out
-    in turn, (g, 4).
+def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]:
+    """Return the final weights of LMS, (4,), not clipped, and the final weights with each position
+    left out in turn, (g, 4).
 
     LMS begins at the weight `start` and takes the rows, less the mean errors, in a shuffled order.
     """
@@ -166,7 +166,7 @@ def lms_weights(errors: Errors, start: float = 0.5) -> tuple[Array, Array]:
     return w[-1], w[:-1]
 
 
-def _recursion(errors: Errors) -> tuple[Array, Array]:
+def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
     """Return p of mean 1 and q, (n, 4), of ``w <- w - mu (p w + q)``; an outlier's row is zero."""
     use = errors.use
     n = np.maximum(use.sum(axis=0), 1)
@@ -183,8 +183,14 @@ def _recursion(errors: Errors) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class FittedWeights:
-    """One method's weights, (4,): as fitted, clipped to [0, 1], and the half width of their 95 %
-    interval over positions (jackknife); `fold_weights` (g, 4): each position left out in turn."""
+    """The large marker's weights by one method for x, y, z and yaw, (4,) each; g positions.
+
+    Attributes:
+        raw: weights as fitted.
+        weights: `raw`, clipped to [0, 1].
+        half_width: half the width of the 95 % interval of `raw` (jackknife over positions).
+        fold_weights: clipped weights, each row fitted without one position, (g, 4).
+    """
 
     raw: Array
     weights: Array
@@ -192,7 +198,7 @@ class FittedWeights:
     fold_weights: Array
 
 
-def fit_all(errors: Errors) -> dict[str, FittedWeights]:
+def fit_all(errors: MarkerErrors) -> dict[str, FittedWeights]:
     """Return both methods' weights by name. Raises InvalidValue where all weights fit alike."""
     total = errors.sums.sum(axis=1)
     closed = closed_form_weights(total)
@@ -219,7 +225,10 @@ def fit_all(errors: Errors) -> dict[str, FittedWeights]:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Mean square errors (g, 4) of each held-out position, by the name of the set of weights."""
+    """Errors of sets of weights on held-out positions.
+
+    `squares`: mean square errors (x, y, z, yaw) at g positions, (g, 4), by name of the set.
+    """
 
     squares: dict[str, Array]
 
@@ -231,28 +240,28 @@ class Evidence:
 
     @property
     def better_squares(self) -> Array:
-        """The better single marker's errors, (g, 4)."""
+        """The mean square errors of the better single marker, (g, 4)."""
         return np.where(self.better == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """Return the RMS error, (4,), m and rad, and the half width of its 95 % interval."""
+        """Return the RMS error of `name` (m, rad) and its 95 % interval's half width, (4,) each."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
     def rms_gain(self, name: str, other: Array) -> tuple[Array, Array]:
-        """Return by how much the RMS error is below that of `other` (g, 4), and the half width of
-        the difference's interval, (4,)."""
+        """Return by how much the RMS error of the weights `name` is below that of the mean squares
+        `other` (g, 4), and the half width of the gain's 95 % interval, (4,) each."""
         (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """Return true where the gain over the better single marker is above zero with its whole
-        interval, (4,)."""
+        """Return True where the whole interval of the gain over the better single marker is above
+        zero, (4,)."""
         gain, half = self.rms_gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)
 
 
-def evaluate_weights(errors: Errors, weights: Mapping[str, Array]) -> Evidence:
+def evaluate_weights(errors: MarkerErrors, weights: Mapping[str, Array]) -> Evidence:
     """Return the errors of the fitted weights, the paper's, and each marker alone. `weights` by
     method: (4,), or one row per position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums

@@ -22,9 +22,9 @@ from perchctl.weights.fit import (
     LABELS,
     PAPER_WEIGHTS,
     SINGLE,
-    Errors,
     Evidence,
     FittedWeights,
+    MarkerErrors,
     evaluate_weights,
     fit_all,
     marker_errors,
@@ -39,20 +39,20 @@ _HEAD = """\
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """Result of a fit. `chosen` names the method whose weights are recommended; `other` is the
-    evidence on the test data `other_name`."""
+    """Result of a fit. `method` is the one whose weights are recommended; `test` is the
+    evidence on the test data `test_name`, or None."""
 
-    errors: Errors
+    errors: MarkerErrors
     fits: dict[str, FittedWeights]
     evidence: Evidence
-    other: Evidence | None
-    other_name: str
-    chosen: str
+    test: Evidence | None
+    test_name: str
+    method: str
 
     @property
     def proven(self) -> list[bool]:
-        """True where the chosen weight beats the better single marker, by axis."""
-        return [bool(p) for p in self.evidence.proven(self.chosen)]
+        """True by axis where the weight of `method` beats the better single marker."""
+        return [bool(p) for p in self.evidence.proven(self.method)]
 
     @property
     def better(self) -> list[str]:
@@ -61,16 +61,16 @@ class FitResult:
 
     @property
     def recommended(self) -> Array:
-        """The fitted weights where proven, else the better single marker's, (4,)."""
+        """The fitted weights where proven, else 1 or 0: the better single marker alone, (4,)."""
         alone = np.where(self.evidence.better == 0, 1.0, 0.0)
-        return np.where(self.proven, self.fits[self.chosen].weights, alone)
+        return np.where(self.proven, self.fits[self.method].weights, alone)
 
 
-def fit_weights(path: Path, chosen: str, test: Path | None = None) -> FitResult:
+def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
     """Read the data, fit the weights by each method, and judge them by held-out positions.
 
     Args:
-        chosen: the method to recommend, one of `FITTED`.
+        method: the method to recommend, one of `FITTED`.
         test: other data to judge the weights by.
 
     Errors: NotFound, InvalidValue.
@@ -87,9 +87,9 @@ def fit_weights(path: Path, chosen: str, test: Path | None = None) -> FitResult:
         errors=errors,
         fits=fits,
         evidence=evaluate_weights(errors, {name: fit.fold_weights for name, fit in fits.items()}),
-        other=other,
-        other_name="" if test is None else str(test),
-        chosen=chosen,
+        test=other,
+        test_name="" if test is None else str(test),
+        method=method,
     )
 
 
@@ -109,7 +109,7 @@ def weights_record(result: FitResult) -> dict[str, Any]:
     record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),
-        "method": result.chosen,
+        "method": result.method,
         "recommended": _by_axis(result.recommended) if any(result.proven) else None,
         "proven": dict(zip(AXES, result.proven, strict=True)),
         "better_single": dict(zip(AXES, result.better, strict=True)),
@@ -121,8 +121,8 @@ def weights_record(result: FitResult) -> dict[str, Any]:
             "positions": len(result.errors.positions),
         },
     }
-    if result.other is not None:
-        record["test"] = {"file": result.other_name, "errors": _errors_record(result.other)}
+    if result.test is not None:
+        record["test"] = {"file": result.test_name, "errors": _errors_record(result.test)}
     return record
 
 
@@ -136,10 +136,12 @@ def _errors_record(found: Evidence) -> dict[str, Any]:
 
 
 def write_weights(path: Path, result: FitResult, date: str, *, anyway: bool) -> None:
-    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted; and
-    the record of the fit behind them. Errors: InvalidValue when it cannot be written; the old one
-    then stays."""
-    flown = result.fits[result.chosen].weights if anyway else result.recommended
+    """Write a file of the recommended weights or, with `anyway`, of the fitted ones, and of the
+    fit's results.
+
+    Errors: InvalidValue if the file cannot be written; an old file then stays.
+    """
+    flown = result.fits[result.method].weights if anyway else result.recommended
     content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
@@ -163,16 +165,16 @@ def report_text(result: FitResult) -> str:
     )
     parts = [_wrapped(data), _verdict(result)]
     judged = [(result.evidence, "on positions left out of the fit")]
-    if result.other is not None:
-        judged.append((result.other, f"on {result.other_name}"))
+    if result.test is not None:
+        judged.append((result.test, f"on {result.test_name}"))
     for found, where in judged:
         rms = {LABELS[name]: _scaled(*found.rms(name)) for name in found.squares}
         gains = {
-            LABELS[name]: _scaled(*found.rms_gain(result.chosen, square), "+")
+            LABELS[name]: _scaled(*found.rms_gain(result.method, square), "+")
             for name, square in found.squares.items()
             if name not in FITTED
         }
-        title = f"gain of {LABELS[result.chosen]} in RMS error {where} over"
+        title = f"gain of {LABELS[result.method]} in RMS error {where} over"
         parts.append(_table(f"RMS error {where}, 95 % interval", _HEADS, rms))
         parts.append(_table(title, _HEADS, gains))
     weights = {
@@ -193,7 +195,7 @@ def _verdict(result: FitResult) -> str:
             "not recommended: on no axis do these weights beat the better single marker beyond "
             "the 95 % interval; take more positions, or fly merge.method: joint"
         )
-    lines = [f"recommended weights of the large marker ({LABELS[result.chosen]})"]
+    lines = [f"recommended weights of the large marker ({LABELS[result.method]})"]
     for axis, name, proven, weight in zip(
         AXES, result.better, result.proven, result.recommended, strict=True
     ):

@@ -1,7 +1,7 @@
 """The paper's experiment in the simulator: a camera that stands still at seeded places.
 
 Places lie between z3 and z2 under the target, where both markers are seen whole; heading
-and offset are drawn. The picture is the simulator's, noise and blur are the experiment's.
+and offset are drawn.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SimulatedStand:
         self._corners = square_corners(profile.target.large.side_m)
 
     def fill_session(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
-        """Complete the session; `advance` is called with each frame. Raises InvalidValue."""
+        """Add the missing positions; call `advance` on each frame. Raises InvalidValue."""
         while session.done < self._positions:
             position = session.next_position
             place, readings = self.place(position), []
@@ -69,8 +69,8 @@ class SimulatedStand:
             session.append(session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> CameraPlace:
-        """Return the place of a position, counted from 1. Each position has its own part of the
-        range z3 to z2, so that few cover it. Raises InvalidValue."""
+        """Return the camera place of a position, counted from 1. Each position has its own part of
+        the range z3 to z2, so even few cover the range. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _STREAM, position])
         share = (position - 1) % self._positions

@@ -87,7 +87,7 @@ def test_a_constant_offset_moves_no_weight() -> None:
     assert np.abs(fitted(plain) - fitted(offset)).max() < 1e-6
 
 
-def judged(errors: fit.Errors) -> tuple[dict[str, fit.FittedWeights], fit.Evidence]:
+def judged(errors: fit.MarkerErrors) -> tuple[dict[str, fit.FittedWeights], fit.Evidence]:
     fits = fit.fit_all(errors)
     return fits, fit.evaluate_weights(
         errors, {name: each.fold_weights for name, each in fits.items()}

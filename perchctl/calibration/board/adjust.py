@@ -60,8 +60,8 @@ class CameraFit:
 
 
 def lens_parameters(camera: CameraModel) -> Array:
-    """Return fx, fy, cx, cy and the distortion of a camera, (p,); four coefficients of plumb_bob
-    get k3 = 0."""
+    """Return fx, fy, cx, cy and the distortion of a camera, (p,); k3 = 0 is added to a plumb_bob
+    model with four coefficients."""
     K, dist = camera.K, camera.dist
     if camera.model == "plumb_bob" and dist.size == 4:
         dist = np.append(dist, 0.0)
@@ -69,7 +69,7 @@ def lens_parameters(camera: CameraModel) -> Array:
 
 
 def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
-    """Return the camera and the poses with the least squared residuals.
+    """Return the camera of lens `model`, and the board poses, with the least squared residuals.
 
     Raises NoSolution.
     """
@@ -117,8 +117,8 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Ca
 def projection_derivatives(
     camera: CameraModel, pose: Array, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the Jacobians of the projections of points (n, 3) at a pose (rvec and tvec, (6,)) by
-    the lens parameters, (2 n, p), and by the pose, (2 n, 6)."""
+    """Return the Jacobians of the pixels of points (n, 3) at a pose (rvec, tvec; (6,)) with respect
+    to the lens parameters, (2 n, p), and to the pose, (2 n, 6)."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
     p = len(lens_parameters(camera))

@@ -76,9 +76,9 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """Return how a view shows the board, (5,): centre of its corners relative to the picture's
-    width and height, its relative size, and its tilt: how much farther away its right side is than
-    its left, and its lower side than its upper."""
+    """Return how a view shows the board, (5,): the corners' centre x, y and the board's size,
+    relative to the picture, and the tilts: how much farther away the right side is than the left,
+    and the lower side than the upper."""
     w, h = view.size_px
     x, y = view.corners_px.mean(axis=0) / (w, h)
     squares = view.corners_m[:, :2] / board.square_m
@@ -101,7 +101,7 @@ def signature_distance(one: Array, other: Array) -> float:
 
 
 def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
-    """Return how far each of `AXES` is covered, 0..1."""
+    """Return the share, 0..1, of its goal that each of `AXES` has reached."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
     spread = {"x": x, "y": y, "size": size, "tilt": sum(tilts) / 2.0}
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}

@@ -1,15 +1,14 @@
 """The check of an existing calibration by new pictures.
 
-The new views give two solutions: the file's camera with only the boards' poses fitted,
-and a camera fitted to these views alone. The first's reprojection
-error shows a wrong lens; but poses take up a wrong focal length, so the two cameras
-are compared at the target as well, in mm. The check fails
+The file's camera, with only the boards' poses fitted, is compared with a camera fitted to the new
+views. The former's reprojection error shows a wrong lens; but poses take up a wrong focal length,
+so the target's positions by the two cameras are compared as well. The check fails
 
 - when the file's RMS is more than twice that of the free camera and above 0.3 px, or
-- when the two put the target farther apart, straight ahead, than half of the limit
-  (1 mm, or 1 % of the distance) and than the 95 % line of the new pictures themselves.
+- when these positions, straight ahead, differ by more than half of the limit (1 mm, or 1 % of the
+  distance) and than the 95 % line of the new pictures.
 
-Pictures whose own 95 % line is above twice the limit cannot judge, and the check is refused.
+Pictures whose 95 % line is above twice the limit cannot judge: the check is refused.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ UNSURE_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class Deviation:
-    """Shift in mm of the target's position between the checked and the refitted camera, straight
-    ahead; `mm95`: 95 % uncertainty of the refit."""
+    """`mm`: shift of the target's position, straight ahead at distance `z_m`, between the checked
+    and the refitted camera; `mm95`: 95 % uncertainty of the refit."""
 
     z_m: float
     mm: float
@@ -45,7 +44,7 @@ class Deviation:
 
     @property
     def limit_share(self) -> float:
-        """`mm` as a share of the limit; 0 if it is within the uncertainty."""
+        """`mm` as a share of `allowed_error_mm`; 0 if `mm` is within `mm95`."""
         return self.mm / allowed_error_mm(self.z_m) if self.mm > self.mm95 else 0.0
 
 
@@ -53,8 +52,8 @@ class Deviation:
 class CheckResult:
     """Verdict on a calibration by new pictures, with the reason.
 
-    rms_px is of the checked camera (infinite if it cannot see the boards), best_rms_px of the
-    camera refitted to the pictures.
+    rms_px: reprojection error of the checked camera (infinite if it cannot see the boards);
+    best_rms_px: that of the camera refitted to the pictures.
     """
 
     passed: bool

@@ -57,7 +57,7 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A view left out, or some of its corners, and why."""
+    """A rejected view or, if `corner_ids` has any, rejected corners of it; and the reason."""
 
     view: str
     reason: str
@@ -186,8 +186,8 @@ _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
 @dataclass(frozen=True, eq=False)
 class SaddleFit:
-    """Refined corners (n, 2); is_valid (n,); edge_width_px (n,), blur (tanh width) of the wider
-    edge at each corner."""
+    """Refined corners (n, 2); is_valid (n,), False where the fit failed; edge_width_px (n,), blur
+    (tanh width) of the wider edge at each corner."""
 
     corners_px: Array
     is_valid: NDArray[np.bool_]

@@ -32,7 +32,7 @@ _LIMIT_FLOOR_MM = 1.0
 
 @dataclass(frozen=True)
 class ErrorAtRange:
-    """95 % bound of the target's position error at one distance.
+    """95 % bound of the target's position error at distance z_m.
 
     mm95: largest over the part of the picture that the calibration boards covered and that shows a
     whole marker; axis_mm95: straight ahead.

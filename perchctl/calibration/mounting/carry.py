@@ -64,7 +64,7 @@ class RotationSolution:
 
     @property
     def rpy_sigma_deg(self) -> tuple[float, float, float]:
-        """Sigma of the three angles."""
+        """Standard deviations of `rpy_deg`."""
         step = 1e-6
         small = Rotation.from_rotvec(step * np.eye(3)).as_matrix()
         here = np.array(rpy_from_rotation(self.R_body_cam))
@@ -253,14 +253,13 @@ def _vectors(R: Array) -> Array:
 
 
 # --- Turn of the camera and latency from nothing ---
-# No start is needed, whatever the camera's turn.
 # Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
 # ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam
 # that fits best follows in closed form; the latency with the least misfit wins.
 
 
 LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
-"""Also such as cannot be: a clock that is wrong is to be named, not hidden at the grid's end."""
+"""Impossible ones included, so that a wrong clock is named."""
 _SPAN_S = (0.2, 0.5)
 _MOST_PAIRS = 400
 _FIT_ROUNDS = 3
@@ -382,7 +381,7 @@ def weight_residuals(
     late_jacobian: Array | None = None,
 ) -> PoseResiduals:
     """Weight the residuals of poses by their covariances (n, 3, 3), times an estimated factor. With
-    `late_jacobian` (n, 3), by a second of delay, the timestamps' jitter is estimated and added."""
+    `late_jacobian` (n, 3), misfit per second of delay, timestamp jitter is estimated and added."""
     best_cost, best, late = np.inf, cov, late_jacobian
     for jitter_s in (0.0,) if late is None else _JITTERS_S:
         spread = cov
@@ -410,9 +409,7 @@ def _weights(distance2: Array) -> Array:
 
 
 def _robust_shares(distance2: Array) -> tuple[float, float]:
-    """What the weights make of the normal equations: by which factor the cost is truly
-    curved, as a weight sinks with the distance, and by which the information is then less or more
-    than the inverse of the estimate's spread (an M-estimator's sandwich)."""
+    """Return the curvature and information factors of robust weights for `jackknife_covariance`."""
     w = _weights(distance2)
     curved = float((w * (1.0 - 2.0 * distance2 / (3 * (FREEDOM + distance2)))).mean())
     pushed = float((w**2 * distance2).mean()) / 3

@@ -31,9 +31,10 @@ _POSE_SHAPES: dict[str, tuple[int, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class AttitudeSample:
-    """The vehicle's own estimate at `t_s` of its own clock, right-handed (pitch nose down).
+    """The vehicle's estimated attitude at `t_s` on its own clock, right-handed (pitch nose down).
 
-    gyro_radps (3,) is in body axes."""
+    gyro_radps (3,) is in body axes.
+    """
 
     t_s: float
     roll_rad: float

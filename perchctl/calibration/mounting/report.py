@@ -1,5 +1,4 @@
-"""A measured mounting against the profile's: as lines for people, a record for programs, and the
-profile's keys."""
+"""A measured mounting against the profile's: as text, JSON record and profile keys."""
 
 from __future__ import annotations
 
@@ -57,7 +56,7 @@ class MountingReport:
 
     @property
     def gear_body_m(self) -> Array:
-        """The gear's tip in body axes; from the profile without a pivot."""
+        """The gear's tip in body axes, (3,); the profile's if no pivot was recorded."""
         if self.pivot is None:
             return np.array(self.profile.vehicle.gear_body_m)
         T = self.profile.camera.mount.T_body_cam
