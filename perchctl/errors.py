@@ -14,8 +14,8 @@ MOST_DECIMALS = 9
 
 
 def distinct_texts(found: float, limit: float, decimals: int) -> tuple[str, str]:
-    """Return texts of a number that was found and of its limit, for a message: with `decimals` or
-    as many as the limit has, and with more if both would look the same."""
+    """Return `found` and `limit` as texts for a message: with `decimals`, or as many as the limit
+    has, and with more if both texts would be the same."""
     own = -int(Decimal(f"{limit:g}").as_tuple().exponent)
     for count in range(min(max(decimals, own), MOST_DECIMALS), MOST_DECIMALS + 1):
         texts = f"{found:.{count}f}", f"{limit:.{count}f}"
@@ -25,7 +25,7 @@ def distinct_texts(found: float, limit: float, decimals: int) -> tuple[str, str]
 
 
 class PerchError(Exception):
-    """Base of all reported failures; `exit_code` becomes the process's."""
+    """Base of all reported failures; the process ends with its `exit_code`."""
 
     exit_code = 1
     meaning = "other failure"

@@ -55,8 +55,8 @@ def file_kind(path: Path) -> str:
 
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
-    """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or as
-    `check_writable`. `content` is what the message calls such a file's content."""
+    """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or if
+    `check_writable` does. `content` is what the message calls such a file's content."""
     if path.suffix.lower() not in suffixes:
         raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
     check_writable(path, force)
@@ -85,7 +85,7 @@ def check_writable(path: Path, force: bool) -> None:
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """True if both exist and are one and the same."""
+    """True if both paths exist and lead to the same file."""
     return one.exists() and other.exists() and one.samefile(other)
 
 

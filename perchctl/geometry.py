@@ -115,8 +115,7 @@ def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
 def quaternion_from_rpy(
     roll_rad: float, pitch_rad: float, yaw_rad: float
 ) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix on the
-    way."""
+    """Return the unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix."""
     cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
     cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
     cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
@@ -129,7 +128,7 @@ def quaternion_from_rpy(
 
 
 def nearest_axis(direction: Array) -> str | None:
-    """Return the axis within 30 deg of a unit vector (3,), such as ``-y``; None for none."""
+    """Return the axis within 30 deg of a unit vector (3,), such as ``-y``, or None."""
     i = int(np.argmax(np.abs(direction)))
     if abs(float(direction[i])) < math.cos(math.radians(30.0)):
         return None

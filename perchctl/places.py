@@ -28,7 +28,7 @@ def data_file(kind: str, name: str) -> Path | None:
 
 
 def file_names(kind: str) -> list[str]:
-    """Return the names of the files of that kind that can be named without a path."""
+    """Return the names, without folder and suffix, of the shipped and user files of a kind."""
     folders = (data_folder(kind), user_folder("config") / kind)
     return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
 

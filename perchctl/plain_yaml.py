@@ -46,8 +46,8 @@ def parse_yaml(text: str) -> Any:
 
 
 def split_values(text: str) -> list[str]:
-    """Return the texts of values that commas stand between, as in a list: a value may be a list
-    itself. Raises ValueError as `parse_yaml` does."""
+    """Return the texts of the values between commas, as in a list; a value may itself be a list.
+    Raises ValueError as `parse_yaml` does."""
     row = f"[{text}]"
     parse_yaml(row)
     node = yaml.compose(row, yaml.SafeLoader)
@@ -56,5 +56,5 @@ def split_values(text: str) -> list[str]:
 
 
 def clip_text(text: str, most: int = _MOST_SHOWN) -> str:
-    """Return the text, or its beginning if it is longer than anybody reads."""
+    """Return the text, or its beginning if it is longer than `most`."""
     return text if len(text) <= most else f"{text[: most - 3]}..."

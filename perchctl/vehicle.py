@@ -64,7 +64,7 @@ def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
 
 
 def has_fresh_position(newest: Telemetry | None, now_s: float) -> bool:
-    """True if position and velocity are known too: they come by a packet of their own."""
+    """True if telemetry is fresh with position and velocity, which come by their own packet."""
     if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
         return False
     return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
@@ -119,8 +119,8 @@ class PositionSetpoint:
 
 @dataclass(frozen=True)
 class RawThrust:
-    """An attitude, level if nothing else is said, and a raw thrust 0..65535: stabilised position
-    control off. Roll to the right and pitch nose down are positive, as in telemetry."""
+    """A raw thrust 0..65535 at an attitude, level by default, without position control. Roll to the
+    right and pitch nose down are positive, as in telemetry."""
 
     thrust: int
     roll_rad: float = 0.0

@@ -226,7 +226,7 @@ class Tracker:
         if self._live and judged in _NO_PICTURE:
             return [TrackResult(name, frame, notes=about)]
         results = []
-        for picture, output in self._perception.look(frame):
+        for picture, output in self._perception.process_fields(frame):
             self._target = target_in_camera(output, self._target)
             notes = (*about, *self._notes(output))
             results.append(TrackResult(name, picture, output, self._target, notes))

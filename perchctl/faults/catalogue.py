@@ -51,7 +51,7 @@ def log_uniform(low: float, high: float) -> Draw:
 
 
 def chance(source: DrawInputs, share: float) -> bool:
-    """Return True in that share of all draws."""
+    """Draw True with the probability `share`, else False."""
     return bool(source.rng.uniform() < share)
 
 
@@ -66,12 +66,12 @@ def duration_s(low: float = 0.1) -> Draw:
 
 
 def either(share: float, one: Any, other: Any) -> Draw:
-    """Draw `one` in that share of all draws, else `other`."""
+    """Draw `one` with the probability `share`, else `other`."""
     return lambda source: _value(one if chance(source, share) else other, source)
 
 
 def random_sign(size: Draw) -> Draw:
-    """Draw a number of either sign."""
+    """Draw a number with `size`, and give it a random sign."""
     return lambda source: (1.0 if chance(source, 0.5) else -1.0) * size(source)
 
 
@@ -87,7 +87,7 @@ def draw_direction(source: DrawInputs) -> tuple[float, float]:
 
 
 def key_press_times(period: float | Draw, duration: Draw) -> Draw:
-    """Draw the times of a key that is pressed again and again."""
+    """Draw the times, s, of a key pressed every `period` for `duration`."""
 
     def draw(source: DrawInputs) -> tuple[float, ...]:
         period_s, for_s = _value(period, source), duration(source)
@@ -104,7 +104,7 @@ def _value(value: Any, source: DrawInputs) -> Any:
 
 
 def effect(act: Callable[..., object], **values: Any) -> Draw:
-    """Draw an effect: `act` with its values, in their order."""
+    """Draw an effect: `act` with the keyword arguments `values`, each drawn if it is a Draw."""
     return lambda source: partial(act, **{name: _value(v, source) for name, v in values.items()})
 
 
@@ -176,7 +176,7 @@ def _hung_and_packet_lost(source: DrawInputs) -> tuple[e.Effect, ...]:
 
 
 def packet_loss(order: str) -> Draw:
-    """Draw the loss of one packet of an order, or of two."""
+    """Draw the loss of the next one or two packets of the kind `order`."""
     return effect(e.packet_lost, order=order, count=either(0.6, 1, 2))
 
 
@@ -504,9 +504,11 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 
 @dataclass(frozen=True)
 class Case:
-    """One fault of one flight. To reach LANDING, the operator lands `landed_after_s` into the
-    phase `landed_from`. To reach RECOVER, the first contact holds only the part `first_hold` of
-    the weight."""
+    """One fault of one flight: `effects` begin `moment_s` into `phase`.
+
+    To reach LANDING, the operator lands `landed_after_s` into the phase `landed_from`. To reach
+    RECOVER, the magnet holds only the part `first_hold` of the weight at the first contact.
+    """
 
     fault: Fault
     phase: Phase

@@ -43,7 +43,7 @@ def packet_kind(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """A radio that loses the packets that `air` loses, and those that a fault names.
+    """A radio that loses the packets that the radio `air` loses, and those of a fault.
 
     Attributes:
         cut: the uplink has ended for good.
@@ -61,8 +61,8 @@ class FaultyRadio(Radio):
         self.receive: Callable[[Packet], None] | None = None
 
     def lose(self, end_s: float, uplink: bool, block: str, delay_s: float = math.inf) -> None:
-        """Until `end_s` lose all commands (`uplink`), and the packets of a log block, or of "all";
-        with `delay_s` these packets arrive late instead."""
+        """Until `end_s` lose all commands if `uplink`, and the packets of the log block `block`
+        ("all": of every block); a finite `delay_s` delays the log packets instead."""
         self._losses.append((end_s, uplink, block, delay_s))
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
@@ -211,9 +211,9 @@ class FaultyClock:
     nothing through `radio`. A flight longer than `stop_s` is ended.
 
     Attributes:
-        pending: is called where the loop waits next.
-        tick_s, slow_until_s: each tick takes at least `tick_s` until then.
-        killed_s: when the program was killed; `endless`: since its flight took too long.
+        pending: called once, where the loop waits next.
+        tick_s, slow_until_s: until `slow_until_s` each tick takes at least `tick_s`.
+        killed_s: when the program was killed, or None; `endless`: it was killed at `stop_s`.
     """
 
     def __init__(self, link: MockLink, radio: FaultyRadio, stop_s: float) -> None:
@@ -244,7 +244,6 @@ class FaultyClock:
             raise ProgramKilled
 
     def kill(self) -> None:
-        """End the program."""
         if self.killed_s is None:
             self.killed_s = self._link.now_s
             self._radio.cut = True

@@ -47,8 +47,8 @@ def radio_loss(
     down: str = "",
     delay_s: float = math.inf,
 ) -> None:
-    """Lose all commands (`up`), and the log block of the name `down`, or "all"; with `delay_s`
-    these come late instead."""
+    """Lose all commands if `up`, and the packets of the log block `down` ("all": of every block); a
+    finite `delay_s` delays the log packets instead."""
     rig.radio.lose(t_s + for_s, up, down, delay_s)
 
 
@@ -132,7 +132,7 @@ def log_reads(
 
 
 def battery_sags(rig: FaultRig, t_s: float, rate_vps: float, by_v: float) -> None:
-    """Let the battery's resting voltage fall by `by_v` at this rate."""
+    """Let the battery's resting voltage fall by `by_v` at `rate_vps`."""
     world, left_v = rig.vehicle.world, by_v
 
     def sag(_now_s: float) -> None:
@@ -226,13 +226,13 @@ def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
-    """Return the scenario with a magnet that holds this part of the weight."""
+    """Return the scenario with a magnet that holds the part `of_weight` of the vehicle's weight."""
     hold_n = of_weight * (scenario.mass_kg * GRAVITY_MPS2)
     return replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
 
 
 def room(scenario: Scenario, **fields: Any) -> Scenario:
-    """Return the scenario with other values of these fields."""
+    """Return the scenario with `fields` replaced."""
     return replace(scenario, **fields)
 
 
@@ -266,7 +266,7 @@ def profile_for(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
 
 
 def latency_drop_s(effect: Effect) -> float:
-    """Return by how much the fault shortens the latency that the profile expects."""
+    """Return the seconds by which the fault shortens the latency that the profile expects."""
     sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
@@ -310,12 +310,10 @@ class Injector:
             self._due_s = tick.t_s + self._moment_s
 
     def begin_due(self, t_s: float) -> None:
-        """Begin the effects if they are due."""
         if self.begin_s is None and self._due_s is not None and t_s >= self._due_s:
             self.begin(t_s)
 
     def begin(self, t_s: float) -> None:
-        """Begin the effects now."""
         self.begin_s = t_s
         for effect in self._effects:
             effect(self._edges, t_s)

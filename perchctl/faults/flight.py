@@ -139,7 +139,6 @@ class FaultyFlight:
         return self._result(end, reason, report, end_s)
 
     def tick(self, tick: Tick) -> None:
-        """Show the tick to the injectors."""
         for injector in self._injectors:
             injector.tick(tick)
 

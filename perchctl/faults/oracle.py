@@ -88,14 +88,14 @@ class Sample(NamedTuple):
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """Return how deep a slip may go until it is caught; `hold_ratio`: magnet's hold over weight."""
+    """Return how deep a slip may be, m; `hold_ratio`: the magnet's hold over the weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
-    """Return when presses of Ctrl-C became an emergency stop; None if they never did."""
+    """Return the time of the press of Ctrl-C that made an emergency stop; None if none did."""
     run_s = presses_s[0] if presses_s else 0.0
     for before_s, press_s in pairwise(presses_s):
         if press_s - before_s >= SILENCE_S:
@@ -136,9 +136,9 @@ class Oracle:
     `magnet_radius_m` a contact is on the target.
 
     Attributes:
-        flags: those raised, in order, with the time at which each was first raised.
-        drop_m: the deepest fall until caught.
-        astray_m: the farthest from where it should have been, in the air.
+        flags: each raised flag with the time at which it was first raised, in order.
+        drop_m: depth of the deepest fall, until it was caught.
+        astray_m: the largest `Sample.astray_m` in the air.
         newest: the last sample.
     """
 
@@ -174,7 +174,6 @@ class Oracle:
         self._claims |= dict.fromkeys(claims, t_s)
 
     def note_press(self, t_s: float) -> None:
-        """Note that the operator pressed Ctrl-C."""
         self._presses_s.append(t_s)
 
     def note_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
@@ -191,7 +190,6 @@ class Oracle:
         return emergency_stop_s(self._presses_s)
 
     def update(self, s: Sample) -> None:
-        """Judge the next sample."""
         self.newest = s
         if s.hanging:
             self._hung = s

@@ -36,8 +36,8 @@ class FaultResult(CampaignFlight):
             raised.
         begin_s: when the fault began; None when the flight was over before.
         row: name of the mission's transition that ended the flight; empty without one.
-        drop_m: the deepest fall until caught, in the simulation's truth.
-        astray_m: in the air, the farthest from where it should have been.
+        drop_m: depth of the deepest fall until it was caught, as simulated.
+        astray_m: largest distance in the air from where the vehicle should have been.
     """
 
     fault: str

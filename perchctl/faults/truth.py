@@ -53,8 +53,7 @@ class WatchedVehicle(SimulatedVehicle):
 
 
 def true_sample(vehicle: SimulatedVehicle) -> Sample:
-    """Return the true state of the vehicle now; the fields that depend on the fault stay at
-    their defaults."""
+    """Return the vehicle's true state now; fields that depend on the fault keep their defaults."""
     world, firmware = vehicle.world, vehicle.firmware
     weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
     _, qx, qy, _ = world.quaternion
@@ -106,15 +105,15 @@ WATCH_WITHIN_S = 0.1
 
 @dataclass
 class Facts:
-    """What was true in the flight. Times None: never.
+    """What was true in the flight; a time is None for what never happened.
 
     Attributes:
-        effects: those of the fault, which began at `begin_s`.
+        effects: the fault's effects, which began at `begin_s`.
         silence_lock_s: when the firmware locked the vehicle, which had received nothing.
-        own_landing: the onboard landing was under way when the silence before such a cut began.
+        own_landing: the onboard landing was under way when the silence before that lock began.
         killed_s: when the program was killed.
         rebooted_s: when the vehicle started again on turning motors, off the floor.
-        stop_s: second Ctrl-C.
+        stop_s: when the operator pressed Ctrl-C for the second time.
         magnet_failed_s: when the magnet let go for good; `was_watched`: by then the whole weight
             had hung on it, motors off, for as long as the program has to watch it.
         slipped_s: when the vehicle first came off the magnet with its motors still, `slip_height_m`
@@ -140,7 +139,6 @@ class Facts:
     battery_low_m: float = 0.0
 
     def has_effect(self, act: Callable[..., None]) -> bool:
-        """Return True if `act` is one of the effects."""
         return any(effect.func is act for effect in self.effects)
 
 
@@ -261,7 +259,6 @@ class PositionBound:
         self._down_at: Place | None = None
 
     def add_target(self, place: Place) -> None:
-        """Add a place at which a target hangs."""
         if place not in self._targets:
             self._targets.append(place)
 
@@ -338,8 +335,7 @@ class UndetectedDrift:
         self._slid_m = self._fault_s = 0.0
 
     def update_m(self, fault_s: float, phase: Phase | None) -> float:
-        """Return the distance so far, `fault_s` after the fault began; call it with rising
-        times."""
+        """Return the distance, m, `fault_s` after the fault began; times must rise."""
         before_s, self._fault_s = self._fault_s, fault_s
         if phase in UNDER_TARGET:
             self._slid_m = 0.0
@@ -377,10 +373,12 @@ class DescentBound:
         uplink: bool,
         lands: bool = False,
     ) -> bool:
-        """Return True if the vehicle should have come down by now and has not. At the
-        ceiling in time it may hang there, and without `uplink` it cannot obey until it hears
-        again. `lands`: its onboard landing flies, which starts from rest with each of three
-        orders; one that climbs does not count."""
+        """Return True if the vehicle should have come down by now and has not.
+
+        A vehicle that was at the ceiling in time may hang there; without `uplink` the time to obey
+        starts anew. `lands`: its onboard landing is active, which counts as coming down unless it
+        climbs.
+        """
         if self._due_s is None:
             return False
         if touching and t_s < self._due_s + REACTION_S:

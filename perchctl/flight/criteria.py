@@ -190,8 +190,8 @@ class GroundCriteria:
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
-        """A position in another unit, with another axis up, or elsewhere, which waiting will not
-        mend. By the target the world is the vehicle's own, so only the fence counts."""
+        """A position in another unit, with another axis up, or too far from the expected target,
+        which waiting does not cure. With the target as source only that distance counts."""
         x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
@@ -226,7 +226,7 @@ class GroundCriteria:
 
 
 def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """Return the problem of a capture whose up is not the vehicle's, by its own attitude."""
+    """Return the problem of a capture whose vertical is not that of the vehicle's own attitude."""
     if place.quaternion is None:
         return None
     # The world's vertical in the capture's axes, if its body's axes are the vehicle's.

@@ -141,7 +141,7 @@ class FlightInputs:
         self.last_good_frame_s = now_s
         self.frames += 1
         if look:
-            for _, self.output in perception.look(frame, used_s):
+            for _, self.output in perception.process_fields(frame, used_s):
                 if positioning is not None and self._is_heard(now_s):
                     positioning.add_pose(perception.state.measured.surest, self.history, now_s)
         mirrored = perception.is_mirrored
@@ -193,8 +193,8 @@ class FlightInputs:
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
-        """Return the target's estimate at the present. The filter coasts by frames: while none are
-        searched, its target is a remembered place, and not tracked."""
+        """Return the target's estimate at the present; None before one was seen. It is not
+        `tracked` while no good frames come or are searched, since the filter coasts by frames."""
         target = self.perception.target(now_s, spread=self.recorded)
         if self._positioning is not None:  # else the estimate runs away
             target = self._positioning.with_fixed_target(target, self.history)
@@ -245,7 +245,7 @@ class TargetPositioning:
         self._touches = False
 
     def begin_tick(self, history: History, now_s: float, *, in_contact: bool) -> None:
-        """Begin a tick, before its picture. `in_contact`: a contact was proven, and lasts."""
+        """Begin a tick: send a supported vehicle's position if it is known without a picture."""
         newest = history.newest
         self._touches = in_contact
         if newest is None or not is_supported(history, now_s):
@@ -313,17 +313,12 @@ class TurnReporter:
 
     @property
     def has_watchers(self) -> bool:
-        """True if somebody records them."""
         return bool(self._watchers)
 
     def begin(self, now_s: float) -> None:
-        """Note when a turn of the loop begins."""
         self._began_s = now_s
 
-    def report_waiting(
-        self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None
-    ) -> None:
-        """Report a turn before take-off."""
+    def report_waiting(self, inputs: FlightInputs, now_s: float, feed: FeedStatus | None) -> None:
         turn = Turn(
             self._counted(),
             "waiting",
@@ -331,19 +326,18 @@ class TurnReporter:
             now_s,
             inputs.taken,
             inputs.poses,
-            outside=external_positions(outside),
+            outside=external_positions(feed),
         )
         self._report(turn)
 
     def note_observation(self, obs: Observation) -> None:
-        """Note what the planner is about to decide on."""
         self._open = obs, None
 
     def note_decision(
-        self, obs: Observation, new: PlannerState, command: Command, outside: FeedStatus | None
+        self, obs: Observation, new: PlannerState, command: Command, feed: FeedStatus | None
     ) -> None:
         """Note that the planner has decided: a later failure is not the planner's."""
-        self._open = obs, (new, command, outside)
+        self._open = obs, (new, command, feed)
 
     def report_redone(
         self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
@@ -379,7 +373,7 @@ class TurnReporter:
         obs: Observation,
         new: PlannerState,
         command: Command,
-        outside: FeedStatus | None,
+        feed: FeedStatus | None,
     ) -> Turn:
         """Return the turn, once its command was sent."""
         self._open = None
@@ -396,7 +390,7 @@ class TurnReporter:
             row=new.row,
             held=bool(new.hold),
             attempts=new.attempts,
-            outside=external_positions(outside),
+            outside=external_positions(feed),
             outcome=new.outcome,
             reason=new.reason,
         )

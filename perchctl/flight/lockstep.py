@@ -85,7 +85,7 @@ class LockstepSource:
 
 
 def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
-    """Return the vehicle's camera as the flight sees it by its profile."""
+    """Return a source of the vehicle's camera; it unmirrors frames if the profile says so."""
     source = LockstepSource(vehicle, profile.camera.start_latency_s)
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
@@ -130,16 +130,16 @@ class LockstepFlight:
 
     @property
     def perched_miss_m(self) -> float | None:
-        """The gear's distance from the target's centre, where it hangs there."""
+        """The gear's distance from the target's centre, m; None if the vehicle is not perched."""
         return self.miss_m if self.report.phase is Phase.PERCHED and self.hanging else None
 
     @property
     def final_phase(self) -> Phase:
-        """The phase in which it ended, ABORTED for one that fell."""
+        """The phase in which the flight ended; ABORTED if the vehicle fell."""
         return Phase.ABORTED if self.fell else self.report.phase
 
     def close_log(self, log: LogWatcher) -> FlightSummary | None:
-        """Write the flight's summary and close its log. Returns the summary."""
+        """Write the flight's summary, close its log, and return the summary."""
         return log.close(self.report, self.perched_miss_m, self.fell)
 
 
@@ -157,9 +157,9 @@ def fly_lockstep(
 
     Args:
         log: a file to log to, or a watcher that is left open.
-        scenario, capture: flown instead of the seed's own.
+        scenario, capture: used in place of the seed's own.
         operator: the operator's command.
-        watchers: others that look on.
+        watchers: further watchers of the flight.
 
     Errors: NotFound, InvalidValue (calibration, log file).
     """

@@ -142,9 +142,9 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_unfit_vehicle(newest, parts.profile)
-        outside = _outside(parts, inputs, now_s)
-        refuse_wrong_positions(outside, newest, parts.profile, now_s, at_rest)
-        turns.report_waiting(inputs, now_s, outside)
+        feed = _outside(parts, inputs, now_s)
+        refuse_wrong_positions(feed, newest, parts.profile, now_s, at_rest)
+        turns.report_waiting(inputs, now_s, feed)
         waiting = still_waiting_for(
             newest,
             inputs.frames > 0,
@@ -153,7 +153,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
             parts.profile,
             inputs.target(now_s),
             0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
-            outside,
+            feed,
         )
         if parts.source.finished:
             raise NotFound(
@@ -189,12 +189,12 @@ def _mission(
             now_s = clock.now()
             inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
-        outside = _outside(parts, inputs, now_s)
-        obs = _observe(parts, inputs, now_s, late_s, outside)
+        feed = _outside(parts, inputs, now_s)
+        obs = _observe(parts, inputs, now_s, late_s, feed)
         turns.note_observation(obs)
         before = state
         new, command = step_mission(before, obs, parts.profile)
-        turns.note_decision(obs, new, command, outside)
+        turns.note_decision(obs, new, command, feed)
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
@@ -219,7 +219,7 @@ def _mission(
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        turn = turns.flown_turn(inputs, obs, state, command, outside)
+        turn = turns.flown_turn(inputs, obs, state, command, feed)
         newest = inputs.perception.calibration.newest
         tick = Tick(
             obs.t_s,
@@ -242,7 +242,7 @@ def _mission(
         if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
             return FlightReport.of(
-                state, obs, parts.profile, tuple(passed), inputs.perception.consistency()
+                state, obs, parts.profile, tuple(passed), inputs.perception.camera_errors()
             )
         due_s += period_s
         if due_s < now_s:
@@ -262,7 +262,7 @@ def _observe(
     inputs: FlightInputs,
     now_s: float,
     late_s: float,
-    outside: FeedStatus | None,
+    feed: FeedStatus | None,
 ) -> Observation:
     return replace(
         inputs.observation(now_s),
@@ -270,6 +270,6 @@ def _observe(
         loop_late_s=late_s,
         operator=parts.operator(),
         log_problem=next((w.problem for w in parts.watchers if w.problem), None),
-        position_age_s=0.0 if outside is None else outside.age_s,
-        position_problem=None if outside is None else outside.problem,
+        position_age_s=0.0 if feed is None else feed.age_s,
+        position_problem=None if feed is None else feed.problem,
     )

@@ -82,18 +82,18 @@ def still_waiting_for(
     profile: Profile,
     target: TargetEstimate | None = None,
     age_s: float = 0.0,
-    outside: FeedStatus | None = None,
+    feed: FeedStatus | None = None,
 ) -> str:
-    """Return what is missing yet; empty when ready. Errors: TimedOut past the bound, SafetyAbort
-    off the ground."""
+    """Return in words what is still missing; empty when ready. Errors: TimedOut if it took too
+    long, SafetyAbort off the ground or too near to the target."""
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
     if age_s > profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
     criteria = GroundCriteria(telemetry, profile)
-    unsent = None if outside is None else unsent_problem(outside, profile)
-    seen = None if outside is None else outside.measured
+    unsent = None if feed is None else unsent_problem(feed, profile)
+    seen = None if feed is None else feed.measured
     waiting = _first(
         {
             "positions of the motion capture": None if by_sight else unsent,
@@ -172,7 +172,7 @@ def view_problem(
 def target_view_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """Return the target as seen from a level vehicle at a place in its world."""
+    """Return the target as seen from a level vehicle at `body_m`, in the target's world."""
     return view_from(
         np.array(body_m),
         yaw_rad,

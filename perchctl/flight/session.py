@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """What is flown, and where: the command line on top of the profile."""
+    """The options of one flight: those of the command line, else the profile's."""
 
     profile: Profile
     profile_path: Path
@@ -52,12 +52,11 @@ class FlyOptions:
         return self.uri.startswith("sim://")
 
     def require_lift_check(self) -> None:
-        """Call the function `require_lift_check` for this flight."""
         require_lift_check(self.profile.positioning, self.uri, simulated=self.simulated)
 
 
 def check_options(options: FlyOptions) -> None:
-    """Refuse what can be refused before anything is opened. Errors: InvalidValue, UsageError."""
+    """Check the options before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     if options.profile.positioning.by == "mocap" and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
@@ -154,8 +153,8 @@ def _true_miss_m(simulated: SimProcess | None) -> float | None:
 
 
 def start_simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
-    """Start the simulated vehicle with its camera's stream. Raises UsageError without
-    the simulator."""
+    """Start the simulated vehicle with its camera's stream. Raises UsageError without the
+    simulator."""
     if find_spec("mujoco") is None:
         raise no_simulator()
     from perchctl.sim import SimProcess, draw_capture, draw_scenario

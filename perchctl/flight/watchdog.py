@@ -119,7 +119,7 @@ class Watchdog:
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Command | None:
-        """Return the command that has to be sent now in the loop's place; None for none."""
+        """Return the command to send in the loop's place, or None. `waiting`: unread samples."""
         last = self._last
         if self._cut_ordered:
             return self._cut(now_s, newest)
@@ -235,13 +235,13 @@ def rescue(
     motion: VisualInertialMotion | None = None,
 ) -> str:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
-    Returns where the vehicle came to rest, as a sentence without its end.
+    Returns where the vehicle came to rest, in words without a full stop.
 
     Args:
-        state: the planner's last; None before its first tick.
+        state: the planner's last state; None before its first tick.
         history: the telemetry so far.
-        position_age_s: age of the newest external position at a time; none is sent any more
-            if the target is the positioning system.
+        position_age_s: age of the newest external position at a time; positions are no longer
+            sent if the target is the positioning system.
         on_sent: called with each command that was sent.
         motion: the motion that pictures and accelerometer last agreed on.
     """

@@ -55,7 +55,7 @@ class CflibLink:
     """`perchctl.link.protocol.Link` on an unmodified cflib.
 
     `connection` is None unless connected. `landing_wait_s`: how long `close` waits for a vehicle
-    that still flies. `positioning` by motion capture sets the estimator to it.
+    that still flies. `positioning` by motion capture: the estimator is set to external positions.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class CflibLink:
             return False
 
     def settle(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
-        """Start the estimator where `feed` says that the vehicle is; without one at the world's
+        """Start the estimator where `feed` says that the vehicle is; without a feed, at the world's
         origin, `ground_z_m` high. On the ground, after `connect`; bounded. Errors:
         ConnectionFailed, NotFound, InvalidValue, TimedOut."""
         if self.connection is None:

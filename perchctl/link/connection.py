@@ -34,7 +34,8 @@ class Connection:
     """One opened `cflib.crazyflie.Crazyflie`.
 
     `lost` is None while connected, then the cause in one sentence. `cf` is cflib's object, for its
-    tables, parameters and log blocks. `claim` is closed when the connection ends.
+    tables, parameters and log blocks. `claim`, the vehicle's lock, is closed when the connection
+    ends.
     """
 
     def __init__(self) -> None:
@@ -301,8 +302,7 @@ _CAUSES = {
 
 
 def readable_cause(message: str) -> str:
-    """Return cflib's message without its traceback, or the cause and its remedy where they are
-    known."""
+    """Return cflib's message without its traceback, or, where known, the cause and its remedy."""
     for words, cause in _CAUSES.items():
         if words in message:
             return cause
@@ -319,7 +319,7 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
 
 
 def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
-    """Start a thread for what may block in a driver."""
+    """Start a daemon thread for a call that may block in a driver."""
     thread = threading.Thread(target=call, name=name, daemon=True)
     thread.start()
     return thread

@@ -148,7 +148,7 @@ class StandingFeed:
         self._clock, self._count = clock, 0
 
     def wait(self, duration_s: float) -> None:
-        """Let the time pass."""
+        """Send the place until `duration_s` has passed."""
         end_s = self._clock() + duration_s
         while (now_s := self._clock()) < end_s:
             if now_s >= self._due_s:

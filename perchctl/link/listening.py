@@ -132,7 +132,7 @@ _ECHO_MARK = 1  # cflib's own pings begin with 0
 class ProbeLink(ReadOnlyLink):
     """A `ReadOnlyLink` that accepts any firmware, since it is there to find what is wrong.
 
-    `quality` is the radio's, %: how few of its packets had to be sent again; None without one.
+    `quality`: the radio's, 100 % if no packet had to be sent again; None without a radio.
     `missing` names the log variables that perchctl needs and the firmware lacks.
     """
 
@@ -161,11 +161,11 @@ class ProbeLink(ReadOnlyLink):
         return int(self._cf.platform.get_protocol_version())
 
     def parameters(self) -> dict[str, float]:
-        """Return all parameters by name, as they were read when the link was opened."""
+        """Return all parameters by name, as read when the link was opened."""
         return read_parameters(self._cf)
 
     def age_s(self) -> float:
-        """Return the age of the older part of the newest sample; infinite without a sample."""
+        """Return the age of the newest sample's position; infinite without a sample."""
         newest = self._blocks.newest
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
@@ -212,10 +212,10 @@ SCAN_TIMEOUT_S = 20.0
 
 def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
-    packets only. Returns their URIs, and why no radio was asked: empty where one was, else the
-    cause and, in lines of its own, what to do.
+    packets only. Returns their URIs, and why no radio was asked, with advice in further lines; the
+    empty string if a radio was asked.
 
-    A radio's driver may hang: it gets a thread, and what came by then counts.
+    A driver may hang: after `SCAN_TIMEOUT_S` the URIs found so far are returned.
     """
     addresses: list[int | None] = [None]  # the usual one
     parts = uri.partition("?")[0].split("/")

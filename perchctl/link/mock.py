@@ -41,14 +41,12 @@ WATCH_PERIOD_S = 0.05
 
 
 class Radio:
-    """Carries the packets of both directions; loses those of a simulated radio's `bursts`, or
-    none."""
+    """A simulated radio, both ways; `bursts` decides which packets are lost (None: no packet)."""
 
     def __init__(self, bursts: Any = None) -> None:
         self._bursts = bursts
 
     def uplink_arrives(self, packet: Packet, now_s: float) -> bool:
-        """True if the packet arrives at the vehicle."""
         return self._bursts is None or not self._bursts.is_lost(now_s)
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:

@@ -94,7 +94,7 @@ class Sender:
         self._keeper.start()
 
     def put(self, command: Command, by: str | None = None) -> None:
-        """Queue a command. `by`: who sends it in the loop's place."""
+        """Queue a command; `by`: who sends it in the loop's place, None for the loop."""
         with self._ready:
             if isinstance(command, EmergencyStop):
                 self._queue.clear()  # nothing that was ordered before it matters any more
@@ -106,7 +106,7 @@ class Sender:
             self._ready.notify_all()
 
     def repeat_order(self, since_s: float) -> None:
-        """Repeat a last order that was handed over since then: the link may have lost it."""
+        """Queue the newest order again if it was handed over since `since_s`: it may be lost."""
         with self._ready:
             if self._last is None:
                 return
@@ -116,13 +116,12 @@ class Sender:
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """Return the seconds for which the library has taken nothing of what waits; 0 when nothing
-        waits."""
+        """Return the seconds for which no waiting command was taken; 0 if no command waits."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until everything is handed over; False when that takes too long."""
+        """Wait until all commands are handed over; return False after `timeout_s`."""
         end_s = time.monotonic() + timeout_s
         with self._ready:
             while self._queue:

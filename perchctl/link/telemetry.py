@@ -44,7 +44,7 @@ NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 def telemetry_from(
     values: Mapping[str, float], t_s: float, behind_s: float = 0.0, start: int = 0
 ) -> Telemetry:
-    """Return telemetry from log values by name; `behind_s` and `start` as `Telemetry` has them.
+    """Return telemetry from log values by name; `behind_s` and `start` as in `Telemetry`.
     Raises KeyError when a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
     variances = [values[name] for name in VARIANCE_BLOCK if name in values]
@@ -240,7 +240,7 @@ class LogBlocks:
         return list(self._samples.copy())
 
     def resume(self, send: Callable[[Packet], bool]) -> bool:
-        """Start the blocks again that come no more: send one packet; True if it went out.
+        """Send one packet of those that restart silent blocks; return True if it went out.
 
         To be called from one thread whenever there is room. `send` must not wait. A vehicle that
         still has a block says so, and starts it again all the same.

@@ -302,7 +302,7 @@ def update_conditions(c: Context) -> dict[Condition, float]:
 
 
 def lasting_conditions(since: dict[Condition, float]) -> dict[Condition, float]:
-    """The entries that last when the phase changes, or while held."""
+    """The entries of `since` that outlast a change of the phase, or a hold."""
     return {name: s for name, s in since.items() if name in LASTING}
 
 

@@ -117,7 +117,6 @@ class Context:
         self.cone_m = ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)
 
     def with_state(self, state: PlannerState) -> Context:
-        """The same tick with another state."""
         return Context(state, self.obs, self.profile)
 
     def evolve(self, **changes: Any) -> Context:

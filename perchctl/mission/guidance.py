@@ -136,7 +136,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint a tick later; unsighted, lower, from where the target is soonest seen."""
+    """The held setpoint a tick later; lower if the target gives the position, and is not seen."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
@@ -145,8 +145,8 @@ def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 
 
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The setpoint inside the fence, under the height limit and above the ground (fault 36), lower
-    only in a take-off."""
+    """The setpoint moved inside the fence, under the height limit and (fault 36) `FLOOR_M` above
+    the ground; in a take-off, down to the ground."""
     ground, safety = c.state.ground_m, c.safety
     if ground is None:
         return setpoint
@@ -167,7 +167,7 @@ def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 
 
 def is_pressing(c: Context) -> bool:
-    """True if it is at its thrust's limit, or above what hovering takes, and does not move."""
+    """True if the thrust is at its limit, or above that of hovering, and nothing moves."""
     return (
         _is_strong(c)
         and abs(c.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
@@ -220,7 +220,7 @@ def lower_thrust(c: Context) -> Action:
 
 def release_by_thrust(c: Context) -> Action:
     """The release's second stage: raw thrust down to still motors, and the stop when the whole
-    weight has hung long enough. Without fresh telemetry it restarts; a landing accepts older."""
+    weight has hung long enough. Old telemetry restarts it; a landing accepts older telemetry."""
     late_s = c.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
         return hold_by_position(c)
@@ -250,7 +250,7 @@ def hold_by_position(c: Context) -> Action:
 
 
 def motors_are_still(c: Context) -> bool:
-    """True if the motors stand still by raw thrust."""
+    """True if raw thrust has brought the motors to a stop."""
     released_s = c.state.released_s
     return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
 
@@ -274,7 +274,7 @@ def catch_goal_above_m(hover_thrust: float, thrust: float) -> float:
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
 
 
-def catch(c: Context) -> Action | None:
+def catch_slip(c: Context) -> Action | None:
     """The setpoint far above that stops a slip; None once it is caught, or with old telemetry."""
     state, tel = c.state, c.telemetry
     if state.caught or not c.imu_proves:

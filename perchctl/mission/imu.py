@@ -70,7 +70,6 @@ class Corrections:
         return now_s - self.none_since_s if certain else 0.0
 
     def add_sample(self, sample: Telemetry) -> Corrections:
-        """The corrections with one more sample."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -364,7 +363,7 @@ def advance_reckoning(
     old: DeadReckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
 ) -> DeadReckoning:
     """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
-    that velocity may be in other axes, and the reckoned one is kept even after a silence."""
+    that velocity may be in other axes, so the reckoned velocity is kept even after a silence."""
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
         carried = not old.imu.t_s < imu.silent_s <= blow.t_s
@@ -445,14 +444,14 @@ def advance_reckoning(
 
 
 def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """The reckoning with the bias of an attitude that wrong positions have tilted."""
+    """The reckoning with its bias corrected for an attitude that wrong positions have tilted."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
 
 def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) -> DeadReckoning:
     """The reckoning with the step of the position between two samples that its speed does not
-    explain. Steps add up; where samples are missing none is seen."""
+    explain. Steps add up; after a gap in the samples no step is added."""
     dt_s = _position_s(sample) - _position_s(last)
     if not 0.0 < dt_s <= UNSEEN_S:
         return old
@@ -476,7 +475,7 @@ def _position_s(sample: Telemetry) -> float:
 def add_sighting(
     old: DeadReckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> DeadReckoning:
-    """The reckoning from a new sight on; `aside_m`: from gear to target axis, world axes."""
+    """The reckoning restarted at a sight; `aside_m`: from gear to target axis, world axes."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
     )

@@ -28,8 +28,8 @@ from perchctl.mission.guidance import (
     STILL_THRUST,
     THRUST_MIN,
     Action,
-    catch,
     catch_goal_above_m,
+    catch_slip,
     clear_contact_below,
     hold_here,
     is_pressing,
@@ -63,7 +63,7 @@ from perchctl.vehicle import (
 
 
 class RestState(Enum):
-    """Where a vehicle with its motors off is, as a sentence without its end."""
+    """Where a vehicle with its motors off is, in words without a full stop."""
 
     HANGS = "the vehicle hangs on the magnet, its motors are off"
     HELD = "something holds the vehicle away from the target; the motors are off"
@@ -123,7 +123,7 @@ def step_landing(
 
 
 def begin_landing(c: Context) -> Context:
-    """The tick with its way down begun; the same tick if it had begun before."""
+    """The tick in the phase LANDING; unchanged if the landing had begun before."""
     if c.state.phase is Phase.LANDING:
         return c
     new = c.evolve(
@@ -141,7 +141,7 @@ def begin_landing(c: Context) -> Context:
 
 
 def enter_landing(c: Context, old: PlannerState) -> Context:
-    """The tick with the state in which a way down from `old` starts; its entry is set already."""
+    """The tick with the state in which a landing from `old` starts; the phase is set already."""
     tel, stopped_s = c.telemetry, old.stopped_s
     heard = c.t_s - tel.t_s <= c.safety.proof_age_s
     ordered = heard and tel.has_bit(HL_ACTIVE) and not c.by_sight
@@ -323,7 +323,7 @@ def _answered(c: Context) -> Context:
 
 
 def give_up_position(c: Context) -> Context:
-    """The tick once accelerometer and attitude are all that is left, for good."""
+    """The tick from which on only accelerometer and attitude are used, for good."""
     hover = _hover_thrust(c.state, c.obs)
     return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
 
@@ -451,7 +451,7 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
 
 
 def act(c: Context) -> Action:
-    """The command of one tick: after proof of a fall or of standing, else by what is known."""
+    """The landing's command: on proof of a fall or of standing, else by what is known."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
@@ -539,7 +539,7 @@ def _caught_again(c: Context) -> Action:
 
 def _catch(c: Context) -> Action | None:
     """A catch by position; None without a heading, or astray."""
-    return None if c.state.heading_lost or c.state.astray else catch(c)
+    return None if c.state.heading_lost or c.state.astray else catch_slip(c)
 
 
 def _by_setpoints(c: Context) -> Action:
@@ -646,8 +646,8 @@ def _level(c: Context) -> Action:
 
 
 def is_landing_over(c: Context) -> bool:
-    """True if a way down is over: a level one has come to its least thrust, or the setpoint to the
-    floor. Without a stop the firmware would lock the vehicle."""
+    """True if a landing is over: its raw thrust is at its least, or its setpoint at the floor.
+    Without a stop the firmware would lock the vehicle."""
     setpoint, ground_m = c.state.setpoint, c.state.ground_m
     if setpoint is not None and ground_m is not None:
         landing = c.planner.landing

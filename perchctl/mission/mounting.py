@@ -75,7 +75,6 @@ class MountingMonitor:
 
     @property
     def is_unconfirmed(self) -> bool:
-        """True while nothing confirms the mounting."""
         return not (self.fits or self.still)
 
 

@@ -29,8 +29,8 @@ from perchctl.mission.guidance import (
     LIFTED_M,
     Action,
     body_xy_under_target,
-    catch,
     catch_goal_above_m,
+    catch_slip,
     clear_contact_below,
     correct_setpoint,
     hold_here,
@@ -348,7 +348,7 @@ def _complete(c: Context) -> Action:
 
 def _recover(c: Context) -> Action:
     """Hold in the air `descend_m` below where the attempt ended, in position mode all along."""
-    if (caught := catch(c)) is not None:
+    if (caught := catch_slip(c)) is not None:
         return caught
     recover = c.planner.recover
     c = clear_contact_below(c, min(AWAY_M, 0.5 * recover.descend_m))

@@ -22,7 +22,7 @@ RESCUE = " in flight: "
 
 
 class EventKind(Enum):
-    """The kind of an event."""
+    """The kind of an `Event`."""
 
     PHASE = "phase"  # a phase was entered
     HOLD = "hold"  # the vehicle is held in place
@@ -79,7 +79,7 @@ class Event:
 @dataclass(frozen=True)
 class SentCommand:
     """A command that no turn of the loop decided, handed to the link at `t_s` on the loop's clock;
-    as of any packet, its arrival is unknown.
+    whether it arrived is unknown.
 
     `by`: ``watchdog`` while the loop is silent, and the operator's stop; ``rescue`` after an error;
     ``reconnect``, an order once more over a link that was lost; ``farewell``, the zero setpoint
@@ -93,7 +93,7 @@ class SentCommand:
 
 @dataclass(frozen=True)
 class ExternalPositions:
-    """The external positions that are sent to the vehicle."""
+    """State of the external positions for the vehicle: the newest, its age, the count `sent`."""
 
     age_s: float  # of the newest
     problem: str | None  # why none is sent now
@@ -129,7 +129,7 @@ class TurnInputs:
 
 @dataclass(frozen=True, eq=False)
 class UnfilteredPose:
-    """An unfiltered pose of the target, as of a `perchctl.vision.MarkerPose`."""
+    """An unfiltered pose of the target; the fields are those of `perchctl.vision.MarkerPose`."""
 
     t_s: float
     e_m: Array

@@ -40,12 +40,12 @@ class Touchdown:
 
     @property
     def is_hard(self) -> bool:
-        """True if the way down did not go as it should."""
+        """True if the vehicle met the floor faster than `HARD_MPS`."""
         return self.speed_mps > HARD_MPS
 
     @property
     def text(self) -> str:
-        """The touchdown as a sentence without its end."""
+        """The touchdown in words, as in ``touched down hard: 1.4 m/s, 3.2 g``."""
         how = "touched down hard" if self.is_hard else "touched down"
         return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
 
@@ -144,8 +144,8 @@ class FlightReport:
 
 
 def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
-    """Where the vehicle is, as a sentence without its end, once its motors have been seen off for
-    `off_s`; None before that. A hard touchdown is told with it."""
+    """Where the vehicle is, in words without a full stop, with its touchdown if that was hard; None
+    until its motors have been seen off for `off_s`."""
     c = Context(state, obs, profile)
     if c.held_s(Condition.DOWN) < off_s:
         return None

@@ -14,7 +14,7 @@ from perchctl.vision import TargetEstimate
 
 
 class Phase(Enum):
-    """The paper's seven phases, the two ways down, and the terminals."""
+    """The paper's seven phases, recovery, landing, and the three final phases."""
 
     __hash__ = object.__hash__  # by identity: each row of the table looks it up
 
@@ -33,7 +33,7 @@ class Phase(Enum):
 
     @property
     def is_flying(self) -> bool:
-        """True until a way down begins."""
+        """True until a landing begins."""
         return self in FLYING_PHASES
 
     @property
@@ -128,7 +128,7 @@ class ContactError:
 
 
 class Operator(IntEnum):
-    """The operator's command; it only rises (Ctrl-C once, twice)."""
+    """The operator's command, which never falls: Ctrl-C once lands, twice stops."""
 
     NONE = 0
     LAND = 1
@@ -137,8 +137,8 @@ class Operator(IntEnum):
 
 @dataclass(frozen=True)
 class Mismatch:
-    """What would bring the target to rest: pictures `later_s` later than assumed, or a camera
-    turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
+    """What explains that the target seems to move: pictures `later_s` later than assumed, or a
+    camera turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
 
     later_s: float = 0.0
     turn_rad: float = 0.0
@@ -274,7 +274,6 @@ class PlannerState:
 
     @classmethod
     def on_ground(cls, obs: Observation) -> PlannerState:
-        """The state before take-off."""
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
             entered_s=t_s,

@@ -138,7 +138,7 @@ def astray_reason(c: Context) -> str:
 
 
 def is_position_lost(c: Context) -> bool:
-    """True if no position has come for so long that none is waited for any more."""
+    """True if no position came for `positioning.land_s`, or the estimate is useless before."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
@@ -156,7 +156,7 @@ def position_loss_text(c: Context) -> str:
 
 
 def is_outside_fence(c: Context) -> bool:
-    """True if the vehicle is farther from its take-off than the fence allows."""
+    """True if the vehicle is farther from its start than the fence allows."""
     if c.state.ground_m is None:
         return False
     x, y, _ = c.telemetry.position_m

@@ -25,8 +25,12 @@ FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first. `battery_changed_s`: when the last reading came
-    that differed, or the first; `imu`: motion by accelerometer in the whole flight."""
+    """Telemetry of the last `KEEP_S`, oldest first.
+
+    In the newest samples, `jumped`: the estimate stepped; `turned_rad`: the heading's largest step.
+    `battery_changed_s`: when the battery's reading last changed, or first came; `imu`: motion by
+    accelerometer in the whole flight.
+    """
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False
@@ -47,10 +51,12 @@ class History:
 def add_samples(
     history: History, new: list[Telemetry], safety: SafetyConfig, late: bool = False
 ) -> History:
-    """The history with new samples; `jumped` and `turned_rad`, the largest step of the heading, are
-    about these only, or also about those before, where they came `late` in the same turn. Samples
-    with NaN or out of order are left out (fault 35); a position or velocity alone is that of the
-    sample before."""
+    """The history with new samples.
+
+    `jumped` and `turned_rad` are about the new samples, with `late` also about the earlier ones of
+    the same turn. A sample without position or velocity gets both from the sample before; others
+    with NaN, or out of order, are left out (fault 35).
+    """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu
     changed_s, battery_v = history.battery_changed_s, history.battery_v
@@ -106,7 +112,7 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """The first velocity from `t_s` on, else the newest, else zero; world axes."""
+    """The velocity of the first sample from `t_s` on, else of the newest, else zero; world axes."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)

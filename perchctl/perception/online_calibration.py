@@ -54,8 +54,10 @@ def update_calibration(
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
     """Return the estimate with one more picture in its sums, and once a second with their solution.
-    `t_s` is its arrival less the profile's latency. A pose that is not finite, too near, or without
-    the attitude of its time is ignored."""
+
+    `t_s` is the picture's arrival less the profile's latency. A pose that is not finite, too near,
+    or without the attitude of its time is ignored.
+    """
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
@@ -121,8 +123,11 @@ LEAST_FRAMES = 30
 
 @dataclass(frozen=True, eq=False)
 class ConsistencySums:
-    """A flight's memory: `level` (3, 8) and its `variance` (3,) as the newest frame left them,
-    None before the first; `information` (8, 8) of the innovations; `row_count` of their rows."""
+    """A flight's sums for `solve_consistency`.
+
+    `level` (3, 8), the filtered rows, and their `variance` (3,) after the newest frame, None before
+    the first; `information` (8, 8) of the innovations; `row_count` of their rows.
+    """
 
     t_s: float = -math.inf
     began_s: float = 0.0
@@ -140,10 +145,12 @@ def rows_variance_range(
     delay_s: float,
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
-    """Return what a frame tells: rows (3, 8) as the columns have them, the variance (3,) of the
-    target's place, and its range, m. `before` and `after` are the vehicle's attitude
-    `ATTITUDE_STEP_S` before and after the frame's time less `delay_s`, the delay that is thought
-    likely; `velocity_mps` its velocity then."""
+    """Return a frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
+    variance (3,) of the target's place; and its range, m.
+
+    `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
+    time less `delay_s`, the likely delay; `velocity_mps` is its velocity then.
+    """
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
@@ -199,7 +206,7 @@ def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
     """Return the sums with one frame more, by its `rows_variance_range`. After a gap, or a jump,
-    changes are counted anew; what was learned of delay and turn is kept."""
+    the level starts anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
     gap_s = t_s - old.t_s
@@ -228,7 +235,7 @@ def add_rows(
 
 
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
-    """Return what the flight shows so far; None after less than a second of frames.
+    """Return the errors of latency and mounting; None with less than a second of frames.
 
     `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
     """

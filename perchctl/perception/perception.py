@@ -47,10 +47,10 @@ class Perception:
         stills: each frame is searched thoroughly, without memory of others.
         history: the vehicle's telemetry; empty where there is no vehicle.
         state: the pipeline's memory.
-        calibration, motion: what pictures and telemetry tell of latency and mounting, and of the
-            vehicle's motion sideways.
-        refused: why the last target was another vehicle's; None: none was.
-        health: whether a frame can be a measurement at all.
+        calibration, motion: estimates, from pictures and telemetry, of latency and mounting, and
+            of the vehicle's motion.
+        refused: why a target was taken for another vehicle's; None if none was.
+        health: judges whether a frame can be a measurement at all.
     """
 
     pipeline: Pipeline
@@ -64,9 +64,11 @@ class Perception:
     health: FrameHealth = field(default_factory=FrameHealth)
     _mirrored: int = 0  # frames with the target's mirror image since one showed the target
 
-    def look(self, frame: Frame, later_s: float = 0.0) -> Iterator[tuple[Frame, PipelineOutput]]:
-        """Yield each picture of the frame, one or two fields in order of time, with what the
-        pipeline finds. `later_s`: the measured latency by which the frame's time was set back."""
+    def process_fields(
+        self, frame: Frame, applied_delay_s: float = 0.0
+    ) -> Iterator[tuple[Frame, PipelineOutput]]:
+        """Yield each field of an interlaced frame, or the whole frame, with the pipeline's output.
+        `applied_delay_s`: the measured latency that was taken off the frame's time."""
         if self.stills:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()
@@ -81,7 +83,7 @@ class Perception:
                 self._mirrored = 0
             if output.refused:
                 self.refused = output.lock_note
-            self._calibrate(output, later_s)
+            self._calibrate(output, applied_delay_s)
             yield picture, output
 
     @property
@@ -96,15 +98,15 @@ class Perception:
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
-    def consistency(self) -> CameraErrors | None:
-        """Latency and mounting by all pictures so far; None if there were too few."""
+    def camera_errors(self) -> CameraErrors | None:
+        """Errors of latency and mounting by all pictures so far; None if there were too few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sightings(self) -> None:
-        """Forget the sights by which the vehicle's motion is judged."""
+        """Forget the sights from which the vehicle's motion is estimated."""
         self.motion = drop_sightings(self.motion)
 
-    def _calibrate(self, output: PipelineOutput, later_s: float) -> None:
+    def _calibrate(self, output: PipelineOutput, applied_delay_s: float) -> None:
         """Update what is estimated of motion, latency and mounting."""
         pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
@@ -117,7 +119,7 @@ class Perception:
             return
         self.calibration = update_calibration(
             self.calibration,
-            output.detections.t_s + later_s,
+            output.detections.t_s + applied_delay_s,
             pose,
             self.history,
             self.pipeline.pose,

@@ -36,7 +36,7 @@ ALIKE_S = 3 * STEP_S
 
 @dataclass(frozen=True)
 class VisualInertialWindow:
-    """The sights of the last `WINDOW_S`, and what they were judged to show."""
+    """The sights of the last `WINDOW_S`, and the mismatch and motion that they show."""
 
     sights: tuple[tuple[float, Vector], ...] = ()  # time, way from body to target, body axes, m
     judged_s: float = -math.inf
@@ -48,12 +48,12 @@ class VisualInertialWindow:
 
     @property
     def mismatch(self) -> Mismatch | None:
-        """The newest judgement, once enough in a row agree; None before that."""
+        """The newest mismatch, once enough judgements in a row agree; None before that."""
         return self.latest if self.agree_count >= AGREED else None
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window without its sights, which from now on accepts a rougher motion."""
+    """The window without its sights; from now on it accepts a rougher motion."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -64,8 +64,8 @@ def estimate_motion(
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
 ) -> VisualInertialWindow:
-    """The window with one more sight, `way_m` from body to target in body axes, by the telemetry of
-    the last 2 s, oldest first; `offset_g` is what the accelerometer reads too much."""
+    """The window with one more sight, `way_m` from body to target in body axes; `samples`:
+    telemetry of the last 2 s, oldest first; `offset_g`: what the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, way_m)))
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
@@ -108,8 +108,11 @@ def _found(wanders_m: Array) -> Mismatch | None:
 def fit_hypotheses(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
-    """The motion under each hypothesis, a pair of `LATER_S` and `TURNS_RAD`: the target's sideways
-    motion, rms in m, (n,); the vehicle's speed at the newest sample and the offset, (3, n)."""
+    """The motion under each of n hypotheses, pairs of `LATER_S` and `TURNS_RAD`.
+
+    Returns the target's sideways motion, rms in m, (n,); the vehicle's velocity at the newest
+    sample, m/s, (3, n); and the offset of its acceleration, m/s2, (3, n).
+    """
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])

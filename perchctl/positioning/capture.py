@@ -38,8 +38,8 @@ _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """What the child connects to. `skip_empty`: a frame without a body is no frame, since the
-    library returns frames by its own clock, whether or not anything has arrived."""
+    """The capture that the child connects to. `skip_empty`: frames without a body are dropped,
+    since the library returns frames by its own clock, whether or not anything has arrived."""
 
     kind: str
     options: dict[str, str] = field(default_factory=dict)
@@ -49,15 +49,15 @@ class CaptureSetup:
 
 @dataclass(frozen=True)
 class CaptureFailure:
-    """The library has given up, with its words; with `is_loaded` False Python cannot import it."""
+    """The library's failure, with its message; `is_loaded` is False if Python cannot import it."""
 
     text: str
     is_loaded: bool = True
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return what the child connects to: Vicon and VRPN take a port in the host's name, the others
-    as an option of its own."""
+    """Return the child's connection: Vicon and VRPN take a port in the host's name, the others as
+    an option of its own."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -78,7 +78,7 @@ def open_capture(
 
 
 class MotionCapture:
-    """`perchctl.positioning.feed.CaptureSource`; its process ends with it.
+    """A `perchctl.positioning.feed.CaptureSource`, whose child process ends with it.
 
     `who` names the capture in sentences; a frame that shows `body` goes before one that does not.
     Creating it waits for the first frame. Errors: ConnectionFailed, UsageError for a library that

@@ -41,7 +41,7 @@ class BodyPose:
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """`t_s`: its arrival, on the loop's clock. A body that is occluded is not in it."""
+    """A frame that arrived at `t_s` on the loop's clock; a body that is occluded is not in it."""
 
     t_s: float
     bodies: Mapping[str, BodyPose] = field(default_factory=dict)
@@ -72,12 +72,12 @@ BUSY = "the link is busy with something else, and a position does not wait"
 
 @dataclass(frozen=True)
 class FeedStatus:
-    """What the flight loop reads in each turn.
+    """The state of a position feed, which the flight loop reads in each turn.
 
-    `age_s`: of the newest position that was handed to the link, from its exposure; inf before
-    the first. `problem`: None while they are sent, otherwise one sentence with the cause.
-    `rate_hz`: of the last second. `measured`: `pose` with its attitude, also where only the
-    position is sent.
+    `age_s`: time since the exposure of the newest position that was sent; inf before the first.
+    `problem`: None while positions are sent, else one sentence with the cause. `sent`: how many
+    were sent so far, `rate_hz` in the last second. `measured`: `pose` with its attitude, also where
+    only the position is sent.
     """
 
     age_s: float = math.inf
@@ -89,7 +89,7 @@ class FeedStatus:
 
 
 class SendingRate:
-    """When the next position may be sent, and how many were."""
+    """Limits how often positions are sent, and counts them."""
 
     def __init__(self, rate_hz: float) -> None:
         self.period_s = 1.0 / rate_hz
@@ -98,7 +98,6 @@ class SendingRate:
         self._times_s: deque[float] = deque()  # of the last `RATE_OVER_S`, and the newest
 
     def is_due(self, now_s: float) -> bool:
-        """Return whether a position may be sent now."""
         return now_s >= self._due_s - 1e-6
 
     def note_sent(self, now_s: float) -> None:
@@ -111,11 +110,11 @@ class SendingRate:
             self._times_s.popleft()
 
     def silent_s(self, now_s: float) -> float:
-        """Return the seconds since the newest was sent; infinite before the first."""
+        """Return the seconds since the newest position was sent; infinite before the first."""
         return now_s - self._times_s[-1] if self._times_s else math.inf
 
     def sent_hz(self, now_s: float) -> float:
-        """Return how many were sent in the last second."""
+        """Return how many positions were sent in the last second."""
         return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
 
 
@@ -191,7 +190,7 @@ class PositionFeed:
             self._turned_s, self._problem = now_s, problem
 
     def place(self) -> VehiclePose | None:
-        """Return the newest pose of which the link was given the position, or all of it."""
+        """Return the newest pose that was sent, even if only its position was; None before that."""
         return self._placed
 
     def status(self, now_s: float) -> FeedStatus:
@@ -265,8 +264,8 @@ class VehiclePose:
 
     @classmethod
     def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> VehiclePose:
-        """Return the vehicle's body, from the rigid body's axes as the capture system has defined
-        them: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
+        """Return the vehicle's pose, from that of the capture's rigid body and the profile's
+        offset: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
         roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
         length = math.sqrt(sum(part * part for part in pose.quaternion))
         w, x, y, z = (part / length for part in pose.quaternion)
@@ -292,8 +291,8 @@ class PoseValidator:
         """Why the newest frame with news was not believed; None if it was."""
 
     def validate(self, frame: CaptureFrame, now_s: float) -> VehiclePose | None:
-        """Return the vehicle's place if the frame has one that may be sent, its time that of the
-        exposure; otherwise `problem` says why, or there was no news in it."""
+        """Return the vehicle's pose at the frame's exposure; None if it may not be sent, for the
+        cause in `problem`, or if the frame is not new."""
         arrived_s = min(frame.t_s, now_s)  # nothing arrives later than now
         if not math.isfinite(arrived_s) or arrived_s <= self._arrived_s:
             return None

@@ -46,7 +46,7 @@ NOWHERE = Place(np.zeros(3), 0.0)
 
 
 def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Place:
-    """Return the target's place, seen by a body at `attitude`, which has its position."""
+    """Return the target's place by its pose in a picture and the body's attitude and position."""
     return Place(*to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
@@ -58,10 +58,10 @@ def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseS
 
 
 class TargetFeed:
-    """Sends places by sights; it has no thread and no clock, and the flight loop calls it.
+    """Sends the vehicle's position by sights of the target, called by the flight loop's thread.
 
-    `target` is None until it was seen from the ground. `off`: by how much the body is beside its
-    estimate by the sights, learned slowly against noise: the estimator lags behind late places.
+    `target`: its place; None until it was seen from the ground. `off`: the body's place by the
+    sights less its estimate, averaged against noise: the estimator lags behind late positions.
     """
 
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
@@ -86,8 +86,8 @@ class TargetFeed:
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
-        """Return the body's position, m, with the gear in the target's centre, level, where its
-        estimate has that heading; None before the target's place is known."""
+        """Return the position, m, of a level body with the gear in the target's centre and the
+        estimated heading `yaw_rad`; None before the target's place is known."""
         if self.target is None:
             return None
         way_m = rot_z(yaw_rad + self.off.yaw_rad).dot(self._setup.gear_body_m)

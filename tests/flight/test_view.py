@@ -91,7 +91,7 @@ def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
 
 def waits(waited_s: float = 0.0, **seen: Any) -> str:
     """What is waited for by a vehicle at rest that has pictures."""
-    given = {"telemetry": REST, "has_frame": True, "outside": FeedStatus(problem=UNSEEN)} | seen
+    given = {"telemetry": REST, "has_frame": True, "feed": FeedStatus(problem=UNSEEN)} | seen
     return still_waiting_for(camera_problem=None, waited_s=waited_s, profile=TARGET, **given)
 
 
@@ -104,7 +104,7 @@ BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m beside its esti
     ({"telemetry": replace(REST, roll_rad=0.4)}, "stand level"),
     ({"telemetry": replace(REST, acc_z_g=1.3)}, "stand still"),
     ({"has_frame": False}, "a good picture"),
-    ({"outside": BESIDE}, r"sight of the target.*0\.40 m beside its estimate"),
+    ({"feed": BESIDE}, r"sight of the target.*0\.40 m beside its estimate"),
 ])  # fmt: skip
 def test_what_keeps_a_target_from_being_measured_is_named_first_things_first(
     seen: dict[str, Any], words: str
@@ -117,6 +117,6 @@ def test_what_keeps_a_target_from_being_measured_is_named_first_things_first(
 
 def test_a_target_in_view_is_waited_for_no_longer() -> None:
     placed, off = ExternalPosition(FEET), ExternalPosition((0.4, 0.0, 0.0))
-    assert waits(outside=FeedStatus(0.05, None, 20, placed, 30.0, placed)) == ""
-    told = waits(outside=FeedStatus(0.05, None, 20, off, 30.0, off))
+    assert waits(feed=FeedStatus(0.05, None, 20, placed, 30.0, placed)) == ""
+    told = waits(feed=FeedStatus(0.05, None, 20, off, 30.0, off))
     assert "the state estimate to agree with the sight of the target" in told

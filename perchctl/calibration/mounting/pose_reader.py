@@ -47,7 +47,7 @@ class PoseReader:
         if judged in ("frozen", "snow"):
             return []
         seen = []
-        for picture, output in self._perception.look(frame):
+        for picture, output in self._perception.process_fields(frame):
             self.mirrored += output.detections.mirrored and not output.poses
             named = ((name, output.detections.get(name)) for name in MARKERS)
             self.outlines = tuple((name, d.corners_px) for name, d in named if d is not None)
