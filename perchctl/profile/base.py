@@ -93,7 +93,7 @@ UNITS_OF = {
 
 
 def key_unit(path: str) -> str:
-    """Return a key's unit by the last of its words; empty where it has none."""
+    """Return the unit that the ending of a key's name stands for; empty without one."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")

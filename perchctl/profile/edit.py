@@ -31,11 +31,11 @@ from perchctl.profile.schema import Profile
 
 def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
     """Return the profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; values in
-    YAML. `option`, for messages, is where they were given.
+    YAML. `option` names the command-line option in messages.
 
     Raises:
-        UsageError: a setting has another form.
-        InvalidValue: an unknown key, or a value that it may not have.
+        UsageError: a setting is not ``key=value``.
+        InvalidValue: the key is unknown, or its value not allowed.
     """
     values = profile.model_dump(mode="json")
     pairs = [_parsed(setting, option) for setting in settings]
@@ -55,7 +55,6 @@ def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--s
 
 
 def _parsed(setting: str, option: str) -> tuple[str, str]:
-    """Split a setting into key and value. Raises UsageError."""
     key, equals, text = setting.partition("=")
     if not equals or not key.strip():
         raise UsageError(
@@ -94,11 +93,11 @@ _DECIMALS = 6
 
 
 def writable_profile(name: str) -> Path:
-    """Return the file of a profile that belongs to the user, behind any links.
+    """Return the file of a user's own profile, with links resolved.
 
     Raises:
         NotFound: no such profile.
-        InvalidValue: it is one that is shipped, or may not be written.
+        InvalidValue: the profile is shipped with perchctl, or not writable.
     """
     path = find_profile(name).resolve()
     if path.is_relative_to(data_folder("profiles").resolve()):
@@ -120,8 +119,8 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
     beside it, which has the same permissions.
 
     Raises:
-        InvalidValue: the layout does not allow it, the profile would not load with them, or the
-        file cannot be written; nothing is changed then.
+        InvalidValue: the values do not fit into the YAML layout, the profile would not load with
+            them, or the file cannot be written. The file is then unchanged.
     """
     listed = ", ".join(f"{dotted}: {_flow(value)}" for dotted, value in values.items())
     by_hand = f"write them yourself: {listed}"
@@ -148,8 +147,8 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
 def replace_values(text: str, values: Mapping[str, Value]) -> str:
     """Return a profile's text with the values under their dotted keys, as in ``camera.latency_s``.
 
-    Comments, order and quotes stay. A list of as many numbers keeps its layout; a key that is
-    missing is put at its section's end, a section at the file's.
+    Comments, order and quotes stay. A list of the same length keeps its layout; a missing key is
+    added at its section's end, a missing section at the file's end.
 
     Raises:
         ValueError: a section holds no keys.

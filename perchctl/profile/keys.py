@@ -23,8 +23,8 @@ from perchctl.profile.schema import Profile
 class Key:
     """One leaf of the profile's schema.
 
-    `meaning` is the schema's own description, with backticks around what is typed as it stands;
-    `allowed` the bounds or choices, in words.
+    `meaning` is the schema's description, with backticks around literals; `allowed` the bounds or
+    choices, in words; `default` its default value.
     """
 
     path: str
@@ -54,7 +54,6 @@ def _allowed(schema: dict[str, Any]) -> str:
 
 
 def _allowed_of(kind: dict[str, Any]) -> str:
-    """Describe what is allowed of one of a key's kinds."""
     choices = kind.get("enum", [kind["const"]] if "const" in kind else [])
     if choices:
         return ", ".join(f"`{choice}`" for choice in choices)
@@ -95,10 +94,9 @@ _WIDTH = 80
 
 
 def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
-    """Write the keys of a profile, each under a comment with its meaning, unit and what is allowed.
+    """Return a profile's keys as YAML, each under a comment with meaning, unit and allowed values.
 
-    Read back, the keys have the same values. `paths` are the dotted paths of the keys that are
-    written, by default all.
+    Read back, the keys have the same values. `paths`: dotted paths of the keys; None: all.
     """
     lines: list[str] = []
     before: list[str] = []

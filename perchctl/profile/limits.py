@@ -42,7 +42,7 @@ class Limit:
         return tuple(_KEY.findall(self.relation))
 
     def holds(self, profile: Any) -> bool:
-        """Return whether the profile's values fulfil the relation."""
+        """True if the profile's values fulfil the relation."""
         # The relations are those of this module, and name keys and numbers only.
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 

@@ -33,7 +33,7 @@ _NAMED_FILES = (
 
 
 def is_profile_path(name: str) -> bool:
-    """Return whether a profile is named by its file, not by its name alone."""
+    """True if `name` is the path of a profile's file, not a bare name."""
     return "/" in name or name.endswith((".yaml", ".yml"))
 
 
@@ -69,14 +69,13 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
 
 
 def check_profile(path: Path, text: str) -> None:
-    """Raise NotFound or InvalidValue if the profile would not load with another text."""
+    """Raise NotFound or InvalidValue if the profile would not load with `text` as its content."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ProfileNote)  # said when it was loaded
         _checked(path, _values_of(text, path))
 
 
 def _checked(path: Path, own: dict[str, Any]) -> Profile:
-    """The profile of what its own file holds."""
     values = _resolved(path, own, seen=())
     values.setdefault("name", path.stem)
     try:
@@ -136,7 +135,7 @@ _WHITE = 127
 
 
 def find_mask(name: str) -> Path:
-    """Return the file of a mask, which a loaded profile names by the whole path."""
+    """Return a mask's file; a loaded profile names it by its full path."""
     path = Path(name)
     if not path.is_file():
         raise NotFound(

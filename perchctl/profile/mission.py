@@ -165,7 +165,7 @@ class LandingConfig(Section):
 
     @property
     def setpoint_time_s(self) -> float:
-        """Longest time of the landing by setpoints; then the firmware's own landing begins."""
+        """Longest time of the landing by setpoints, until the firmware's landing begins."""
         return OVERDUE_SHARE * self.timeout_s
 
 
@@ -194,7 +194,7 @@ class PlannerConfig(Section):
 
 
 class SafetyConfig(Section):
-    """Limits and reaction times; `*_hold_s` stays where it is, `*_land_s` lands."""
+    """Limits and reaction times: the vehicle hovers after `*_hold_s` and lands after `*_land_s`."""
 
     min_rest_v: float = key(3.8, "least resting voltage for a take-off", ge=0, le=5)
     min_load_v: float = key(3.0, "voltage under load below which the vehicle lands", ge=0, le=5)

@@ -21,9 +21,11 @@ BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s":
 
 
 class PositioningConfig(Section):
-    """The source of the vehicle's position. `deck`: its own decks. `mocap`: a motion-capture
-    system measures a rigid body on the vehicle, and its position is sent to it. `target`: the
-    position measured from the printed target by the camera is sent.
+    """The source of the vehicle's position.
+
+    `deck`: its own decks. `mocap`: a motion-capture system measures a rigid body on the vehicle,
+    and perchctl sends its position to the vehicle. `target`: perchctl sends the position that the
+    camera measures from the printed target.
 
     The body's frame, as the system defines it, is turned by `body_rpy_deg` and lies at
     `body_position_m`, both in the vehicle's body axes.

@@ -73,8 +73,8 @@ class Profile(Section):
     log: LogConfig = LogConfig()
 
     @classmethod
-    def lost_texts(cls, values: dict[str, Any]) -> list[str]:
-        """Return a sentence for each key that has become a constant, if its value differs."""
+    def constant_key_errors(cls, values: dict[str, Any]) -> list[str]:
+        """Return a sentence for each key that is now a constant of another value."""
         return split_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")

@@ -39,7 +39,7 @@ def dictionary_size(name: str) -> int:
 
 
 def have_same_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
-    """Return whether two markers have the same cells, in any rotation, as ``DICT_4X4_50`` has
+    """True if two markers have the same cells, in any rotation, as ``DICT_4X4_50`` has
     the first ids of ``DICT_4X4_1000``."""
     one, two = aruco_dictionary(name), aruco_dictionary(other)
     if one.markerSize != two.markerSize:
@@ -60,7 +60,7 @@ def check_marker_id(name: str, marker_id: int) -> None:
 
 
 class Mounting(Section):
-    """Where the camera sits: its position in body axes and its turn from them.
+    """The camera's mounting: its position in body axes and its rotation from them.
 
     With ``rpy_deg: [0, 0, 0]`` the camera looks up, the image's right is the
     vehicle's forward and the image's bottom its left. `rpy_deg` are rotations
@@ -272,7 +272,7 @@ class KalmanConfig(Section):
     ``measured`` takes each pose's own covariance, and accelerations as process noise: in
     the level frame `acceleration_mps2` of the camera or target and `turn_radps2` of the
     camera's attitude and heading, in the world `drift_mps2` of the state estimate. A constant
-    error of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens what is claimed.
+    error of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens the estimate's spread.
 
     `drift_mps`: a target stands still, so while it is not measured it moves in the world
     of the state estimate by that estimate's drift only, at most so fast.

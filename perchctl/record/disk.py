@@ -50,7 +50,7 @@ class DiskFile:
             os.fsync(self._fd)
 
     def free_bytes(self) -> int:
-        """Return the bytes that are left on its disk. Raises OSError."""
+        """Return the free space on the file's disk. Raises OSError."""
         return shutil.disk_usage(self._path).free
 
     def close(self) -> None:
@@ -61,8 +61,8 @@ class DiskFile:
 
 
 def create_file(path: Path, sync: bool, build: Callable[[DiskFile], T]) -> T:
-    """Create a file and return the object that `build` makes with it; if that raises, the file is
-    deleted. Raises OSError as `DiskFile` does."""
+    """Create a file and return the object that `build` makes with it; delete it if `build` raises.
+    Raises OSError as `DiskFile` does."""
     file = DiskFile(path, sync)
     try:
         return build(file)
@@ -94,7 +94,7 @@ class BackgroundWriter:
             self._thread.start()
 
     def put(self, job: Job, weight: int = 1) -> bool:
-        """Queue a job, from any thread; False if the queue is full and the job is refused."""
+        """Queue a job that takes `weight` of the room; False if the queue is too full for it."""
         if self._thread is None:
             _do(job)
             return True
@@ -108,7 +108,7 @@ class BackgroundWriter:
         return True
 
     def finish(self, job: Job, timeout_s: float) -> int:
-        """Queue the last job and wait for it; return the number of jobs not done by then."""
+        """Queue the last job and wait at most `timeout_s`; return the number of jobs not done."""
         if self._thread is None:
             _do(job)
             return 0

@@ -59,8 +59,8 @@ def make_header(
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:
-    """Return the calibration, ``camera``, and the mask of the pixels that the gear covers,
-    ``mask``. An unreadable file is left out."""
+    """Return ``camera``, the calibration, and ``mask``, the pixels that the gear covers; an
+    unreadable file is left out."""
     with contextlib.suppress(PerchError):
         camera = profile_camera(profile.camera)
         record = {"camera": to_exact_json(camera)}

@@ -43,7 +43,7 @@ SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
 def image_message(ns: int, frame: Frame) -> CompressedImage:
-    """Return the message of a picture: its bytes as they came, or without loss."""
+    """Return a picture's message: the camera's own JPEG, or else a PNG."""
     data = frame.encoded
     if data is None:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]
@@ -85,7 +85,7 @@ def to_stamp(ns: int) -> Timestamp:
 
 def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
     """Return the markers' outlines in the frame of a tick's record; empty for
-    a frame without the target, which clears the previous ones."""
+    a frame without the target, which clears the previous outlines."""
     return ImageAnnotations(
         timestamp=to_stamp(ns),
         points=[
@@ -116,8 +116,8 @@ def fixed_transforms(profile: Profile) -> list[FrameTransform]:
 def moving_transforms(
     ns: int, sampled_ns: int, record: Mapping[str, Any]
 ) -> Iterator[FrameTransform]:
-    """Yield the transforms from the world of what a tick's record places: the body, at the time of
-    its sample, the target and the setpoint. One that is missing or not finite is left out."""
+    """Yield the transforms from the world to a tick record's body (at `sampled_ns`), target and
+    setpoint, without any that is missing or not finite."""
     for child, at_ns, keys in (
         (BODY, sampled_ns, BODY_KEYS),
         (TARGET, ns, TARGET_KEYS),

@@ -92,7 +92,7 @@ class FlightLog:
 
     @cached_property
     def sent(self) -> list[SentCommand]:
-        """Commands that no loop turn decided; empty before version 4. Errors: InvalidValue."""
+        """Commands sent outside of turns; empty in logs before version 4. Errors: InvalidValue."""
         return [parse_exact(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
@@ -159,7 +159,7 @@ class FlightLog:
         return 0.0 if first is None else float(first["t_s"])
 
     def to_flight_s(self, t_s: Times) -> Times:
-        """Count times on the loop's clock from the first flown turn, as all outputs do."""
+        """Convert times on the loop's clock to times since the first flown turn."""
         return t_s - self.start_s
 
     @cached_property
@@ -201,7 +201,7 @@ class FlightLog:
         """The flown profile, without passwords. A `Note` warns of each key that has become a
         constant and was flown with another value. Errors: InvalidValue."""
         values = self.header.get("profile")
-        for sentence in Profile.lost_texts(values) if isinstance(values, dict) else ():
+        for sentence in Profile.constant_key_errors(values) if isinstance(values, dict) else ():
             said = sentence.removesuffix("; remove it")
             warnings.warn(f"the flight was by an older perchctl: {said}", Note, stacklevel=2)
         try:
@@ -238,7 +238,7 @@ class FlightLog:
 
     @property
     def computer_differences(self) -> str:
-        """How the flight's computer differed from this one, in words; empty if it did not, or if
+        """How the flight's computer differs from the present one, in words; empty if equal, or if
         the log does not record it."""
         was, here = self.header.get("computer"), computer_record()["computer"]
         if not isinstance(was, dict):

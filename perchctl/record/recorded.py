@@ -41,10 +41,10 @@ def recorded_pictures(
     path: Path | str, numbers: Container[int] | None = None
 ) -> Iterator[RecordedPicture]:
     """Yield the pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it
-    lies beside; of one that was cut off, those that are whole.
+    lies beside; a cut-off last picture is left out.
 
-    Only the frames of `numbers`, where it is given, are decoded. Errors, with the first picture:
-    NotFound without a recording; InvalidValue where it is none.
+    If `numbers` is given, only these frames are decoded. Errors, with the first picture: NotFound
+    without a recording; InvalidValue for a file that is none.
     """
     path = recording_path(path)
     for frame, message in recorded_frames(path):
@@ -58,7 +58,7 @@ def recorded_pictures(
 
 
 def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImage | None]]:
-    """Yield the record of each frame of a recording, with its picture if that was stored.
+    """Yield each frame's record in a recording, and its picture, None if it was not stored.
 
     Errors: NotFound where there is no file, InvalidValue where it is no MCAP file.
     """

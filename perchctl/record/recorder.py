@@ -55,11 +55,11 @@ RESERVE_BYTES = 200_000_000
 
 
 class Recorder:
-    """Writes one flight's recording. Only `open` raises. `frame` and `tick` are called by the
-    loop, and cost it no more than a place in a queue.
+    """Writes one flight's recording. Only `open` raises.
 
-    Live, a thread writes each turn at its end, while the loop sleeps. In lockstep everything is
-    written at once, and nothing is dropped.
+    The loop calls `write_frame` and `write_tick`. Live, these only fill a queue, and a thread
+    writes each turn at its end, while the loop sleeps. In lockstep everything is written at once,
+    and nothing is dropped.
 
     Attributes:
         problem: None, or one sentence about the first thing that the recording lacks.
@@ -121,8 +121,8 @@ class Recorder:
         self._hand_over()
 
     def close(self) -> RecordingEnd:
-        """End the file and return its summary; a second call only returns that. Waits at most
-        `CLOSE_TIMEOUT_S` for a disk that hangs. Never raises."""
+        """End the file, once, and return its summary. Waits at most `CLOSE_TIMEOUT_S` for the disk.
+        Never raises."""
         if not self._closed:
             self._hand_over()
             self._closed = True
@@ -201,7 +201,6 @@ class Recorder:
             self._finish()
 
     def _finish(self) -> None:
-        """End the file with its index."""
         self._over = True
         self._mcap.finish()
         self._stream.flush()
@@ -218,7 +217,6 @@ class Recorder:
         return max(0, self._started_ns + round((t_s - self._t0_s) * NS))
 
     def _add(self, topic: str, ns: int, message: Message | bytes, sequence: int = 0) -> None:
-        """Add a message of Foxglove's, or JSON."""
         channel = self._channels.get(topic)
         if channel is None:
             channel = self._channels[topic] = self._new_channel(topic, message)

@@ -64,7 +64,7 @@ class FlightSummary:
 
     @classmethod
     def from_log(cls, log: FlightLog) -> FlightSummary:
-        """Return the summary by the log's record; by its ticks where that is missing."""
+        """Return the summary by the log's summary record, or without one by its ticks."""
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
         ends = f"ends in {log.phases[-1].phase}" if log.phases else "holds no flight"
@@ -90,7 +90,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for `LogWatcher.end`, which adds what the log lacks."""
+        """Return the record for `LogWatcher.end`, which adds the log's own losses."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,

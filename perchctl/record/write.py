@@ -159,7 +159,7 @@ class LogWatcher:
 
     @property
     def has_begun(self) -> bool:
-        """True if the flight has begun; `abandon` leaves no file of one that has not."""
+        """True if the flight has begun; `abandon` deletes the log of a flight that has not."""
         return self._ticks > 0
 
     def tick(self, tick: Tick) -> None:
@@ -185,7 +185,7 @@ class LogWatcher:
         self._put(partial(turn_line, turn), turn.t_s)
 
     def sent(self, sent: SentCommand) -> None:
-        """Append a command that no turn decided, exactly; from any thread. Never raises."""
+        """Append a command sent outside of loop turns, exactly; from any thread. Never raises."""
         self._put(partial(sent_line, sent), sent.t_s)
 
     def event(self, event: Event) -> None:
@@ -224,7 +224,7 @@ class LogWatcher:
         )
 
     def abandon(self, reason: str) -> None:
-        """Close the log of a flight that failed. One that never began leaves no file."""
+        """Close the log of a failed flight; delete it if the flight never began."""
         self.end({"outcome": "failed", "reason": reason})
         self._ended_recording()
         if not self.has_begun:
@@ -293,7 +293,7 @@ class LogWatcher:
 
 
 def sent_line(sent: SentCommand) -> bytes:
-    """Return a command that no turn decided as one exact line of the log."""
+    """Return a command sent outside of loop turns as one exact line of the log."""
     return json_line({"kind": "sent", **to_exact_json(sent)})
 
 

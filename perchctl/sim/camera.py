@@ -71,7 +71,7 @@ class SimCamera:
         """Take all exposures that end at or before `t_s`.
 
         `pose_at`, the body's pose, is called with times within the exposures that ended since the
-        last call: with calls every control period, no older than one exposure and period.
+        last call. If that was a control period ago, these are at most an exposure and a period old.
         """
         self._t_s = t_s
         while True:
@@ -102,8 +102,8 @@ class SimCamera:
         return given_out
 
     def take_newest(self, count: int) -> list[DeliveredFrame]:
-        """Take the frames; return the first and last copy of each of the newest `count`
-        exposures, since a receiver may repeat them."""
+        """Take the frames, but return only the newest `count` exposures; of an exposure that a
+        receiver repeats, the first and the last copy."""
         frames = self.take()
         last = sorted({frame.index for frame in frames})[-count:]
         ends = [[frame for frame in frames if frame.index == index] for index in last]
@@ -149,7 +149,7 @@ PUMPING_HZ = (0.4, 2.0)
 
 
 class Shutter:
-    """The scenario's shutter; same seed, same light.
+    """Times, camera poses and brightness of a frame's rows; same seed, same light.
 
     `half_frame_s`: half the time from the first light on the frame to the last.
     """

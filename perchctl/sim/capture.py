@@ -39,7 +39,7 @@ class CaptureFault:
     """A temporary fault of the motion capture; the defaults are no fault.
 
     Attributes:
-        occluded: the vehicle's body is not seen.
+        occluded: the vehicle's body is hidden from the cameras.
         frozen: all bodies stay where they were seen last, to the last digit.
         gone: no frame is sent.
         swapped: the vehicle's body and the first other one have changed names.
@@ -94,7 +94,7 @@ class CaptureSettings:
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
-    """Return the motion capture of that seed's flight; None where the vehicle's decks do it."""
+    """Return the motion capture of that seed's flight; None if the profile uses none."""
     config, sim = profile.positioning, profile.simulation
     if config.by != "mocap":
         return None
@@ -113,10 +113,11 @@ def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
 
 
 class SimCapture:
-    """Exposes at `rate_hz`; same settings and flight, same frames. A flight in lockstep has it as
-    its `CaptureSource`.
+    """Motion capture with exposures at `rate_hz`; same settings and flight, same frames.
 
-    Each exposure draws the same random numbers whatever is wrong, so a fault changes no frame
+    It is the `CaptureSource` of a flight in lockstep.
+
+    Each exposure draws the same random numbers with or without a fault, so a fault changes no frame
     outside its time. Frames never overtake each other.
     """
 
@@ -136,7 +137,7 @@ class SimCapture:
         self._under_way: deque[CaptureFrame] = deque()
 
     def begin_fault(self, fault: CaptureFault, for_s: float = math.inf) -> None:
-        """Begin a fault now, for so long."""
+        """Begin a fault now, for `for_s` of simulated time."""
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
     def end_faults(self) -> None:
@@ -186,7 +187,6 @@ class SimCapture:
     def _bodies(
         self, world: World, noise: Array, faults: list[CaptureFault]
     ) -> dict[str, BodyPose]:
-        """All bodies by the name under which the capture has them."""
         settings = self.settings
         R = rotation_from_quaternion(world.quaternion)
         place = np.array((world.x_m, world.y_m, world.z_m)) + R @ settings.body_position_m
@@ -233,7 +233,7 @@ _UNSEEN = BodyPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 class MotionCaptureServer:
-    """Answers in a thread of its own; `publish` sends a frame to the newest client at once."""
+    """Serves NatNet requests in a thread; `publish` sends a frame to the newest client at once."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
@@ -290,7 +290,7 @@ def _models(names: Sequence[str]) -> bytes:
 
 
 def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
-    """Return one frame; a body that is not in it is marked as not tracked."""
+    """Return a frame's message; bodies of `names` missing in it are marked as not tracked."""
     parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
     parts.append(struct.pack("<i", len(names)))
     for index, name in enumerate(names, 1):

@@ -177,7 +177,7 @@ BY_LOG_CODE = {number.log_code: number for number in BY_CTYPE.values()}
 
 
 class Toc:
-    """One table. `codes` maps a complete name ("group.name") to its type byte."""
+    """A table of contents; `codes` maps a complete name ("group.name") to its type byte."""
 
     _ITEM, _INFO = 2, 3
 
@@ -192,7 +192,7 @@ class Toc:
         self._info = struct.pack("<BHI", self._INFO, len(codes), crc) + info_tail
 
     def name(self, ident: bytes) -> str | None:
-        """Return the name that has this number, two bytes; None where no name has it."""
+        """Return the name with a number, given as two bytes; None for an unknown number."""
         number = int.from_bytes(ident, "little")
         return self._names[number] if len(ident) == 2 and number < len(self._names) else None
 
@@ -276,7 +276,7 @@ class CrtpServer:
         return [] if answer is None else [Packet(packet.port, packet.channel, answer)]
 
     def due_packets(self) -> list[Packet]:
-        """Return the log data that the vehicle sends by itself by now."""
+        """Return the packets of log data that are due by now."""
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():

@@ -46,7 +46,7 @@ class VehicleHost:
     Args:
         link: further arguments of `CrtpServer`.
         truth_file: JSON lines of the true state, 50 a simulated second.
-        parts: further arguments of `SimulatedVehicle`, of this one and each that replaces it.
+        parts: further arguments of `SimulatedVehicle`, for each vehicle.
     """
 
     def __init__(
@@ -74,8 +74,8 @@ class VehicleHost:
         self._truth = None if truth_file is None else truth_file.open("w", encoding="utf-8")
 
     @property
-    def uri_stream_capture(self) -> tuple[str, str, tuple[str, str] | None]:
-        """The attributes of these names of `SimProcess`."""
+    def addresses(self) -> tuple[str, str, tuple[str, str] | None]:
+        """The `uri`, `stream_url` and `capture` of `SimProcess`."""
         stream_url = "" if self.stream is None else self.stream.url
         positions = self.positions
         capture = None if positions is None else (SimCapture.SYSTEM, positions.host)
@@ -172,7 +172,6 @@ class VehicleHost:
                     self.socket.sendto(packet.encode(), address)
 
     def _passes(self) -> bool:
-        """Return whether the link carries a packet now."""
         t_s = self.elapsed_s + _EPS_S
         if self._silent_s[0] <= t_s < self._silent_s[1]:
             return False
@@ -196,7 +195,7 @@ def serve_parent(
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     try:
         with contextlib.closing(VehicleHost(scenario, **settings)) as host:
-            channel.send(host.uri_stream_capture)
+            channel.send(host.addresses)
             HostRunner(host, channel, realtime=pace == "realtime", shared=shared).run()
     except Exception as error:
         with contextlib.suppress(OSError):

@@ -73,10 +73,11 @@ def ray_to_plane_map(T_target_cam: Array) -> Array:
 
 
 def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return where the grid's rays meet the plane, (rows, cols, 2) m, and which do not.
+    """Return the points where the grid's rays meet the plane, (rows, cols, 2) m, and True for each
+    ray that misses it, (rows, cols).
 
-    `to_plane` is the map (3, 3), or with a rolling shutter those of rows at equal distances
-    from the picture's first to its last, (n, 3, 3).
+    `to_plane` is the map (3, 3) of `ray_to_plane_map`, or with a rolling shutter the maps (n, 3, 3)
+    of n rows at equal distances from the picture's first to its last.
     """
     x, y = grid.xy[..., 0], grid.xy[..., 1]
     if to_plane.ndim == 2:
@@ -102,7 +103,7 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
-    """Return the local scale of the picture around a node (geometric mean of both directions)."""
+    """Return the picture's pixels per metre around a node (geometric mean of both directions)."""
     row, col = min(max(row, 1), len(nodes) - 2), min(max(col, 1), nodes.shape[1] - 2)
     a = (nodes[row, col + 1] - nodes[row, col - 1]).astype(np.float64)
     b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)
@@ -119,7 +120,7 @@ VIGNETTING_EXPONENT = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """`coarse` holds the rays of every eighth pixel, `pixels` those of all; `shade` is the
+    """`coarse` holds the rays of every eighth pixel, `pixels` the rays of all; `shade` is the
     vignetting (height, width), 255 for no loss; `sample_rays` (3, 5) go through the picture's
     middle and its quarters; `focal_px` is the mean focal length of x and y."""
 
@@ -132,7 +133,7 @@ class Lens:
 
 def shared_lens(camera: CameraModel) -> Lens:
     """Return the camera's lens, which flights share."""
-    return _lens(*camera.contents)
+    return _lens(*camera.calibration_key)
 
 
 @lru_cache(maxsize=2)

@@ -107,12 +107,12 @@ _EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
 
 
 class Cell:
-    """`rest_v` its resting voltage, `battery_v` under load.
+    """A battery cell: `rest_v` is its resting voltage, `battery_v` its voltage under load.
 
     Args:
-        ohm: the resistance that acts at once; `slow_ohm` the one that acts slowly.
-        charge: what an old cell still holds, as a share.
-        knee: where the steep end begins.
+        ohm, slow_ohm: resistance that acts at once, and that acts slowly.
+        charge: an old cell's capacity as a share of a new one's.
+        knee: share of the charge below which the voltage falls steeply.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class Cell:
         self.rest_v = self.battery_v = rest_v
 
     def set_rest_v(self, rest_v: float) -> None:
-        """Set another voltage; the charge stays as it is."""
+        """Set the resting voltage without a change of the charge."""
         self._offset_v += rest_v - self.rest_v
         self.rest_v = rest_v
 
@@ -174,11 +174,11 @@ _HOVER_V = motor_voltage(0.042 * GRAVITY_MPS2 / 4.0)
 _STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
 _PER_V = ((CONTROL_PERIOD_S / MOTOR_LAG_S) ** 2 - _STANDING) / _HOVER_V
 
-Forces = tuple[float, float, float, float]
+ForcesN = tuple[float, float, float, float]
 
 
 class Powertrain:
-    """`forces_n` M1..M4, which load the scenario's `cell`."""
+    """Four motors M1..M4, with thrusts `forces_n`, on the scenario's `cell`."""
 
     def __init__(self, scenario: Scenario) -> None:
         ohm = scenario.cell_resistance_ohm
@@ -190,14 +190,14 @@ class Powertrain:
             scenario.cell_knee,
         )
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
-        self.strength: Forces = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
+        self.strength = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
         self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
 
-    def step(self, pwm: Forces) -> Forces:
-        """Return the forces after one control period under four duty cycles 0..65535."""
+    def step(self, duty_cycles: tuple[float, float, float, float]) -> ForcesN:
+        """Advance by a control period at duty cycles 0..65535; return the motors' thrusts, N."""
         scale = self.cell.battery_v / FULL_COMMAND
-        for motor, duty in enumerate(pwm):
+        for motor, duty in enumerate(duty_cycles):
             speed_v = self._speeds_v[motor]
             missing_v = scale * duty - speed_v
             share = sqrt(_STANDING + _PER_V * speed_v) if missing_v > 0.0 else self._down

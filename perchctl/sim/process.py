@@ -31,8 +31,8 @@ def _serve_parent(*arguments: Any) -> None:
 
 
 class SimProcess:
-    """Handle of a running simulated vehicle; a context manager. It has the methods that the child's
-    `perchctl.sim.host.VehicleHost.call_method` finds.
+    """Handle of a running simulated vehicle; a context manager. It also has the methods that
+    `perchctl.sim.host.VehicleHost.call_method` finds in the child.
 
     From any thread; errors: `ConnectionFailed` when the child is gone, `TimedOut` when it
     does not answer, `InvalidValue` when it refuses.

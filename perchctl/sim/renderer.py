@@ -113,7 +113,7 @@ class Renderer:
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
-        """Put the target's centre there from now on."""
+        """Move the target's centre to `xy_m`, world axes."""
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
@@ -142,8 +142,8 @@ class Renderer:
     def expose(
         self, shots: Sequence[Exposure], frame_index: int = 0, defocus_px: float | None = None
     ) -> Picture:
-        """Return the frame of one exposure, or of two fields, the earlier first; its rows are by
-        the scenario's `camera_fields`. Otherwise as `render`."""
+        """Return the frame of one `Exposure`, or of two fields, the earlier first, woven as the
+        scenario's `camera_fields` says. Otherwise as `render`."""
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
         picture = exposed[0]
         if len(shots) > 1:
@@ -245,12 +245,12 @@ class Renderer:
             rays = RayGrid(xy, pixels.row_share[rows], pixels.boundary_xy)
             picture[rows, cols] = cover(picture[rows, cols], view, maps, rays)
             return
-        blocks, is_paper = by_block(picture)[view.box], view.is_plain & (view.alpha > 0)
+        blocks, is_paper = as_blocks(picture)[view.box], view.is_plain & (view.alpha > 0)
         blocks[is_paper] = view.value[is_paper][:, None, None]
         if view.is_plain.all():
             return
         below = blocks[~view.is_plain]
-        xy = by_block(pixels.xy)[view.box][~view.is_plain].reshape(len(below), -1, 2)
+        xy = as_blocks(pixels.xy)[view.box][~view.is_plain].reshape(len(below), -1, 2)
         rays = RayGrid(xy, pixels.row_share, pixels.boundary_xy)
         covered = cover(below.reshape(len(below), -1), view, maps, rays)
         blocks[~view.is_plain] = covered.reshape(below.shape)
@@ -283,7 +283,7 @@ class Renderer:
 # --- Sums, look-ups and shading of whole pictures ---
 
 
-def by_block(pixels: NDArray[Any]) -> NDArray[Any]:
+def as_blocks(pixels: NDArray[Any]) -> NDArray[Any]:
     """Return a view of a picture (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
     height, width, *rest = pixels.shape
     shape = (height // COARSE_PX, COARSE_PX, width // COARSE_PX, COARSE_PX, *rest)
@@ -291,7 +291,7 @@ def by_block(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 def cover(below: Picture, view: SheetView, maps: Array, rays: RayGrid) -> Picture:
-    """Return what the rays show, the sheet over `below`, as the mean over the exposure's maps."""
+    """Return `below` covered by the sheet along the rays, the mean over an exposure's `maps`."""
     texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
     seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
     alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
@@ -308,7 +308,7 @@ def mean_picture(pictures: Sequence[Picture]) -> Picture:
 
 
 def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
-    """Return a bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
+    """Return the texture's bilinear values at `texels` (h, w, 2) float32; outside by `border`."""
     remap: Any = cv2.remap  # its stub denies that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
@@ -334,7 +334,7 @@ STEP = 2.0**-17
 
 
 def round_pose(T_target_cam: Array) -> Array:
-    """Return the pose (4, 4) of a still camera, rounded."""
+    """Return a still camera's pose (4, 4), rounded to steps of `STEP`."""
     steps = np.full((3, 4), STEP)
     steps[:, 3] *= 2.0 ** np.floor(np.log2(max(abs(float(T_target_cam[2, 3])), 1e-3)))
     T = np.eye(4)
@@ -355,7 +355,7 @@ MAX_KERNEL_REACH_PX = 12
 
 
 def longest_path_px(motion_px: Array) -> float:
-    """Return the longest path of any of the places, `motion_px` (places, times, 2)."""
+    """Return the length of the longest path of the points `motion_px` (points, times, 2)."""
     steps = motion_px[:, 1:] - motion_px[:, :-1]
     return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
 

@@ -21,9 +21,9 @@ class Neighbour:
     """Another vehicle's target on the same ceiling.
 
     Attributes:
-        xy_m: its centre in the own target's axes.
+        xy_m: its centre in the axes of the vehicle's own target.
         yaw_rad: its heading less the own target's.
-        large_id, small_id: its markers', in the own ones' dictionaries; None: the same.
+        large_id, small_id: of its markers, in the own dictionaries; None: the own target's ids.
     """
 
     xy_m: tuple[float, float]
@@ -40,23 +40,23 @@ class Scenario:
     estimate starts there with heading zero *in the estimate's frame*, so
     `start_yaw_rad` turns the target instead: target_* are given in that frame.
 
-    A field with the name of a key of the profile (`perchctl.profile.SimulationConfig`) is what is
-    said there, one number of the key's range.
+    A field named as a key of `perchctl.profile.SimulationConfig` has the key's meaning, with one
+    number of its range.
 
     Attributes:
         target_xy_m, target_yaw_rad: centre and heading of the target.
         gear_body_m: tip of the magnet gear in body axes (its truth).
         T_body_cam_true: rows of the camera's true pose, mounting error included.
-        camera_mirrored: it gives its pictures flipped left to right.
+        camera_mirrored: the camera flips its pictures left to right.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world.Wind`).
-        first_contact_force_n: pull at the first contact; None means the same.
-        camera_freeze_at_s: from then on it gives its last picture; None means never.
-        parameters: the firmware's, where they differ from its release at boot.
+        first_contact_force_n: pull at the first contact; None: `magnet_force_n`.
+        camera_freeze_at_s: from then on the camera repeats its last picture; None: never.
+        parameters: firmware parameters that differ from the release's at boot.
         gyro_bias_radps, acc_bias_mps2: biases in body axes, of the gyroscope after and of the
             accelerometer before the firmware's calibration on the ground; only for a vehicle
             without a deck (`perchctl.sim.firmware.outside`).
-        target_above_ceiling_m: the target's plane lies so far above what the gear meets.
+        target_above_ceiling_m: height of the target's plane above the surface that the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
@@ -117,7 +117,7 @@ class Scenario:
     extra: dict[str, float] = field(default_factory=dict)
 
     def radio_bursts(self) -> RadioBursts | None:
-        """Return the times at which the flight's radio is silent; None where it loses nothing."""
+        """Return the times at which the flight's radio is silent; None without losses."""
         return (
             RadioBursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
         )
@@ -242,7 +242,6 @@ def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
 
 
 def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float]:
-    """The target's turns about the world's x and y."""
     tilt_rad = math.radians(float(rng.uniform(*sim.target_tilt_deg)))
     towards_rad = math.radians(float(rng.uniform(-180.0, 180.0)))
     if not tilt_rad:
@@ -254,7 +253,6 @@ def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float
 def _capture_holes(
     sim: SimulationConfig, rng: np.random.Generator
 ) -> tuple[tuple[float, float], ...]:
-    """Return begin and length of each hole."""
     if not sim.capture_hole_s[1]:
         return ()
     holes, t_s = [], 0.0

@@ -77,7 +77,7 @@ class Sheet:
         self._levels: dict[int, SheetTexture] = {}
 
     def texture(self, image_px_per_m: float) -> SheetTexture:
-        """Return the level that suits an image in which one metre spans that many pixels."""
+        """Return the sheet's texture at the resolution for an image of that scale."""
         ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
         # Level -1 is the finest resolution with single texels, for views nearer than it suits.
         level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
@@ -180,8 +180,9 @@ class PlacedSheet:
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
         """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
-        target's axes; None where it is out of view. `length_px` is the longest way of the picture
-        within the exposure."""
+        target's axes; None where it is out of view.
+
+        `length_px` is the picture's longest motion in the exposure."""
         if self.to_sheet is not None:
             turn, shift = self.to_sheet[:2, :2].T, self.to_sheet[:2, 2]
             nodes = nodes @ turn.astype(np.float32) + shift.astype(np.float32)
@@ -219,7 +220,7 @@ def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def union_box(boxes: Sequence[Box]) -> Box:
-    """Return the box that holds all of them."""
+    """Return the smallest box around all `boxes`."""
     rows, cols = (
         slice(min(each.start for each in spans), max(each.stop for each in spans))
         for spans in zip(*boxes, strict=True)
@@ -237,7 +238,7 @@ def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
 
 
 def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
-    """Return another vehicle's target; an id that is None is that of the own target."""
+    """Return another vehicle's target; an id None stands for the own target's id."""
     large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
     small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
     target = TargetConfig(

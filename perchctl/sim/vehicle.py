@@ -21,8 +21,8 @@ _PAST = 128  # control periods: longer than any exposure with its read-out
 
 
 class SimulatedVehicle:
-    """One simulated Crazyflie. Without a camera model it has no camera, without a capture's
-    settings nobody measures it from outside."""
+    """One simulated Crazyflie. Without a camera model it has no camera, without capture settings no
+    motion capture."""
 
     def __init__(
         self,

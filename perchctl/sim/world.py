@@ -81,7 +81,7 @@ class World:
 
     @property
     def height_m(self) -> float:
-        """How far the vehicle is above where it stands on the floor."""
+        """Height of the vehicle above its place on the floor."""
         return float(self.z_m - REST_HEIGHT_M)
 
     @property
@@ -91,7 +91,7 @@ class World:
 
     @property
     def battery_v(self) -> float:
-        """The battery's voltage under the load of now."""
+        """The battery's voltage under the present load."""
         return self.powertrain.cell.battery_v
 
     @property
@@ -164,7 +164,7 @@ class World:
         velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0),
         hold: bool = False,
     ) -> None:
-        """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
+        """Put the vehicle into a pose, not rotating; `hold` keeps it there until `let_go`.
 
         No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
         """
@@ -312,7 +312,7 @@ class Magnet:
 
     @property
     def hold_n(self) -> float:
-        """What it holds at contact, unless it has let go."""
+        """Force, N, that parts magnet and gear: at the first contact it may be less."""
         scenario = self._scenario
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
@@ -337,8 +337,8 @@ _WIND_STREAM = 1
 
 
 class Wind:
-    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations. Each
-    axis of a gust is a sum of sines, (amplitude m/s, pulsation rad/s, phase)."""
+    """A steady wind with gusts, each axis a sum of sines. Its speed is `Scenario.draught_mps` where
+    the gusts are at two standard deviations."""
 
     def __init__(self, scenario: Scenario) -> None:
         x, y, z = scenario.draught_mps

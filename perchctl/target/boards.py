@@ -69,7 +69,7 @@ class Board:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height of the print as meant, without the white around it."""
+        """Nominal width and height of the print, without the white margin."""
         columns, rows = self.squares
         return columns * self.square_m, rows * self.square_m
 
@@ -172,7 +172,7 @@ def _wrong(text: str, why: str) -> InvalidValue:
 
 
 def board_rectangles(board: Board) -> list[Rectangle]:
-    """Return the black area in metres, origin in the board's centre, x right and y up."""
+    """Return the black area as rectangles, m; origin in the board's centre, x right, y up."""
     columns, rows = board.squares
     width, height = board.size_m
     found: list[Rectangle] = []
@@ -197,6 +197,6 @@ def board_rectangles(board: Board) -> list[Rectangle]:
 
 
 def black_squares(board: Board) -> NDArray[np.bool_]:
-    """Return black squares (rows, columns), row 0 on top; markers fill the others row by row."""
+    """Return which squares are black (rows, columns), row 0 on top; markers fill the others."""
     columns, rows = board.squares
     return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)

@@ -19,10 +19,10 @@ from perchctl.target.sight import (
     BlindRange,
     FieldOfView,
     blind_range,
+    camera_rotation_and_gear,
     circle_outline,
-    rotation_and_gear,
+    reliable_side_px,
     square_outline,
-    sure_side_px,
 )
 from perchctl.vision import MARKERS, CameraModel
 
@@ -34,10 +34,10 @@ class TargetDesign:
 
     Attributes:
         blur_px: sigma of the picture's blur.
-        large_px, small_px: smallest sides, px, detected through that blur, found by trial.
+        large_px, small_px: smallest sides, px, that the detector finds in blurred trial pictures.
         z1_m, z2_m: farthest range of the large and of the small marker, at any turn.
-        z3_m: nearest of the whole large marker, at any turn; z3_upright_m where its sides
-            are parallel to the picture's.
+        z3_m: nearest range of the whole large marker, at any turn; z3_upright_m: with its sides
+            parallel to the picture's.
         small_nearest_m: nearest range from the gear's tip to the target at which the small marker
             is whole at any turn, the gear right under the target's centre.
         start_range_m: from the camera to the target at the start of the search, at the height
@@ -61,14 +61,14 @@ class TargetDesign:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence for each gap."""
+        """A sentence for each gap in which the target is not detected."""
         found: list[str] = []
         start_m = self.start_range_m
         far_m = self.z1_m
         if far_m is None or self.z2_m is None or self.z3_m is None:
             return ("a marker is never read through this blur: a sharper picture is needed",)
         if self.start_height_m == 0.0:
-            sure_px = sure_side_px(self.large_px)
+            sure_px = reliable_side_px(self.large_px)
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
         if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
             found.append(
@@ -95,7 +95,7 @@ class TargetDesign:
         return tuple(found)
 
     def record(self) -> dict[str, object]:
-        """Return ranges, gaps and blind range for machines; metres."""
+        """Return ranges, blind range and warnings as JSON values, metres."""
         names = ("z1_m", "z2_m", "z3_m", "z3_upright_m", "large_px", "small_px", "small_nearest_m")
         ranges = {name: getattr(self, name) for name in (*names, "start_range_m")}
         return ranges | {"blind": vars(self.blind), "warnings": list(self.warnings)}
@@ -174,7 +174,7 @@ def make_design(
         z2_m=None if small_px is None else f * small / small_px,
         z3_m=view.nearest_m(circle_outline(large), *ahead),
         z3_upright_m=view.nearest_m(square_outline(large), *ahead),
-        small_nearest_m=view.nearest_m(circle_outline(small), *rotation_and_gear(profile)),
+        small_nearest_m=view.nearest_m(circle_outline(small), *camera_rotation_and_gear(profile)),
         blind=blind_range(target, camera, profile),
         start_range_m=start_m,
         start_height_m=height_m,

@@ -53,7 +53,7 @@ class TargetDrawing:
         edges_m: lines of the grid, ascending, shape (n + 1,); the same for x and y.
         black: shape (n, n); row 0 is the top of the print (largest y).
         sheet_side_m: side of the white sheet, one cell of white around the marker.
-        ring_m: white around the small marker that is made for it.
+        ring_m: width of the white ring around the small marker, cut into the large one.
     """
 
     edges_m: Array
@@ -64,13 +64,13 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Return the exact share of black, 0..1, in size_px x size_px windows around the centre."""
+        """Return the exact share of black, 0..1, in each pixel's window, (size_px, size_px)."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Return the share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
+        """Return the sheet's share of each pixel's window, 0..1, (size_px, size_px)."""
         half = self.sheet_side_m / 2.0
         w = pixel_overlap(np.array([-half, half]), px_per_m, size_px, window_px)
         return np.asarray(w @ w.T)
@@ -158,7 +158,7 @@ def _merged(edges_m: Array) -> Array:
 
 
 def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> NDArray[np.bool_]:
-    """Return whether points lie in a black cell of a marker in the centre, shape of xs and ys."""
+    """True if points lie in a black cell of a marker in the centre, shape of xs and ys."""
     n = len(cells)
     col = np.floor((xs / side_m + 0.5) * n).astype(int)
     row = np.floor((0.5 - ys / side_m) * n).astype(int)
@@ -246,11 +246,10 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
 def print_scale(
     name: str, option: str, measured_m: float, spec_m: float, source: str
 ) -> tuple[float, list[str]]:
-    """Return a print's measured length over the length that it was meant to have by `source`, and
-    what to say of it; `name` and `option` name the length.
+    """Return a print's measured over its nominal length, and notes for the user, in which `name`
+    and `option` name the length, and `source` its nominal value's origin.
 
-    Raises InvalidValue for a scale that no printer makes: the length was not measured in the unit
-    that was meant.
+    Raises InvalidValue for a scale that no printer makes, as by a length in the wrong unit.
     """
     scale = measured_m / spec_m
     off = scale - 1.0

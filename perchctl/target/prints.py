@@ -26,9 +26,9 @@ def measured_target(
     nominal: TargetConfig, sides_m: Mapping[str, float]
 ) -> tuple[TargetConfig, list[str]]:
     """Return the target with the measured sides of ``large`` and ``small``, and notes for the
-    user. If both are given, its sizes count as measured.
+    user. With both sides given, `size_sigma` falls to `MEASURED_SIGMA`.
 
-    Raises InvalidValue for a size that cannot be this marker's.
+    Raises InvalidValue for a side that no printer makes of the nominal one.
     """
     notes, scales = [], {}
     target = nominal
@@ -93,7 +93,7 @@ class PrintCheck:
     _ratios: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, output: PipelineOutput | None) -> None:
-        """Count one more picture if both markers are in it, and refined."""
+        """Add a picture's ratio if it shows both markers with refined corners."""
         if output is None:
             return
         large = output.detections.large
@@ -102,7 +102,7 @@ class PrintCheck:
             self.add_corners(large.corners_px, small.corners_px)
 
     def add_corners(self, large_px: Array, small_px: Array) -> None:
-        """Count one more picture by its corners, (4, 2) px each."""
+        """Add a picture's ratio by its markers' corners, (4, 2) px each."""
         ratio = size_ratio(large_px, small_px, self.camera, self.target)
         if ratio is not None:
             self._ratios.append(ratio)
@@ -113,7 +113,7 @@ class PrintCheck:
         return len(self._ratios) >= MIN_FRAMES
 
     def error_and_text(self) -> tuple[bool, str]:
-        """Return whether the median ratio shows a print error beyond noise and bias, and a
+        """True if the median ratio shows a print error beyond noise and bias, and a
         sentence."""
         if not self.has_enough_frames:
             return False, (

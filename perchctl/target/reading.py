@@ -22,7 +22,7 @@ from perchctl.vision import MARKERS
 
 
 class ArucoReader:
-    """cv2.aruco by default parameters, with a dictionary of just its id for each marker."""
+    """Reads a target's markers by cv2.aruco with default parameters, searching their ids only."""
 
     def __init__(self, target: TargetConfig) -> None:
         dictionaries = [_single_marker_dictionary(m) for m in (target.large, target.small)]
@@ -66,8 +66,8 @@ _PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
 def smallest_side_px(
     target: TargetConfig, marker: str, blur_px: float, picture_px: int
 ) -> float | None:
-    """Return the side in px from which on the marker, seen straight on at any turn, is found in
-    `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
+    """Return the smallest side, px, at which the marker, facing the camera at any turn, is found in
+    `FOUND_RATE` of the pictures; None if even `SIDE_RANGE_PX[1]` is too small.
 
     Args:
         blur_px: sigma of lens, focus and link together.
@@ -109,7 +109,7 @@ def smallest_side_px(
 def sample_pictures(
     drawing: TargetDrawing, px_per_m: float, side_px: float, blur_px: float
 ) -> Iterator[NDArray[np.uint8]]:
-    """Yield `TRIALS` pictures around the centre, 3 times `side_px` wide, at any turn and offset."""
+    """Yield `TRIALS` pictures of the centre, 3 `side_px` wide, at various turns and offsets."""
     fine = 2 if blur_px >= 1.0 else 4
     size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
     n = size * fine
@@ -139,7 +139,7 @@ _READ_SIDE_PX = 480.0
 
 
 def check_target(target: TargetConfig, magnet_m: float) -> None:
-    """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
+    """Raise InvalidValue for the first reason why the target cannot be read or perched on."""
     large, small = target.large, target.small
     if magnet_m > large.side_m:
         raise InvalidValue(

@@ -22,7 +22,7 @@ _EDGE_POINTS = 200
 
 
 class FieldOfView:
-    """The picture's edge in view rays, as a distance from the axis in every direction."""
+    """The picture's edge, as the tangent of its angle from the camera's axis in each direction."""
 
     def __init__(self, camera: CameraModel, margin_px: float = MARGIN_PX) -> None:
         low = margin_px - 0.5
@@ -46,11 +46,11 @@ class FieldOfView:
         return bool((np.hypot(x, y) <= reach * z).all())
 
     def nearest_m(self, outline_m: Array, R: Array, offset_m: Array) -> float | None:
-        """Return the shortest distance d at which ``R (x, y, d) + offset`` is in the picture for
-        all points (x, y) of `outline_m` (n, 2) and from there on; None if for no distance."""
+        """Return the distance d from which on ``R (x, y, d) + offset`` is in the picture for all
+        points (x, y) of `outline_m` (n, 2); None without such a distance."""
 
         def seen(d: float) -> bool:
-            return self.contains(outline_at_height(outline_m, d) @ R.T + offset_m)
+            return self.contains(outline_points_3d(outline_m, d) @ R.T + offset_m)
 
         low, high = NEAREST_M, FARTHEST_M
         if not seen(high):
@@ -64,7 +64,7 @@ class FieldOfView:
 
 
 def square_outline(side_m: float) -> Array:
-    """Return points along an upright square, (n, 2)."""
+    """Return points along a square's sides, centred at 0, (n, 2)."""
     s = np.linspace(-0.5, 0.5, 21) * side_m
     h = np.full_like(s, side_m / 2.0)
     return np.concatenate([np.column_stack(pair) for pair in ((s, h), (s, -h), (h, s), (-h, s))])
@@ -76,9 +76,9 @@ def circle_outline(side_m: float) -> Array:
     return np.asarray(side_m / math.sqrt(2.0) * np.column_stack([np.cos(a), np.sin(a)]))
 
 
-def outline_at_height(outline_m: Array, height_m: float) -> Array:
-    """Return the outline's points at that height, (n, 3)."""
-    return np.column_stack([outline_m, np.full(len(outline_m), height_m)])
+def outline_points_3d(outline_m: Array, z_m: float) -> Array:
+    """Return the outline's points (x, y, `z_m`), (n, 3)."""
+    return np.column_stack([outline_m, np.full(len(outline_m), z_m)])
 
 
 # --- From the ground: where the target is the vehicle's positioning system, it has to be seen ---
@@ -94,18 +94,19 @@ LEAST_UP = 0.2
 """Of the view's upward part: a camera that looks farther aside sees no target over it."""
 
 
-def sure_side_px(detected_px: float | None = None) -> float:
-    """Return the smallest side, px, of a large marker that the search on the ground finds surely.
-    `detected_px`: the smallest detected through the camera's blur, if that was measured."""
+def reliable_side_px(detected_px: float | None = None) -> float:
+    """Return the smallest side, px, of a large marker that the search on the ground reliably finds.
+
+    `detected_px`: the smallest side detected through the camera's blur; None if not measured."""
     return SURE_PX if detected_px is None else max(SURE_PX, BLURRED * detected_px)
 
 
 def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) -> str:
-    """Return in words where a camera on the ground finds the large marker surely: up to which
+    """Return in words where a camera on the ground reliably finds the large marker: up to which
     height, and how far from the camera's axis at some heights."""
     side_m = target.large.side_m
     view = mount.T_body_cam[:3, 2]
-    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / sure_side_px()
+    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / reliable_side_px()
     lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
     axis = _directions(lean, STRAIGHT_DEG, ".0f", "deg")
     axis = f"leans {axis}" if axis else "points straight up"
@@ -123,8 +124,8 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
 def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
-    """Return how far off the camera's axis a marker of that side, that high above it, is wholly in
-    the picture at any turn; None if not even on the axis, or the camera does not look up."""
+    """Return how far off the axis of a camera, `height_m` below, a marker is wholly in the picture
+    at any turn; None if not even on the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -133,7 +134,7 @@ def overhead_reach_m(
 
     def seen(radius_m: float) -> bool:
         around = circle_outline(math.sqrt(2.0) * radius_m + side_m)
-        return field.contains((outline_at_height(around, 0.0) + axis) @ R)
+        return field.contains((outline_points_3d(around, 0.0) + axis) @ R)
 
     if not seen(0.0):
         return None
@@ -146,7 +147,7 @@ def overhead_reach_m(
 
 @dataclass(frozen=True)
 class TargetView:
-    """A target as a level vehicle at some place sees it.
+    """A target's position in the view of a level vehicle.
 
     Attributes:
         whole: whether one of its markers is wholly in the picture.
@@ -219,9 +220,9 @@ _STEP_M = 0.0005
 
 @dataclass(frozen=True)
 class BlindRange:
-    """Ranges from gear tip to target, m, below which the target is not measured any more: by
-    whole markers, `whole_m`, and by parts of them too, `left_m`. 0: measured down to contact;
-    None: not at all in the last 10 cm."""
+    """Ranges from gear tip to target, m, below which the target is no longer measured: `whole_m` by
+    whole markers only, `left_m` by visible parts too. 0: measured down to contact; None: not at all
+    in the last 10 cm."""
 
     whole_m: float | None
     left_m: float | None
@@ -241,13 +242,13 @@ def _blind_words(nearest_m: float | None) -> str:
 
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
     """Return the blind range of the profile's `camera.mount` and `vehicle.gear_body_m`."""
-    R, offset = rotation_and_gear(profile)
+    R, offset = camera_rotation_and_gear(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
 
     def whole(range_m: float) -> bool:
         return any(
-            view.contains(outline_at_height(each, range_m) @ R.T + offset) for each in outlines
+            view.contains(outline_points_3d(each, range_m) @ R.T + offset) for each in outlines
         )
 
     def left(range_m: float) -> bool:
@@ -266,15 +267,14 @@ def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
 
 
 def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
-    """Return true if the whole small marker is in the picture with the gear's tip `range_m` below
-    it."""
-    R, gear = rotation_and_gear(profile)
-    outline = outline_at_height(square_outline(profile.target.small.side_m), range_m)
+    """True if the whole small marker is in the picture with the gear `range_m` below it."""
+    R, gear = camera_rotation_and_gear(profile)
+    outline = outline_points_3d(square_outline(profile.target.small.side_m), range_m)
     return FieldOfView(camera).contains(outline @ R.T + gear)
 
 
-def rotation_and_gear(profile: Profile) -> tuple[Array, Array]:
-    """Return the rotation from body to camera axes, and the gear's tip in the camera's, m."""
+def camera_rotation_and_gear(profile: Profile) -> tuple[Array, Array]:
+    """Return the rotation (3, 3) from body to camera axes, and the gear's tip in the camera, m."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T
     return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])

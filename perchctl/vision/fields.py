@@ -42,7 +42,7 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
 def is_combed(image: Grey) -> bool:
-    """True if a picture's (h, w) rows differ far more between its fields than within one."""
+    """True if a picture (h, w) is woven of two fields: adjacent rows differ more than a field's."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False
@@ -65,14 +65,14 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """Return the top and bottom field, each (h, w), of a combed picture, else the picture."""
+    """Return a combed picture's top and bottom field, each (h, w), or else just the picture."""
     if not is_combed(image):
         return (image,)
     return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
 def interpolate_field(image: Grey, first_row: int) -> Grey:
-    """Return one field at full height: its own rows stay, those between are interpolated."""
+    """Return the field that begins at `first_row`, with its missing rows interpolated."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -86,12 +86,12 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Return the spread of an edge along the rows of a field, by its blur."""
+    """Return an edge's standard deviation along an interpolated field's rows, given its blur."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
 def classify_fields(frame: Frame) -> Frame:
-    """Return the frame with `fields` set to what it is."""
+    """Return the frame with `fields` set to ``woven`` or ``whole``, unless it is set."""
     if frame.fields is not None:
         return frame
     return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
@@ -106,10 +106,10 @@ def field_frames(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return the pictures of a stream's frame, in their order of time: one, or two fields.
+    """Return the new state, and the pictures of a stream's frame in time order: one, or two fields
+    half a period apart around the frame's time.
 
-    The frame's time is the middle between its fields. In a stream in which none was seen yet,
-    every third frame is looked at.
+    In a stream without fields so far, only every third frame is examined.
     """
     skip = frame.fields is None and state.kind == "whole" and state.skipped + 1 < _EVERY
     frame = replace(frame, fields="whole") if skip else classify_fields(frame)
@@ -133,7 +133,6 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
 
 
 def _period_s(periods_s: tuple[float, ...]) -> float:
-    """The frames' period, perhaps television's."""
     if not periods_s:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
@@ -154,7 +153,6 @@ def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
 
 
 def _voted(state: FieldState, frame: Frame) -> FieldState:
-    """The state with this evidence about the order."""
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:

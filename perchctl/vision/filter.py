@@ -51,7 +51,7 @@ _HEADING_RADPS2 = 0.1  # of the state estimate's heading
 @dataclass(frozen=True)
 class ProcessNoise:
     """Standard deviations of accelerations: of a tracked target along each axis, of its heading,
-    and of the frame's rotation about level axes."""
+    of the frame's rotation about level axes. `is_drifting`: the frame is the drifting world."""
 
     acceleration_mps2: float
     heading_radps2: float
@@ -68,9 +68,8 @@ class ProcessNoise:
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
     """R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2) in SI;
-    P0 (8, 8) is the covariance after the first measurement.
-
-    `process` replaces Q, and a pose's own covariance R, where it is not None.
+    P0 (8, 8) is the covariance after the first measurement. If `process` is not None, it replaces
+    Q, and each pose's own covariance replaces R.
     """
 
     R: Array
@@ -94,8 +93,8 @@ class Measurement:
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
-    """Return the filter's constants. At first sight, a target in the world stands nearly still (5
-    cm/s); one in the level frame moves as the vehicle does (30 cm/s), or as a hand."""
+    """Return the filter's constants. The velocity's first sigma is 5 cm/s in the world, and in the
+    level frame 30 cm/s, or 1 m/s with measured noise."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -121,7 +120,7 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
 
 
 def tilt_jacobian(way_m: Array) -> Array:
-    """Return the Jacobian (3, 2), m/rad, of a vector (3,) by rotation about level x and y."""
+    """Return the Jacobian (3, 2), m/rad, of a vector `way_m` (3,) rotated about level x and y."""
     x, y, z = way_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
@@ -132,7 +131,7 @@ def transition_matrix(dt_s: float) -> Array:
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """Return Q (8, 8) of a step, for a target at `position_m` (3,)."""
+    """Return the process noise Q (8, 8) over `dt_s` of a target at `position_m` (3,)."""
     noise = setup.process
     if noise is None:
         return setup.Q
@@ -178,16 +177,16 @@ def step_track(
     t_s: float,
     setup: FilterSetup,
 ) -> MarkerTrack | None:
-    """Return the track after one frame's prediction and, where the marker was seen, its update.
+    """Return the track predicted to a frame's time and, if the marker was measured, updated.
 
     Args:
-        track: the track so far, None before the first sight.
-        measured: None, or not finite, where nothing was seen.
+        track: the track so far, None before the first measurement.
+        measured: None, or not finite, if the marker was not measured.
         t_s: the frame's time.
 
-    Returns None when there is nothing (left) to track: never seen, or unseen for more
-    than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
-    track changes nothing. A gap beyond `MAX_TRACK_GAP_S` in either direction starts afresh.
+    Returns None without a track: never measured, or unseen for more than `n_max` frames (equation
+    3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap beyond
+    `MAX_TRACK_GAP_S` in either direction starts afresh.
     """
     if measured is not None and not finite(measured.z):
         measured = None

@@ -38,7 +38,7 @@ def undistort_px(points_px: Array, camera: CameraModel) -> Array:
 
 
 def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2) of the pinhole `K`."""
+    """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole with the camera's `K`."""
     K = camera.K
     result = np.empty_like(normalised)
     result[:, 0] = K[0, 0] * normalised[:, 0] + K[0, 1] * normalised[:, 1] + K[0, 2]
@@ -54,7 +54,7 @@ def distort(normalised: Array, camera: CameraModel) -> Array:
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """Project points (n, 3) of a frame with pose rvec, tvec in the camera to pixels (n, 2)."""
+    """Return the pixels (n, 2) of points (n, 3) in a frame of pose rvec, tvec in the camera."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _projected(points, rvec, tvec, camera)

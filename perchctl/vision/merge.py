@@ -34,8 +34,10 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame: `vector` (x, y, z, yaw), velocity, covariances; `bias_m`
-    (3, 4) of the position."""
+    """The target in the tracks' frame: `vector` (x, y, z, yaw), velocity (3,), covariance (3, 3) of
+    the position and variance of the yaw.
+
+    `bias_m` (3, 4): shift of the position by one standard deviation of each constant error."""
 
     vector: Array
     velocity_mps: Array
@@ -54,7 +56,7 @@ def measure_markers(
     config: MergeConfig,
     setup: PoseSetup,
 ) -> MeasuredMarkers:
-    """Solve the poses of what a frame shows, and choose the tracks that they feed.
+    """Solve the poses of a frame's markers, and choose the tracks that these poses update.
 
     `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,) is
     the target's normal in the last pose, in the camera's axes at that time.
@@ -101,7 +103,7 @@ def merge_tracks(
     tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
 ) -> MergedTarget | None:
     """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
-    `fed` update, or else from those measured last; None if none."""
+    `fed` update, or else from the tracks measured last; None without tracks."""
     if not tracks:
         return None
     least = min(track.unseen for track in tracks.values())
@@ -147,9 +149,10 @@ FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 
 
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the markers with corners as at the frame's time. `setup.readout_s` is from a picture's
-    first row to its last; if None the corners are not moved, and `common_px` holds the shift by a
-    likely read-out, otherwise the error that the motion's uncertainty leaves."""
+    """Return the markers with their corners moved to the frame's time.
+
+    If `setup.readout_s` is None, the corners stay, and `common_px` is their shift by a likely
+    read-out time; otherwise `common_px` and the spread hold the shift's error."""
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
@@ -186,7 +189,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 
 
 def detected_stage(large: bool, small: bool) -> Stage:
-    """Return the stage that follows from which markers were detected."""
+    """Return the stage in which just these markers are detected."""
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
@@ -201,7 +204,7 @@ def weight_matrix(weights: WeightsConfig) -> Array:
 
 
 def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8; the yaw on the circle."""
+    """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8, the yaws as angles."""
     W = weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
@@ -210,7 +213,7 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
     """True if the markers are farther apart than the limit and than four standard
-    deviations, in any axis. What is wrong with the print moves both alike, and excuses no gap."""
+    deviations, in any axis. The print's errors move both alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])

@@ -55,7 +55,7 @@ SEVERAL = "more than one target in view: the one that was tracked is followed"
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What no frame changes, made once by `make_pipeline`."""
+    """The pipeline's constants, made by `make_pipeline`."""
 
     detector: DetectorSetup
     pose: PoseSetup
@@ -69,8 +69,9 @@ def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
     """Return the profile's pipeline for a calibrated camera; several streams may share it.
-    `covered` is what `camera.mask` holds in the camera's own pictures, else that is read.
-    Errors: NotFound, InvalidValue (`camera.mask`)."""
+
+    `covered`: pixels (h, w) that the vehicle covers in the camera's pictures; None: read
+    `camera.mask`. Errors: NotFound, InvalidValue (`camera.mask`)."""
     pose = PoseSetup(
         config=profile.pose,
         target=profile.target,
@@ -131,11 +132,10 @@ def pictures(
 def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run one frame, and return the new memory and what it gave. `attitude` is the vehicle's at the
-    frame's time, None without one.
+    """Process a frame; return the new state and the frame's output.
 
-    Without an attitude the vehicle counts as level and at rest: the filter then works
-    in the level frame, whatever `kalman.frame` says.
+    If `attitude`, the vehicle's at the frame's time, is None, the vehicle counts as level and at
+    rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
     frame = classify_fields(frame)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
@@ -157,7 +157,8 @@ def step_detections(
     near: PoseCandidate | None = None,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` after detection; `near` is the expected pose of the target."""
+    """Run the part of `step` after detection; `near` is the target's expected pose, `fields` the
+    picture's kind."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
     measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
@@ -216,9 +217,9 @@ def estimate(
 ) -> TargetEstimate | None:
     """Return the target at a moment after the newest frame, for the vehicle's attitude of then.
 
-    A tracked target is predicted by its filter and carried on by the vehicle's motion. One that
-    is no longer tracked stays in the world where it was last. None when none was seen yet.
-    Without `spread` that is left as it was at the newest frame: nothing steers by it.
+    A tracked target is predicted by its filter and carried on by the vehicle's motion. A target no
+    longer tracked stays at its last place in the world. None before the first measurement. Without
+    `spread` the standard deviations stay those of the newest frame.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:

@@ -33,7 +33,8 @@ _Source = Literal["large", "small", "joint"]
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
     """The constants of pose estimation: `T_body_cam` (4, 4), the camera's mounting, `gear_body_m`
-    (3,), the gear's tip, and `readout_s` from a picture's first row to its last, if known."""
+    (3,), the gear's tip, and `readout_s`, from a picture's first row to its last (None:
+    unknown)."""
 
     config: PoseConfig
     target: TargetConfig
@@ -76,10 +77,9 @@ def estimate_pose(
 ) -> MarkerPose | None:
     """Return the pose from one marker's corners, or from both markers' corners at once.
 
-    `start` is a pose of the same frame whose tilt is already decided (the joint one):
-    it is refined on these corners instead of solving anew.
-    None where the corners give no pose: no finite solution in front of the camera, or
-    a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
+    `start`, the same frame's joint pose, is refined on these corners instead of solving anew, as
+    its tilt is already decided. None if the corners give no pose: no finite solution in front of
+    the camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
     """
     source: _Source = "joint" if len(detections) > 1 else detections[0].marker
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
@@ -222,7 +222,7 @@ class ScoredPose(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """Expected normal (3,) of the marker, camera axes, and its tolerance."""
+    """Expected normal (3,) of the marker, camera axes, None if unknown, and its tolerance."""
 
     normal_cam: Array | None
     spread_rad: float
@@ -236,7 +236,7 @@ class TiltPrior:
 
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
-    """Return the better of the two possible tilts of a planar marker."""
+    """Return the better of a planar marker's two possible poses; None if neither is valid."""
     candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
@@ -290,12 +290,11 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
-    """Return the pose's covariance, its chi2 and the effect of the sheet's curl.
+    """Return the covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and
+    the pose's change (6,) by one standard deviation of the sheet's curl.
 
-    These are the covariance (6, 6) of (rvec, tvec), the squared error per degree of freedom, and
-    the change (6,) by one standard deviation of the curl. In the covariance are the corners'
-    noise (more, if the residuals show more), shifts that all corners share, and a twist of the
-    sheet; its curl is not.
+    The covariance covers the corners' noise (at least as large as the residuals), shifts that all
+    corners share, and a twist of the sheet, but not its curl.
     """
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
@@ -346,13 +345,11 @@ def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
 
 
 def _usable(candidate: PoseCandidate) -> bool:
-    """True if the candidate is finite and in front of the camera."""
     rvec, tvec = candidate.rvec, candidate.tvec
     return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
 
 
 def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
-    """The candidate refined by OpenCV, or as it was."""
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
@@ -362,7 +359,6 @@ def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
 
 
 def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
-    """The candidate with what it leaves over of the corners."""
     rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
@@ -385,7 +381,6 @@ def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]
 
 
 def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPrior) -> ScoredPose:
-    """The best candidate by corners and tilt."""
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -412,7 +407,7 @@ def curl_lift(object_m: Array, curl_per_m: float) -> Array:
 
 
 def curl_weight(curl: Array) -> Array:
-    """Return the corner errors' weights (2n, 2n), inverse of ``I + curl curl^T``; curl (2n, k)."""
+    """Return ``(I + curl curl^T)^-1`` (2n, 2n), the weights of corner errors; curl (2n, k)."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
@@ -441,8 +436,8 @@ class WeightedCorners:
     """Corners object_m (n, 3) on the target and image_px (n, 2) of a pinhole K, with spreads
     sigma_px (n,). whitening (2n, 2n) makes errors independent and of unit spread; shift (2n, k)
     holds one whitened standard deviation of each common error: the shift of all edges, the
-    detections' `common_px`, and the shake of each one's rows; `curl_lift_m` (2n, 2) is of
-    `curl_lift`, and `curled` tells whether it weighs the corners."""
+    detections' `common_px`, and the shake of a detection's rows. `curl_lift_m` (2n, 2) is
+    `curl_lift`'s result, and `curled` tells if the curl changes the corners' weights."""
 
     object_m: Array
     image_px: Array

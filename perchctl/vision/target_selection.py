@@ -46,7 +46,7 @@ def marker_offset_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return a marker's distance from the own target's place: an `OwnOffset`."""
+    """Return a marker's distance from the own target's place (an `OwnOffset`), m."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
@@ -67,7 +67,7 @@ def target_offset_m(
 def refusal_text(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Return why a pose is another vehicle's target; None if it is the own."""
+    """Return why a pose is another vehicle's target; None for the own target."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = target_offset_m(pose, attitude, place, setup)
@@ -90,8 +90,8 @@ _YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 def to_world(
     e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Return position (3,) and heading of a target in the world of the state estimate, from those
-    relative to the gear in the level frame."""
+    """Convert a target's position (3,) and heading, relative to the gear in the level frame, to the
+    world of the state estimate."""
     way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -100,8 +100,8 @@ def to_world(
 def to_level(
     position_m: Array, yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Return position (3,) and heading of a target relative to the gear in the level frame, from
-    those in the world; the inverse of `to_world`."""
+    """Convert a target's position (3,) and heading in the world to the level frame, relative to the
+    gear; the inverse of `to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     way = (position_m - np.asarray(attitude.position_m)).dot(attitude.R_world_level)
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)

@@ -39,8 +39,8 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in either frame, whether there is a gate, and the place of the
-    vehicle's own target."""
+    """The filters' constants in the level and the world frame, whether a gate judges poses, and the
+    place of the vehicle's own target."""
 
     level: FilterSetup
     world: FilterSetup
@@ -49,7 +49,7 @@ class TrackSetup:
     own_place: OwnTargetPlace
 
     def constants(self, in_world: bool) -> FilterSetup:
-        """Return the filters' constants in the tracks' frame."""
+        """Return the filters' constants in the world or the level frame."""
         return self.world if in_world else self.level
 
 
@@ -158,8 +158,9 @@ class FramePose:
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
-    restart there, and if so for the same target. A rejected pose goes to `rival`; `text`
-    explains what is unusual."""
+    restart at it, and if so for the same target.
+
+    `rival` is the rival track after this frame; `text` explains a rejection or a restart."""
 
     accepted: bool
     restarts: bool = False
@@ -254,7 +255,6 @@ class _Fit:
 
 
 def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fit:
-    """Return by how much the pose is off from what a track foresees."""
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The most that it drifts counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
@@ -363,7 +363,9 @@ def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Return both markers' expected corners, (4, 2) px, and their pose: the last sighting, moved by
-    the vehicle's motion. Without an attitude at both times: unmoved, and no corners."""
+    the vehicle's motion.
+
+    Without both attitudes: None and the unmoved pose; without a recent sighting: both None."""
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude
@@ -389,7 +391,7 @@ def expected_corners(
 def update_sighting(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
-    """Return the new sighting, with the updated errors of the estimated motion."""
+    """Return the sighting of a new pose, with the errors of the estimated motion since `before`."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s

@@ -43,7 +43,7 @@ class CameraModel:
     model: str = "plumb_bob"
 
     @property
-    def contents(self) -> tuple[tuple[int, int], str, bytes, bytes]:
+    def calibration_key(self) -> tuple[tuple[int, int], str, bytes, bytes]:
         """A hashable value, equal for cameras with the same calibration."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
@@ -54,12 +54,13 @@ class Frame:
     """One picture. `t_s` is the time of exposure on the loop's clock, as far as
     known: time of arrival less the profile's `camera.latency_s`.
 
-    `image` is grey, uint8, shape (height, width). `fields` says whether it is a picture of one
-    moment: ``whole``; ``woven`` of two fields; the ``top`` or ``bottom`` field of such a one
-    at full height; None: not classified yet (`perchctl.vision.fields`). `repeated`: the
-    source gave the previous picture again, which is no measurement. `encoded`: the
-    JPEG that came, where `cv2.imdecode(..., IMREAD_GRAYSCALE)` of it is `image` to the bit; who
-    changes the image leaves it out.
+    `image` is grey, uint8, shape (height, width).
+
+    `fields` says whether it is a picture of one moment: ``whole``; ``woven`` of two fields; a woven
+    picture's ``top`` or ``bottom`` field at full height; None: not classified yet
+    (`perchctl.vision.fields`). `repeated`: the source gave the previous picture again, which is no
+    measurement. `encoded`: the source's JPEG, from which `cv2.imdecode(..., IMREAD_GRAYSCALE)`
+    gives exactly `image`; None without one, or for a changed image.
     """
 
     index: int
@@ -105,7 +106,7 @@ class EdgeShift:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What was found of the target in one frame."""
+    """The target's markers as detected in one frame."""
 
     frame_index: int
     t_s: float
@@ -168,12 +169,11 @@ class MarkerPose:
         e_m: target relative to the gear in the level frame, (3,).
         e_yaw_rad: heading of the target's x axis in the level frame.
         sigma_m: standard deviation of `e_m`, (3,); sigma_yaw_rad likewise.
-        reprojection_px: RMS over the corners used.
-        chi2: their squared errors in units of their spread, per degree of freedom.
+        reprojection_px: RMS error of the corners.
+        chi2: the corners' squared errors over their variances, per degree of freedom.
         cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
-        print_m: by how much one standard deviation of the print's errors moves `e_m`, (3, 2):
-            its size's, and of the sheet's curl. Included in `sigma_m` and `cov`, but the same
-            in every frame.
+        print_m: shift of `e_m` by one standard deviation of the print's size and of the sheet's
+            curl, (3, 2). Included in `sigma_m` and `cov`, but the same in every frame.
         camera_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the print's.
     """
 
@@ -197,10 +197,10 @@ class MarkerTrack:
     """A marker's Kalman filter between two frames (paper, section II-A.1).
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI,
-    indexed by the names in `perchctl.vision.filter`. P (8, 8) is what the noise of
-    measurements and motion leaves open; `bias` (8, 4), by how much one standard deviation
-    of each constant error has moved the state: of the vehicle's roll and pitch, of the print's
-    size and of its curl. `unseen` counts the frames since the last measurement.
+    indexed by the names in `perchctl.vision.filter`. P (8, 8) is its covariance by the noise of
+    measurements and motion; `bias` (8, 4) is the state's shift by one standard deviation of each
+    constant error: the vehicle's roll and pitch, the print's size and curl. `unseen` counts the
+    frames since the last measurement.
     """
 
     t_s: float
@@ -217,25 +217,25 @@ class MarkerTrack:
 
 @dataclass(frozen=True, eq=False)
 class TargetEstimate:
-    """Where the target is at `t_s`: the paper's e = (e_x, e_y, e_z, e_psi), and its
+    """The target's position and heading at `t_s`, the paper's (e_x, e_y, e_z, e_psi), and their
     spread.
 
     Attributes:
-        t_s: the time it holds for; of the frame, or later by prediction.
+        t_s: the estimate's time: the frame's, or later by prediction.
         measured_s, small_measured_s: exposure of the last frame in which the target, and
             its small marker, were measured.
-        stage: what the newest frame was merged from; ``NONE`` while the filter coasts.
+        stage: markers measured in the newest frame; ``NONE`` while the filter coasts.
         measured: the newest frame held a detection of the target.
-        tracked: the filter lives: the target was measured at most `kalman.n_max` frames
-            ago. False is the place where it was last.
+        tracked: the target was measured at most `kalman.n_max` frames ago. If False, the estimate
+            is the target's last place.
         unseen: frames since the last detection.
         e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,).
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: filter's velocity of `e_m` (`kalman.frame: level`) or of the
             target in the world (`kalman.frame: world`), in level axes, (3,).
         world_m, world_yaw_rad: the target in the world of the vehicle's state estimate;
-            None without an attitude. world_velocity_mps: how that world drifts against
-            the target, None where the filter does not work in it.
+            None without an attitude. world_velocity_mps: drift of that world against the target,
+            None if the filter works in the level frame.
     """
 
     t_s: float
@@ -270,8 +270,8 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class Lock:
-    """The target that the pipeline is locked on: its track after the last pose, in the world or
-    the level frame, the number of `frames` with a pose, and whether one had both markers."""
+    """The target that the pipeline is locked on: its last track and pose, in the world or the level
+    frame, the number of `frames` with a pose, and whether one had both markers."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -283,8 +283,8 @@ class Lock:
 @dataclass(frozen=True, eq=False)
 class RivalTrack:
     """A track of something that looks like the target, but at a place where the target cannot be
-    (`text`): its first time, its frames, those with both markers, and whether its range differs
-    from the target's."""
+    (`text`): its first time, numbers of its frames and of those with both markers, and whether its
+    range differs from the target's."""
 
     track: MarkerTrack
     in_world: bool
@@ -313,9 +313,9 @@ class MeasuredMarkers:
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """State of the interlacing detection of a stream. `top_first` is None until the `votes`
-    decide, `kind` is that of the last examined frame, `skipped` frames ago; `previous` is the
-    last combed picture."""
+    """State of a stream's interlacing detection: `kind` of the last examined frame, `skipped`
+    frames ago; whether the top field is first, None until the `votes` decide; the frames' last
+    periods; the time `last_s` and picture of the `previous` woven frame."""
 
     kind: PictureKind | None = None
     skipped: int = 0

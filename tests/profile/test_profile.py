@@ -204,7 +204,7 @@ def test_a_profile_in_an_old_log_is_read() -> None:
     values = load_profile("sim").model_dump(mode="json")
     values["simulation"] |= {"set": "extreme", "gust_mps": [0.2, 0.6], "drift_xyz_mps": None}
     values["planner"]["ascend"]["near_m"] = 0.35
-    assert Profile.lost_texts(values) == []
+    assert Profile.constant_key_errors(values) == []
     values["planner"]["ascend"]["near_m"] = 0.5
     log = FlightLog(Path("f.jsonl"), {"profile": values}, [], [], None, True)
     with pytest.warns(Note, match=r"planner\.ascend\.near_m"):

@@ -121,7 +121,7 @@ def _saturated(value: float) -> float:
 
 @dataclass(slots=True)
 class Estimate:
-    """The state estimate in the firmware's units, written once a step."""
+    """The state estimate in the firmware's units: m, m/s, degrees, pitch nose up."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -138,7 +138,7 @@ class Estimate:
 
 
 class Controller:
-    """Setpoint and estimate in, four thrust requests out, in units of the thrust command."""
+    """Computes four thrust requests, in units of the thrust command, from setpoint and estimate."""
 
     def __init__(self) -> None:
         dt, pt, tilt = ATTITUDE_DT_S, POSITION_DT_S, TILT_MAX_DEG * _OVERHEAD
@@ -244,7 +244,7 @@ _N_PER_COMMAND = MOTOR_FORCE_N / FULL_COMMAND
 
 
 class MotorDriver:
-    """Turns thrust requests into duty cycles, by the battery's voltage that it has filtered."""
+    """Turns thrust requests into duty cycles, by the filtered battery voltage."""
 
     def __init__(self) -> None:
         # Low-passed with 0.1 s: the compensation meets a sagging battery late.

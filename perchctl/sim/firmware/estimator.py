@@ -66,14 +66,14 @@ class Estimator:
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
-        """Forget drift and outside corrections, as `kalman.resetEstimation` does."""
+        """Forget drift and external positions, as `kalman.resetEstimation` does."""
         self._reset_s = t_s
         self._drift_s = 0.0
         if self.outside is not None:
             self.outside.reset()
 
     def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
-        """Take one measurement from outside; only a vehicle without a deck uses it."""
+        """Take an external position, or pose; only a vehicle without a deck uses it."""
         if self.outside is not None and self._parameters["stabilizer.estimator"] == KALMAN:
             self.outside.update_position(position_m)
             if quaternion is not None:
@@ -87,8 +87,8 @@ class Estimator:
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """Return the variance of a state, in the order of `Covariance`. All states of a deck's
-        estimate have the same one, which falls after a reset."""
+        """Return the variance of a state, in the order of `Covariance`. With a deck all states have
+        the same variance, which falls after a reset."""
         if self.outside is not None:
             return float(self.outside.covariance[state, state])
         age_s = t_s - self._reset_s

@@ -48,10 +48,10 @@ height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling").""
 
 
 class Imu:
-    """`add` takes a control period's truth; after `IMU_EVERY` of them `read` gives their mean.
+    """`add` takes a control period's true motion; `read` gives the mean of `IMU_EVERY` periods.
 
-    `gyro_bias_radps`, `acc_bias_mps2`: what is read too much, body axes; `acc_scale`: by how much
-    the firmware divides.
+    `gyro_bias_radps`, `acc_bias_mps2`: constant errors, body axes; `acc_scale`: the firmware's
+    divisor of the acceleration.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -78,7 +78,7 @@ class Imu:
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
-        """Return the mean of what was added since the last reading, with the errors."""
+        """Return the mean of the values added since the last reading, with the sensors' errors."""
         if len(self._white) < 6:
             self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
         take = self._white.pop
@@ -128,7 +128,7 @@ class ExternalFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Begin again at the place and heading of `kalman.initial*`, level and at rest."""
+        """Start anew at the position and heading of `kalman.initial*`, level and at rest."""
         m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
         self.covariance = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
         names = ("X", "Y", "Z", "Yaw")

@@ -21,7 +21,7 @@ class AxisState(NamedTuple):
 
 
 class Polynomial:
-    """From a state at t = 0 to rest at `goal` at t = T; no jerk at either end."""
+    """An axis' way from a state at t = 0 to rest at `goal` at t = T; no jerk at either end."""
 
     def __init__(self, start: AxisState, goal: float, duration_s: float) -> None:
         self.goal = goal
@@ -53,7 +53,7 @@ class Polynomial:
 
 
 class HighLevelPlanner:
-    """States idle, flying, landing; setpoints for the commander at 100 Hz."""
+    """Plans with states idle, flying and landing; setpoints for the commander at 100 Hz."""
 
     def __init__(self) -> None:
         self.state = IDLE
@@ -94,7 +94,7 @@ class HighLevelPlanner:
         t_s: float,
         state: int = FLYING,
     ) -> bool:
-        """Plan the way to a height in `state`; False if refused. `yaw_rad` None: same heading."""
+        """Plan the way to a height, in `state`; False if refused. `yaw_rad` None: same heading."""
         if self.blocked or self.state not in ((IDLE, FLYING) if state == LANDING else (IDLE,)):
             return False
         x, y, z, yaw = (AxisState(axis.value) for axis in self._now)

@@ -53,7 +53,7 @@ _IN_FLIGHT = frozenset({State.FLYING, State.LEVEL_OUT})
 
 
 class Supervisor:
-    """`update` is called at 25 Hz; everything else only records."""
+    """The firmware's supervisor; `update` runs at 25 Hz, the other methods only record."""
 
     def __init__(self) -> None:
         self.state = State.NOT_INITIALIZED
@@ -90,7 +90,7 @@ class Supervisor:
         setpoint_age_s: float,
         acc_g: tuple[float, float, float],
     ) -> bool:
-        """True when this update ended a flight by a crash or a disarm."""
+        """Update the state; True if a crash or a disarm ended a flight."""
         if motors_running:
             self._thrust_s = t_s
         flying = self._thrust_s is not None and t_s - self._thrust_s < FLYING_MEMORY_S - _TICK_S

@@ -20,7 +20,7 @@ PARAMETER_COUNT = 257
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: its C type, value at boot, and whether it can be written or kept."""
+    """One parameter: its C type, value at boot, and whether it is read-only or storable."""
 
     ctype: str
     default: float
@@ -74,7 +74,7 @@ PARAMETERS = _parameters()
 
 @dataclass(frozen=True)
 class LogVariable:
-    """One log variable: its C type, and what reads its value off a `Firmware`."""
+    """One log variable: its C type, and the function that reads it from a `Firmware`."""
 
     ctype: str
     read: Callable[[Any], float] = lambda firmware: 0.0

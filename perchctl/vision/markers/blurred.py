@@ -43,8 +43,9 @@ _SHEET = 1.3  # half sides of a marker that are surely paper
 def find_expected_blurred(
     picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first marker near to where it is expected (4, 2) px. Fits that begin with little
-    and with much blur take turns; without a `turn`, both are tried."""
+    """Return the first marker found near its `expected` corners (4, 2) px; empty if none.
+
+    An even or odd `turn` chooses fits that start with little or with much blur; None: both."""
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
@@ -64,7 +65,7 @@ def find_expected_blurred(
 
 
 def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """Return a marker anywhere: the best of all quadrilaterals."""
+    """Return the marker that the best of the picture's quadrilaterals shows; empty if none does."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -166,7 +167,7 @@ def align_marker(
     max_sigma: float = _MAX_SIGMA,
     alone: bool = True,
 ) -> RefinedCorners | None:
-    """Return the marker by its drawing, None unless the picture looks like it.
+    """Return the marker fitted by its drawing; None unless the picture looks like the drawing.
 
     `reach` is the allowed distance of the corners from `start_px`, and `max_sigma` their
     largest spread, both in sides. If `alone`, the codeword must be distinctive; otherwise the
@@ -214,6 +215,6 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
 
 
 def is_distinctive(found: Alignment) -> bool:
-    """True if another codeword would look different. Of 36 others that `is_verified` took
-    for the marker, all had a flip above 0.5."""
+    """True if another codeword would look different. Of 36 other markers that `is_verified`
+    accepted, all had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA

@@ -44,7 +44,7 @@ def homography_to_unit(corners: Array) -> Array:
 
 
 def apply_homography(H: Array, points: Array) -> Array:
-    """Return the points (..., 2) through a homography."""
+    """Return the points (..., 2) mapped by the homography."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
@@ -84,7 +84,7 @@ def doubled_area(corners: Array) -> Array:
 
 
 def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """Return True if all corners (4, 2) are at least `room_px` inside the picture's edges."""
+    """True if all corners (4, 2) are at least `room_px` inside the picture's edges."""
     h, w = shape[:2]
     right, low = w - 1 - room_px, h - 1 - room_px
     # False for NaN.

@@ -51,7 +51,7 @@ def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraMo
 def is_target_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """Return True if each expected marker (4, 2) px may be cut by the picture's edge or hidden
+    """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden
     by the vehicle's gear."""
     whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(is_hidden(hidden, c) for c in whole)
@@ -65,7 +65,7 @@ def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -
 def fit_cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the target's visible part and return the corners of one marker, computed from it.
+    """Fit the target's visible part; return one marker's corners by that fit, empty if it fails.
     `expected` are the predicted corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
@@ -94,8 +94,8 @@ def fit_cut_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """Return True if the visible part of the target is enough to measure it, for a large marker
-    with these axes (3, 3) and this centre (3,) in the camera."""
+    """True if the visible part of the target is enough to measure it, for a large marker
+    with the rotation (3, 3) and centre (3,) in the camera frame."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
     found = predict_fit(pose, _outline(patterns), camera)
@@ -123,7 +123,6 @@ def _stands_for(found: PoseFit) -> MarkerName:
 def _start(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
-    """The pose that goes with expected corners."""
     name: MarkerName = "small" if "small" in expected else "large"
     rays = undistort(expected[name], camera)
     if not np.isfinite(rays).all():
@@ -205,8 +204,10 @@ _LEAST_NODES = 200  # that show paper
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on.
-    Beyond `reach` a lens model may fold back; `size` is the reduced picture's (width, height)."""
+    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on. (`x`,
+    `y`): places of their samples in the picture reduced to `size` (width, height).
+
+    `inside` marks nodes in the picture. Beyond `reach` a lens model may fold back."""
 
     first: Array
     step: float
@@ -219,7 +220,8 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A reduced picture: grey values (rows, columns) at a lattice's nodes, `seen` if uncovered."""
+    """A reduced picture: grey values (rows, columns) at a lattice's nodes; `seen` if the node is in
+    view and uncovered."""
 
     lattice: Lattice
     grey: Grey
@@ -281,13 +283,12 @@ def _looked_up(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
 
 
 def _coarse(fine: Grey) -> Grey:
-    """The mean of the samples of each node."""
     rows, columns = (n // _FINE for n in fine.shape)
     return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the drawing's whiteness through H (3, 3) at the nodes and `margin` more around."""
+    """Return the whiteness of the drawing projected by H (3, 3), at nodes and `margin` around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -309,7 +310,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
 
 
 def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Return the likeness to the drawing through H in best light, and its gain, grey levels."""
+    """Return the correlation with the drawing projected by H, and its gain in grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -336,9 +337,9 @@ _TEXELS = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Points along the drawing's edges: `at` (n, 2); normal (n, 2) from black to white; number of
-    its line (n,); that line's print error, sigma (n,); width of the adjacent cells (n,); and
-    whether the edge is the small marker's (n,)."""
+    """Points along the drawing's edges: `at` (n, 2); `normal` (n, 2) from black to white; and per
+    point (n,) its `line`'s number, the sigma of that line's print error, the width of the adjacent
+    `cell`, and whether the edge is the `small` marker's."""
 
     at: Array
     normal: Array
@@ -381,7 +382,7 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
 
 @lru_cache(maxsize=8)
 def make_texture(drawing: Drawing) -> Texture:
-    """Return a picture of the drawing up to `PAPER`, beyond which it is white."""
+    """Return a picture of the drawing up to `PAPER`, and the map (3, 3) to its columns and rows."""
     axis = make_grid(_TEXELS, PAPER).axis
     wide = render_cells(drawing, axis, PAPER / _TEXELS)
     more = (len(wide) - _TEXELS) // 2
@@ -439,14 +440,15 @@ class RigidPose:
 
     @property
     def H(self) -> Array:
-        """Own coordinates to normalised ones, (3, 3)."""
+        """Homography (3, 3) of the drawing's coordinates to normalised image coordinates."""
         return np.column_stack([self.R[:, 0], self.R[:, 1], self.t])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
     """A pose with its covariance (6, 6) of rotation and translation; the numbers of edge points in
-    view, of those that showed an edge, and of the small marker's among these; and their RMS."""
+    view, of points that showed an edge, and of the small marker's points among these; and the RMS
+    of the shown points' residuals."""
 
     pose: RigidPose
     cov: Array
@@ -481,7 +483,7 @@ def fit_pose(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
-    """Fit the pose in which the drawing's edges match the picture's."""
+    """Fit the pose in which the drawing's edges match the picture's; None if the fit fails."""
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
     for reach_px in _REACH_PX:
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
@@ -607,7 +609,6 @@ def _solved(
 
 
 def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> PoseFit:
-    """The pose with its covariance."""
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
     common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)

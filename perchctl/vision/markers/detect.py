@@ -74,11 +74,12 @@ def detect_markers(
     empty_frames: int | None = None,
     own: OwnOffset | None = None,
 ) -> Detections:
-    """Find and refine the target's markers in one frame. The first place searched is at the
-    `expected` corners (4, 2) px, by the vehicle's motion, or else near the `previous` detections.
-    `empty_frames`, the number of frames in a row without markers, alternates the kinds of search;
-    None: all kinds. `own` chooses among several targets where none is expected. For a frame of
-    two fields the result is their mean."""
+    """Find and refine the target's markers in one frame.
+
+    The search begins at the corners (4, 2) px `expected` by the vehicle's motion, or else near the
+    `previous` detections. `empty_frames`, the number of frames in a row without markers, alternates
+    the kinds of search; None: all kinds. If no target is expected, `own` chooses among several. For
+    a frame of two fields the result is the fields' mean."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     both = with_missing_marker(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup.fits_lines)
@@ -206,7 +207,6 @@ def _refined(picture: Picture, found: FoundMarkers) -> _Found:
 
 
 def _detection(name: MarkerName, seen: _Found, fields: PictureKind | None) -> Detection | None:
-    """The marker's detection in a picture of that kind."""
     r = seen.get(name)
     if r is None:
         return None
@@ -273,14 +273,14 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """True if a photometric fit would not improve on the lines."""
+    """True if the line fits are accurate enough without a photometric fit."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
-    """Return the seen markers with better corners, and the other marker if it is visible. A marker
-    found by a search alone is dropped unless its lines suffice or the drawing confirms it."""
+    """Return the `seen` markers with better corners, and any other visible marker. A marker found
+    by a search alone is dropped unless its lines suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = large_around(picture, better["small"])
@@ -335,7 +335,7 @@ _ANCHOR = 0.12  # of the small marker's side
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """Return the markers near the given corners (4, 2) px whose sides are straight edges."""
+    """Return those markers near the corners `places` (4, 2) px whose sides are straight edges."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -398,7 +398,7 @@ def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | No
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        """Return True if the small marker is where the large one has it."""
+        """True if the small marker is where the large one has it."""
         centre = picture.other_corners(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
@@ -424,8 +424,8 @@ _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def mean_of_fields(a: Detections, b: Detections) -> Detections:
-    """Return the mean of both fields' corners, which holds for either order of the fields. If one
-    marker is in both fields, another that is in a single field is left out."""
+    """Return the mean of both fields' corners, valid for either order of the fields. If one marker
+    is in both fields, a marker in only one field is left out."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = a.get(name), b.get(name)
@@ -441,7 +441,6 @@ def mean_of_fields(a: Detections, b: Detections) -> Detections:
 
 
 def _middle(a: Detection, b: Detection) -> Detection:
-    """The mean of two fields' detections, each with its own noise."""
 
     def half(one: float, other: float) -> float:
         return float(((one**2 + other**2) / 4.0) ** 0.5)

@@ -36,9 +36,11 @@ _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """Constants of `detect_markers`, made by `make_aruco_detector`. `dictionaries` are the large
-    and the small marker's; `ratio` is the small side over the large one, `mask` the pixels
-    covered by the vehicle. Without `fits_lines` there are no fits and no tracking by them."""
+    """Constants of `detect_markers`, made by `make_aruco_detector`.
+
+    `dictionaries` are the large and the small marker's; `ratio` is the small side over the large
+    one, `mask` the pixels covered by the vehicle. Without `fits_lines` markers are neither fitted
+    nor tracked by fits."""
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
@@ -50,7 +52,7 @@ class DetectorSetup:
 def make_aruco_detector(
     config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
 ) -> DetectorSetup:
-    """Return dictionaries of the target's ids alone, and its markers' looks."""
+    """Return the setup for a target, with dictionaries of its markers' ids alone."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -156,7 +158,7 @@ def fill_hidden(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
 
 
 def is_hidden(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
-    """Return True if a part of the marker is hidden, up to `reach` half sides."""
+    """True if any pixel up to `reach` half sides from the marker's centre is hidden."""
     if hidden is None:
         return False
     h, w = hidden.shape
@@ -185,6 +187,6 @@ class Picture:
     camera: CameraModel
 
     def other_corners(self, corners_px: Array, name: MarkerName) -> Array:
-        """Return the corners of marker `name` that follow from the other's corners (4, 2)."""
+        """Return marker `name`'s corners (4, 2) by `corners_px` (4, 2) of the other marker."""
         ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
         return scale_square(corners_px, ratio, self.camera)

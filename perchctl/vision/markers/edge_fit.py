@@ -57,8 +57,8 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def profile_places(lengths_px: Array) -> Array:
-    """Return the places of the profiles along sides of these lengths (rows,), as shares of the
-    side (rows, n), away from the corners, where the next side blurs."""
+    """Return the profiles' places along sides of `lengths_px` (rows,), as shares (rows, n) of a
+    side, away from the corners, where the next side blurs."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -152,8 +152,9 @@ def refine_lines(
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers (m, 4, 2); None where these are not a marker's sides. The
-    shift of all edges is measured unless it is `known`. A marker with wide edges, or with edges
+    """Fit lines to the sides of m markers (m, 4, 2); None for corners without a marker's sides.
+
+    The shift of all edges is measured unless it is `known`. A marker with wide edges, or with edges
     near the ends of the profiles, is fitted again with the profiles centred on its edges."""
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
@@ -257,7 +258,7 @@ def _intersect(lines: Array) -> Array:
 
 
 def shift_prior_px(white_grey: float) -> float:
-    """Return the spread of an unmeasured edge shift, by the grey level of white paper."""
+    """Return the standard deviation of an unmeasured edge shift, given white paper's grey level."""
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
@@ -383,10 +384,10 @@ _SIDES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """Sides of m markers: raw_px (m, 4, 2) and the same normalised, `corners`; lengths of the sides
-    and depth of the cells behind them (m, 4); mean cell width (m,); index of the marker with the
-    widest cells; winding of the corners, +1 or -1 (m,); and pixels per normalised unit along
-    each side (4m,)."""
+    """Sides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; the sides' lengths
+    `sides_px` and the cells' depths behind them `depth_px` (m, 4); mean cell width `cell_px` (m,);
+    index of the marker with the `widest` cells; `winding` of the corners, +1 or -1 (m,); and pixels
+    per normalised unit along each side `px_per_unit` (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
@@ -401,8 +402,8 @@ class Sides:
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """Edges on profiles: grey values (rows, n, steps + 1), reach of the windows in them, near_px
-    (rows,), edge points (rows, n, 2), normalised, their weight (rows, n) and blur (rows,)."""
+    """Edges on profiles: `grey` values (rows, n, steps + 1), half length `near_px` of the windows
+    in them (rows,), edge `points` (rows, n, 2), normalised, `weight` (rows, n) and blur (rows,)."""
 
     grey: Floats
     near_px: Array
@@ -440,8 +441,8 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 def measure_edges(
     image: NDArray[np.uint8], markers: Sides, camera: CameraModel, with_inner: bool
 ) -> tuple[EdgeData, EdgeData | None]:
-    """Return the edges' places on profiles across all sides and, on request, across the inner edges
-    of the border with the widest cells, if these are wide enough."""
+    """Return the edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
+    marker `markers.widest`; None without `with_inner`, or if the marker's cells are too narrow."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
     widest = markers.widest
@@ -484,7 +485,8 @@ def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
 
 
 def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> NeighbourEdges:
-    """Return neighbours at `s` (rows, n): four rows a rim, then maybe one border's inner edges."""
+    """Return the neighbours of edges at places `s` (rows, n): four rows a rim, then four of the
+    inner edges of the border of rim `inner` if `s` has them."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -544,10 +546,8 @@ class NeighbourEdges:
 def locate_edges(
     grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
 ) -> tuple[Array, Array, Array]:
-    """Return where on each profile the edge is that rises along it.
-
-    These are its place along the profile's normal, px (rows, n), the weight of the profiles, 0 for
-    outliers (rows, n), and each row's blur, a standard deviation, px (rows,).
+    """Return, for the dark-to-bright edge on each profile, its offset from the profile's middle, px
+    (rows, n), its weight, 0 for outliers (rows, n), and each row's blur, sigma in px (rows,).
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.

@@ -70,8 +70,8 @@ def fit_partly_seen(
 ) -> RefinedCorners | None:
     """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
 
-    `known` is the shift of all edges, where it was measured before. None where what is seen does
-    not determine the corners, or the cells that are seen are not the marker's.
+    `known` is the shift of all edges, if measured before. None if the visible part does not
+    determine the corners, or its cells are not the marker's.
     """
     pattern, camera = picture.setup.patterns[name], picture.camera
     if not mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX:
@@ -105,7 +105,7 @@ def fit_partly_seen(
 
 
 def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
-    """Return True if no part of the marker is hidden or outside of the picture."""
+    """True if no part of the marker is hidden or outside of the picture."""
     room_px = ROOM_PX + found.blur_px
     return within(found.corners_px, picture.image.shape, room_px) and not is_hidden(
         picture.hidden, found.corners_px
@@ -274,10 +274,12 @@ _SEARCH_STEPS: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class SeenEdges:
-    """Edges of one round. Per profile (rows, n): point in the marker's coordinates (rows, n, 2),
-    outward offset from the square's edge, weight. Per row (rows,): number of its side, distance
-    from the centre in half sides, pixels per half side across it, blur in units of the window.
-    And the grey level of white paper."""
+    """Edges measured in one round of the fit.
+
+    Per profile (rows, n): point in the marker's coordinates (rows, n, 2), outward offset from the
+    square's edge, weight. Per row (rows,): number of the side, its distance from the centre in half
+    sides, pixels per half side across it, blur in units of the window. And white paper's grey
+    level."""
 
     points: Array
     offset_px: Array
@@ -290,7 +292,7 @@ class SeenEdges:
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """Return the edges near those of the square of homography H; None if too few are visible."""
+    """Return the edges near the square projected by H (3, 3); None if too few are visible."""
     camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):

@@ -26,11 +26,9 @@ _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0
 
 @dataclass(frozen=True, eq=False)
 class Rim:
-    """The cells next to a marker's border, for its four sides in the order of the corners, (4, n)
-    each; the first and last cell of a side are the border's.
-
-    white: 1 for a white cell next to the border; open: 1 if the cell behind it is white
-    too; tolerance: print error of an edge's position, in cells.
+    """The cells next to a marker's border, along its four sides in the order of the corners. white:
+    (4, n), 1 for a white cell; the first and last are the border's. open: (4, n), 1 if the cell
+    behind it is white too. tolerance: print error of an edge's position, in cells.
     """
 
     white: Array
@@ -44,13 +42,13 @@ class Rim:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """How one marker looks.
+    """A marker's looks.
 
-    rim: inside of its border. drawing: all of it. spots (n, 2): points in its own
-    coordinates (see `perchctl.vision.markers.corners`) at which its cells are read; owner
-    (n,): the cell of each; blurred_spots (4, n): expected grey at the spots with a blur of half
-    a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; white (cells,): whether a
-    cell is white; inner (cells,): whether it is within the border.
+    rim: cells inside the border. drawing: all cells. spots (n, 2): points in the marker's
+    coordinates (see `perchctl.vision.markers.corners`) at which cells are read; spot_cells (n,):
+    each spot's cell; spots_per_cell (cells,); blurred_spots (4, n): expected grey at the spots with
+    a blur of half a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; white (cells,):
+    whether a cell is white; inner (cells,): whether it is within the border.
     """
 
     rim: Rim
@@ -82,7 +80,7 @@ def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return the pattern of a marker, with spots in all cells that the other leaves free."""
+    """Return the pattern of a marker, with spots in all cells not hidden by a marker inside."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -111,7 +109,7 @@ def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
 
 
 def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if every cell at these corners clearly has its colour."""
+    """True if the picture clearly has the pattern's colour in every cell."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -127,7 +125,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if nearly all cells have their colour."""
+    """True if the picture has the pattern's colour in nearly all cells."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -137,7 +135,7 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
 
 
 def fits_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """Return True if the grey values in the cells correlate with the pattern."""
+    """True if the grey values in the cells correlate with the pattern."""
     return float(correlations(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
@@ -192,9 +190,10 @@ EDGE = 12
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A marker's cells with its border, 1 = white, (n, n); for the target's large marker
-    what lies in its centre, at `ratio` of its size, and `sheet`, half the side of the
-    white paper in the marker's own coordinates (None: white without end)."""
+    """A marker's `cells` with its border, 1 = white, (n, n).
+
+    For the target's large marker also the small marker's cells, `centre`, the `ratio` of small to
+    large side, and `sheet`, half the paper's side in the marker's coordinates (None: endless)."""
 
     cells: Array
     centre: Array | None = None
@@ -210,7 +209,7 @@ class Drawing:
 def make_drawing(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
-    """Return the drawing of inner bits, 1 = white; with a centre, the large marker's."""
+    """Return a marker's drawing by its inner bits, 1 = white; `centre`: the small marker's."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -233,7 +232,7 @@ def _wide(axis: Array, half_node: float) -> Array:
 
 @lru_cache(maxsize=64)
 def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """Return the drawing at n by n nodes, and if its sheet ends, the share beyond it."""
+    """Return the whiteness at n by n nodes, and if the sheet ends, each node's share beyond."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = render_cells(drawing, axis, half_node)
@@ -245,12 +244,12 @@ def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
 
 @lru_cache(maxsize=64)
 def black_square(cells: int, n: int) -> NDArray[np.float32]:
-    """Return a black square of `cells` cells a side at n by n nodes over its reach."""
+    """Return the whiteness of a black square of `cells` cells a side, n by n nodes."""
     return render_sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
 def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of each node and of `EDGE` nodes all around."""
+    """Return the whiteness of the nodes at `axis` x `axis`, and of `EDGE` more nodes all around."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T

@@ -70,8 +70,8 @@ class Alignment:
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their spread.
         likeness: correlation of the picture with the drawing.
-        pattern, strength: correlation and height of the inner bits, beyond what a black square
-            of the same size explains; the height in units of the border's.
+        pattern, strength: correlation and contrast of the inner bits, beyond what a black square of
+            the same size explains; the contrast relative to the border's.
         cell_departure: largest mean departure of a cell, in units of the gain.
         flip, flip_sigma: how far the worst-fitting cell has the other colour, 0 (as drawn) to 1
             (wrong bit), and the spread of the least certain cell.
@@ -216,7 +216,7 @@ def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations |
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """Return the correlation of `grey` with a fit whose residual is `error`."""
+    """Return the correlation of `grey` with its fit, whose residual is `error`."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -265,7 +265,6 @@ def _repeated(error: Array) -> float:
 
 
 def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
-    """The largest mean departure over a cell."""
     index, count = _cells_of(grid, n_cells)
     total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
@@ -328,7 +327,7 @@ def _crossings(axis: Array) -> Array:
 
 
 def project_nodes(H: Array, uv1: Array) -> Array:
-    """Map own coordinates (3, n) to pinhole pixels, x and y (2, n)."""
+    """Map the marker's coordinates (3, n) by H to pinhole pixels, x and y (2, n)."""
     q = H.dot(uv1)
     return np.asarray(q[:2] / q[2])
 
@@ -343,7 +342,7 @@ def distort_px(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """Return each node's lens shift through H, (2, n * n), interpolated from a few."""
+    """Return each node's shift by the lens, px (2, n * n), interpolated from a few nodes."""
     uv1, between = _few(grid)
     pin = project_nodes(H, uv1)
     shift = (distort_px(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -436,8 +435,8 @@ class RenderedDrawing:
 
     @cached_property
     def square_light_rows(self) -> tuple[Array, Array]:
-        """The same basis for a black square of the drawing's size, without slopes of the gain and
-        bend: rows (4 or 5, n * n), and their Gram matrix."""
+        """Basis of a black square's grey values under any light but slopes of the gain and bend:
+        rows (4 or 5, n * n), and their Gram matrix."""
         soft = blur_nodes(black_square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
         lit, _ = self.light_rows
@@ -453,7 +452,7 @@ class RenderedDrawing:
 
 @lru_cache(maxsize=16)
 def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over its reach, blurred by that step."""
+    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_STEP * step)`` nodes."""
     return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 

@@ -41,8 +41,8 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class FoundMarkers:
-    """Raw corners (4, 2) px of at most one of each marker, whether the mirror image of one is
-    there, and how many whole targets there were to choose from."""
+    """Raw corners (4, 2) px of at most one large and one small marker, whether a marker's mirror
+    image was found, and the number of whole targets to choose from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     mirrored: bool = False
@@ -55,9 +55,11 @@ def search(
     look: Look = "all",
     own: OwnOffset | None = None,
 ) -> FoundMarkers:
-    """Search the window around the expected markers, then the whole picture if that found too
-    little; with `look` "near" or "window" the window only, with "sharp" the picture only. `own`
-    chooses among several targets where none is expected."""
+    """Search the window around the expected markers, then the whole picture if the window shows too
+    little.
+
+    `look` "near" or "window": the window only; "sharp": the picture only. `own` chooses among
+    several targets if none is expected."""
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.fits_lines and expected and look != "sharp":
@@ -80,7 +82,7 @@ def search(
 def search_halved(
     picture: Picture, expected: Mapping[MarkerName, Array], own: OwnOffset | None = None
 ) -> FoundMarkers | None:
-    """Search the window at half size, a millisecond; None where anything whole is missed."""
+    """Search the window at half size, in 1 ms; None if an expected whole marker is missed."""
     shape = picture.image.shape
     in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
@@ -94,8 +96,8 @@ def search_halved(
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """Return where to look, None where a window would not pay. It holds the whole large marker as
-    long as that can be in the picture."""
+    """Return the part of the picture to search, None if a window would not pay. The window holds
+    the whole large marker if that can be in the picture."""
     h, w = shape[:2]
     if "large" in expected:
         corners = expected["large"]
@@ -123,7 +125,6 @@ def _pass(
     own: OwnOffset | None,
     halved: bool = False,
 ) -> FoundMarkers:
-    """What one pass of OpenCV's detector over the window gives."""
     setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
@@ -154,9 +155,10 @@ def choose_markers(
     ratio: float,
     own: OwnOffset | None = None,
 ) -> dict[MarkerName, Array]:
-    """Return at most one of each marker. A small marker in the centre of a large one, of the right
-    size and turn, verifies both. Markers at their expected places win over a pair elsewhere;
-    among single ones, the nearest by `own`."""
+    """Return at most one large and one small marker, corners (4, 2) px.
+
+    A small marker in the centre of a large one, of the right size and turn, verifies both. Markers
+    at their expected places win over a pair elsewhere; among single ones, the nearest by `own`."""
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
@@ -219,7 +221,7 @@ def _wholes(
 
 
 def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return the distance of the small marker from its place in the large one; at most 1."""
+    """Return the small marker's distance from its place in the large one, over the tolerance."""
     mapped = scale_square(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
