@@ -17,7 +17,7 @@ SENTENCE = "Ctrl-C"
 
 
 def is_command_line() -> bool:
-    """Return True if this process is perchctl's command line: not a program that imports it, nor a
+    """True if this process is perchctl's command line: not a program that imports it, nor a
     child process, which has the same arguments."""
     script = "" if "multiprocessing" in sys.modules else os.path.basename(sys.argv[0])
     if script == "-m":

@@ -77,7 +77,7 @@ def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
 
 
 def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
-    """Return True if an emergency stop took effect: locked, with the motors off."""
+    """True if an emergency stop took effect: locked, with the motors off."""
     if newest is None or not is_fresh(newest, now_s):
         return False
     return newest.has_bit(LOCKED) and newest.thrust < 1

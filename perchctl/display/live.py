@@ -215,7 +215,7 @@ _HTML = Path(__file__).with_name("page.html")
 
 
 def is_loopback(host: str | None) -> bool:
-    """Return True if a Host header names this machine, whatever the port (it may be forwarded)."""
+    """True if a Host header names this machine, whatever the port (it may be forwarded)."""
     if not host:
         return False
     try:

@@ -520,7 +520,7 @@ class Case:
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:
-    """Return the faults named by `all` or by names between commas. Errors: UsageError."""
+    """The faults named by `all` or by names between commas. Errors: UsageError."""
     if names == "all":
         return FAULTS
     found = []
@@ -534,7 +534,7 @@ def select_faults(names: str) -> tuple[Fault, ...]:
 
 
 def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -> Case:
-    """Return the case of a seed, drawn from a selection; equal arguments give equal cases."""
+    """The case of a seed, drawn from a selection; equal arguments give equal cases."""
     rng = np.random.default_rng([seed, STREAM])
     fault = faults[int(rng.integers(len(faults)))]
     phase = fault.phases[int(rng.integers(len(fault.phases)))]

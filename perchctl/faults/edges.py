@@ -24,7 +24,7 @@ from perchctl.vision import Frame
 
 
 def packet_kind(packet: Packet) -> str:
-    """Return the kind of a packet, by which a fault names it, or the empty string."""
+    """The kind of a packet, by which a fault names it, or the empty string."""
     kind = packet.data[0] if packet.data else None
     match packet.port, packet.channel, kind:
         case Port.COMMANDER, 0, _:

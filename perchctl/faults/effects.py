@@ -226,13 +226,13 @@ def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
 
 
 def magnet_holds(scenario: Scenario, of_weight: float) -> Scenario:
-    """Return the scenario with a magnet that holds the part `of_weight` of the vehicle's weight."""
+    """The scenario with a magnet that holds the part `of_weight` of the vehicle's weight."""
     hold_n = of_weight * (scenario.mass_kg * GRAVITY_MPS2)
     return replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
 
 
 def room(scenario: Scenario, **fields: Any) -> Scenario:
-    """Return the scenario with `fields` replaced."""
+    """The scenario with `fields` replaced."""
     return replace(scenario, **fields)
 
 
@@ -240,7 +240,7 @@ OF_THE_SCENARIO = (magnet_holds, room)
 
 
 def scenario_for(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
-    """Return the scenario with the effects that hold from the start."""
+    """The scenario with the effects that hold from the start."""
     for effect in effects:
         if effect.func in OF_THE_SCENARIO:
             scenario = effect(scenario)
@@ -252,7 +252,7 @@ def scenario_for(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
 
 
 def profile_for(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
-    """Return the profile with the positioning and the camera latency that the effects need."""
+    """The profile with the positioning and the camera latency that the effects need."""
     for effect in effects:
         if effect.func in (external_positions, deck_silent):
             by = "deck" if effect.func is deck_silent else "mocap"
@@ -266,7 +266,7 @@ def profile_for(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
 
 
 def latency_drop_s(effect: Effect) -> float:
-    """Return the seconds by which the fault shortens the latency that the profile expects."""
+    """The seconds by which the fault shortens the latency that the profile expects."""
     sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
     return float(effect.keywords["late_s"]) if sooner else 0.0
 

@@ -36,7 +36,7 @@ class ExpectedOutcome:
     within_s: float = 4.0
 
     def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
-        """Return True if a flag raised at `t_s` is a consequence of the cause."""
+        """True if a flag raised at `t_s` is a consequence of the cause."""
         cause_s = self.cause(facts)
         return cause_s is not None and flag in self.flags and 0.0 <= t_s - cause_s <= self.within_s
 
@@ -129,7 +129,7 @@ EXPECTED_OUTCOMES = (
 
 
 def unexpected_flags(flags: Mapping[Flag, float], facts: Facts) -> tuple[Flag, ...]:
-    """Return the flags that no expected outcome covers: those that count."""
+    """The flags that no expected outcome covers: those that count."""
     return tuple(
         flag
         for flag, t_s in flags.items()

@@ -95,7 +95,7 @@ def drop_limit_m(hold_ratio: float) -> float:
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
-    """Return the time of the press of Ctrl-C that made an emergency stop; None if none did."""
+    """The time of the press of Ctrl-C that made an emergency stop; None if none did."""
     run_s = presses_s[0] if presses_s else 0.0
     for before_s, press_s in pairwise(presses_s):
         if press_s - before_s >= SILENCE_S:
@@ -381,7 +381,7 @@ REFUSAL_CLAIMS: Claims = {"stands"}
 
 
 def last_transition(report: FlightReport) -> str:
-    """Return the name of the transition that ended the flight; empty without one."""
+    """The name of the transition that ended the flight; empty without one."""
     return report.history[-1].row if report.history else ""
 
 
@@ -393,7 +393,7 @@ def report_claims(report: FlightReport) -> Claims:
 
 
 def rescue_claims(event: Event) -> Claims:
-    """Return the claims of a rescue's note; none for any other event."""
+    """The claims of a rescue's note; none for any other event."""
     if not event.is_rescue:
         return set()
     found = next(found for found in RestState if found.value in event.reason)

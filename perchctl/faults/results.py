@@ -107,13 +107,13 @@ def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
 
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
-    """Return the flights with a flag that counts, the gravest first."""
+    """The flights with a flag that counts, the gravest first."""
     bad, order = [r for r in results if r.is_bad], list(FLAGS)
     return sorted(bad, key=lambda r: (min(map(order.index, r.counted)), -len(r.counted), r.seed))
 
 
 def fault_table(results: Sequence[FaultResult]) -> str:
-    """Return the flights of each fault, the figures, and the worst flights as plain text."""
+    """The flights of each fault, the figures, and the worst flights as plain text."""
     figures, flown = fault_summary(results), Counter(r.fault for r in results)
     wrong = Counter(r.fault for r in results if r.is_bad)
     excused = Counter(r.fault for r in results if r.is_excused)

@@ -53,7 +53,7 @@ class WatchedVehicle(SimulatedVehicle):
 
 
 def true_sample(vehicle: SimulatedVehicle) -> Sample:
-    """Return the vehicle's true state now; fields that depend on the fault keep their defaults."""
+    """The vehicle's true state now; fields that depend on the fault keep their defaults."""
     world, firmware = vehicle.world, vehicle.firmware
     weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
     _, qx, qy, _ = world.quaternion
@@ -271,7 +271,7 @@ class PositionBound:
         self._phase = phase or Phase.APPROACH
 
     def astray_m(self, place: Place) -> float:
-        """Return the distance of `place` from the nearest place where the vehicle may be."""
+        """The distance of `place` from the nearest place where the vehicle may be."""
         return min(math.dist(spot, place) for spot in self._nearest(place))
 
     def _nearest(self, place: Place) -> list[Place]:
@@ -299,7 +299,7 @@ def _nearest_between(a: Place, b: Place, place: Place) -> Place:
 
 
 def target_places(scenario: Scenario) -> list[Place]:
-    """Return the places of the vehicle's target and of those that look like it, if any."""
+    """The places of the vehicle's target and of those that look like it, if any."""
     if scenario.no_target:
         return []
     x_m, y_m = scenario.target_xy_m
@@ -335,7 +335,7 @@ class UndetectedDrift:
         self._slid_m = self._fault_s = 0.0
 
     def update_m(self, fault_s: float, phase: Phase | None) -> float:
-        """Return the distance, m, `fault_s` after the fault began; times must rise."""
+        """The distance, m, `fault_s` after the fault began; times must rise."""
         before_s, self._fault_s = self._fault_s, fault_s
         if phase in UNDER_TARGET:
             self._slid_m = 0.0
@@ -373,7 +373,7 @@ class DescentBound:
         uplink: bool,
         lands: bool = False,
     ) -> bool:
-        """Return True if the vehicle should have come down by now and has not.
+        """True if the vehicle should have come down by now and has not.
 
         A vehicle that was at the ceiling in time may hang there; without `uplink` the time to obey
         starts anew. `lands`: its onboard landing is active, which counts as coming down unless it
@@ -400,7 +400,7 @@ def _for_s(effect: e.Effect) -> float:
 
 
 def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
-    """Return the seconds from an effect's beginning in `phase` until the program has to land;
+    """The seconds from an effect's beginning in `phase` until the program has to land;
     infinite if it need not."""
     safety, values, limit_s = profile.safety, effect.keywords, math.inf
     if effect.func is e.operator:

@@ -104,7 +104,7 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """Return True if the driver will never take a packet again. To be called repeatedly, and
+        """True if the driver will never take a packet again. To be called repeatedly, and
         only while it takes none: True once this has lasted for `DEAD_S`.
 
         A radio out of reach counts its lost packets, and goes on by itself. One whose dongle was

@@ -52,12 +52,12 @@ class Packet(NamedTuple):
     data: bytes
 
     def encode(self) -> bytes:
-        """Return the packet's bytes on the air."""
+        """The packet's bytes on the air."""
         return bytes((self.port << 4 | 0x0C | self.channel,)) + self.data
 
     @staticmethod
     def decode(datagram: bytes) -> Packet | None:
-        """Return the packet of these bytes; None for what cannot be one: empty or too long."""
+        """The packet of these bytes; None for what cannot be one: empty or too long."""
         if not 1 <= len(datagram) <= 1 + MAX_DATA:
             return None
         return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
@@ -80,7 +80,7 @@ _ARM, _EMERGENCY_STOP = 1, 3
 
 
 def encode(what: Command | ExternalPosition) -> tuple[Packet, ...]:
-    """Return the packets of a command, or of a position from outside, in the order in which they
+    """The packets of a command, or of a position from outside, in the order in which they
     are sent; none for `Idle`.
 
     Raises InvalidValue for a number that its field cannot hold.

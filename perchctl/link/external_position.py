@@ -43,7 +43,7 @@ POLL_S = 0.02
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """Return the firmware's parameters for external positions, to be set after the user's own;
+    """The firmware's parameters for external positions, to be set after the user's own;
     none with decks."""
     if config.by == "deck":
         return {}

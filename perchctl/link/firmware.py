@@ -28,7 +28,7 @@ def check_firmware(cf: Any, uri: str) -> None:
 
 
 def missing_variables(cf: Any) -> list[str]:
-    """Return the needed variables that the firmware does not log."""
+    """The needed variables that the firmware does not log."""
     table = cf.log.toc
     return [name for name in NEEDED if table.get_element_by_complete_name(name) is None]
 
@@ -90,6 +90,6 @@ def read_parameters(cf: Any) -> dict[str, float]:
 
 
 def detected_decks(parameters: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the decks that were found at boot, by the firmware's names, sorted."""
+    """The decks that were found at boot, by the firmware's names, sorted."""
     names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
     return tuple(sorted(names))

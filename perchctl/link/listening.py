@@ -91,7 +91,7 @@ class AttitudeLink(ReadOnlyLink):
         return self._motors_run
 
     def samples(self) -> list[AttitudeSample]:
-        """Return the samples that arrived since the last call, oldest first."""
+        """The samples that arrived since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def _prepare(self, connection: Connection) -> None:
@@ -157,7 +157,7 @@ class ProbeLink(ReadOnlyLink):
         return self.connection.cf
 
     def protocol_version(self) -> int:
-        """Return the protocol's version; -1 for a vehicle that is too old to have one."""
+        """The protocol's version; -1 for a vehicle that is too old to have one."""
         return int(self._cf.platform.get_protocol_version())
 
     def parameters(self) -> dict[str, float]:
@@ -165,7 +165,7 @@ class ProbeLink(ReadOnlyLink):
         return read_parameters(self._cf)
 
     def age_s(self) -> float:
-        """Return the age of the newest sample's position; infinite without a sample."""
+        """The age of the newest sample's position; infinite without a sample."""
         newest = self._blocks.newest
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 

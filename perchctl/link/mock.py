@@ -50,7 +50,7 @@ class Radio:
         return self._bursts is None or not self._bursts.is_lost(now_s)
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:
-        """Return the seconds after which a log block's packet arrives; None when it is lost."""
+        """The seconds after which a log block's packet arrives; None when it is lost."""
         lost = self._bursts is not None and self._bursts.is_lost(now_s)
         return None if lost else TELEMETRY_DELAY_S
 

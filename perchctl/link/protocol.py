@@ -37,10 +37,10 @@ class Link(Protocol):
         """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
 
     def decks(self) -> tuple[str, ...]:
-        """Return the decks that the connected vehicle found at boot, by the firmware's names."""
+        """The decks that the connected vehicle found at boot, by the firmware's names."""
 
     def telemetry(self) -> list[Telemetry]:
-        """Return the samples that arrived since the last call, oldest first."""
+        """The samples that arrived since the last call, oldest first."""
 
     def send(self, command: Command) -> None:
         """Hand one command to the vehicle. Never blocks for long."""
@@ -94,7 +94,7 @@ log in again, and plug the radio or the vehicle in again."""
 
 
 def check_uri(uri: str) -> str:
-    """Return the URI's scheme. Raises InvalidValue, which names what is allowed."""
+    """The URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme, _, rest = uri.partition("://")
     fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
     if not fits or (scheme == "udp" and int(rest.rpartition(":")[2]) > 65535):
@@ -103,7 +103,7 @@ def check_uri(uri: str) -> str:
 
 
 def vehicle_uri(uri: str) -> str:
-    """Return the URI without what does not identify the vehicle: dongle, letter case, options."""
+    """The URI without what does not identify the vehicle: dongle, letter case, options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":

@@ -116,7 +116,7 @@ class Sender:
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """Return the seconds for which no waiting command was taken; 0 if no command waits."""
+        """The seconds for which no waiting command was taken; 0 if no command waits."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 

@@ -96,7 +96,7 @@ class Timebase:
         self._last_arrival_s = 0.0
 
     def to_loop_s(self, stamp_ms: int, arrival_s: float) -> float:
-        """Return the time of a stamp, ms, that arrived at `arrival_s`."""
+        """The time of a stamp, ms, that arrived at `arrival_s`."""
         if self._last_ms is None:
             self._unwrapped_ms = stamp_ms
         else:
@@ -231,7 +231,7 @@ class LogBlocks:
             raise TimedOut(f"{uri} is connected but sends no telemetry")
 
     def take_samples(self) -> list[Telemetry]:
-        """Return the samples that arrived since the last call, oldest first."""
+        """The samples that arrived since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     @property

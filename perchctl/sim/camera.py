@@ -82,7 +82,7 @@ class SimCamera:
             self._index += 1
 
     def take(self) -> list[DeliveredFrame]:
-        """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
+        """The frames that arrived by the time of the last `advance`, oldest first, once."""
         arrived = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
             arrived.append(self._under_way.popleft())
@@ -173,7 +173,7 @@ class Shutter:
         self._flicker = scenario.camera_flicker * swing
 
     def shots(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> list[Exposure]:
-        """Return the frame's exposures in time order: two fields, or one whole frame."""
+        """The frame's exposures in time order: two fields, or one whole frame."""
         half_s = self._apart_s / 2.0
         moments = (middle_s - half_s, middle_s + half_s) if half_s else (middle_s,)
         return [self._shot(moment_s, T_world_cam_at, height) for moment_s in moments]

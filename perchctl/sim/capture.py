@@ -94,7 +94,7 @@ class CaptureSettings:
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
-    """Return the motion capture of that seed's flight; None if the profile uses none."""
+    """The motion capture of that seed's flight; None if the profile uses none."""
     config, sim = profile.positioning, profile.simulation
     if config.by != "mocap":
         return None
@@ -166,14 +166,14 @@ class SimCapture:
         self._under_way.append(CaptureFrame(self._arrival_s, bodies))
 
     def take(self) -> list[CaptureFrame]:
-        """Return the frames that arrived by the time of the last `advance`, oldest first, once."""
+        """The frames that arrived by the time of the last `advance`, oldest first, once."""
         arrived = []
         while self._under_way and self._under_way[0].t_s <= self._t_s + 1e-9:
             arrived.append(self._under_way.popleft())
         return arrived
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """Return the newest frame that has arrived since the last call."""
+        """The newest frame that has arrived since the last call."""
         arrived = self.take()
         return arrived[-1] if arrived else None
 

@@ -147,7 +147,7 @@ class CNumber:
         return struct.calcsize("<" + self.letter)
 
     def pack(self, value: float) -> bytes:
-        """Return the bytes as C stores them: integers truncated and wrapped, floats rounded."""
+        """The bytes as C stores them: integers truncated and wrapped, floats rounded."""
         if self.letter in "ef":
             try:
                 return struct.pack("<" + self.letter, value)
@@ -192,12 +192,12 @@ class Toc:
         self._info = struct.pack("<BHI", self._INFO, len(codes), crc) + info_tail
 
     def name(self, ident: bytes) -> str | None:
-        """Return the name with a number, given as two bytes; None for an unknown number."""
+        """The name with a number, given as two bytes; None for an unknown number."""
         number = int.from_bytes(ident, "little")
         return self._names[number] if len(ident) == 2 and number < len(self._names) else None
 
     def answer(self, data: bytes) -> bytes | None:
-        """Return the answer to a request on channel 0."""
+        """The answer to a request on channel 0."""
         if data[0] == self._INFO:
             return self._info
         if data[0] != self._ITEM or len(data) < 3:
@@ -267,7 +267,7 @@ class CrtpServer:
         self._param_toc = Toc(Port.PARAM, param_codes)
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """Return the answers to one packet, at most one. A packet too short for its
+        """The answers to one packet, at most one. A packet too short for its
         command is ignored, as by the firmware."""
         try:
             answer = self._answer(packet)
@@ -276,7 +276,7 @@ class CrtpServer:
         return [] if answer is None else [Packet(packet.port, packet.channel, answer)]
 
     def due_packets(self) -> list[Packet]:
-        """Return the packets of log data that are due by now."""
+        """The packets of log data that are due by now."""
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():

@@ -136,7 +136,7 @@ class VehicleHost:
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
     def truth(self) -> dict[str, Any]:
-        """Return the true state, SI and radians, and firmware outputs: no Crazyflie reports it."""
+        """The true state, SI and radians, and firmware outputs: no Crazyflie reports it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
         ceiling_n, floor = world.push_n_and_on_floor()
         return {
@@ -312,7 +312,7 @@ class MjpegServer(ThreadingHTTPServer):
             self._changed.notify_all()
 
     def wait_for_newer(self, number: int) -> tuple[int, Picture]:
-        """Return the newest picture and its number as soon as that is above `number`."""
+        """The newest picture and its number as soon as that is above `number`."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest[0] > number)
             return self._newest

@@ -59,7 +59,7 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
 
 
 def ray_to_plane_map(T_target_cam: Array) -> Array:
-    """Return the homographies (..., 3, 3) from rays (x, y, 1) to homogeneous points (X w, Y w, w)
+    """The homographies (..., 3, 3) from rays (x, y, 1) to homogeneous points (X w, Y w, w)
     of the target's plane, for poses (..., 4, 4).
 
     From X = t + s R r with X_z = 0. A camera above the plane sees nothing of it
@@ -73,7 +73,7 @@ def ray_to_plane_map(T_target_cam: Array) -> Array:
 
 
 def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the points where the grid's rays meet the plane, (rows, cols, 2) m, and True for each
+    """The points where the grid's rays meet the plane, (rows, cols, 2) m, and True for each
     ray that misses it, (rows, cols).
 
     `to_plane` is the map (3, 3) of `ray_to_plane_map`, or with a rolling shutter the maps (n, 3, 3)
@@ -103,7 +103,7 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
-    """Return the picture's pixels per metre around a node (geometric mean of both directions)."""
+    """The picture's pixels per metre around a node (geometric mean of both directions)."""
     row, col = min(max(row, 1), len(nodes) - 2), min(max(col, 1), nodes.shape[1] - 2)
     a = (nodes[row, col + 1] - nodes[row, col - 1]).astype(np.float64)
     b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)
@@ -132,7 +132,7 @@ class Lens:
 
 
 def shared_lens(camera: CameraModel) -> Lens:
-    """Return the camera's lens, which flights share."""
+    """The camera's lens, which flights share."""
     return _lens(*camera.calibration_key)
 
 

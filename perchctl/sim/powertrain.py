@@ -54,7 +54,7 @@ _D = (C1 / (3.0 * C3) - _P * _P) ** 3
 
 
 def motor_voltage(thrust_n: float) -> float:
-    """Return the motor voltage at which one motor gives `thrust_n`."""
+    """The motor voltage at which one motor gives `thrust_n`."""
     q = _Q + _Q_PER_N * thrust_n
     s = sqrt(q * q + _D)
     return cbrt(q + s) + cbrt(q - s) + _P
@@ -65,7 +65,7 @@ STANDSTILL_V = motor_voltage(0.0)
 
 
 def thrust_n(volts: float) -> float:
-    """Return the steady thrust of one motor at a motor voltage."""
+    """The steady thrust of one motor at a motor voltage."""
     if volts <= STANDSTILL_V:
         return 0.0
     return C0 + volts * (C1 + volts * (C2 + volts * C3))

@@ -126,7 +126,7 @@ class Renderer:
         defocus_px: float | None = None,
         frame_index: int = 0,
     ) -> Picture:
-        """Return the picture of one exposure.
+        """The picture of one exposure.
 
         Args:
             T_world_cam_samples: poses (4, 4) at equal steps over the exposure,
@@ -142,7 +142,7 @@ class Renderer:
     def expose(
         self, shots: Sequence[Exposure], frame_index: int = 0, defocus_px: float | None = None
     ) -> Picture:
-        """Return the frame of one `Exposure`, or of two fields, the earlier first, woven as the
+        """The frame of one `Exposure`, or of two fields, the earlier first, woven as the
         scenario's `camera_fields` says. Otherwise as `render`."""
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
         picture = exposed[0]
@@ -300,7 +300,7 @@ def cover(below: Picture, view: SheetView, maps: Array, rays: RayGrid) -> Pictur
 
 
 def mean_picture(pictures: Sequence[Picture]) -> Picture:
-    """Return the mean of the pictures, rounded once."""
+    """The mean of the pictures, rounded once."""
     total: Any = pictures[0].astype(np.uint16)
     for picture in pictures[1:]:
         total = cv2.add(total, picture, dtype=cv2.CV_16U)
@@ -308,7 +308,7 @@ def mean_picture(pictures: Sequence[Picture]) -> Picture:
 
 
 def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
-    """Return the texture's bilinear values at `texels` (h, w, 2) float32; outside by `border`."""
+    """The texture's bilinear values at `texels` (h, w, 2) float32; outside by `border`."""
     remap: Any = cv2.remap  # its stub denies that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
@@ -355,7 +355,7 @@ MAX_KERNEL_REACH_PX = 12
 
 
 def longest_path_px(motion_px: Array) -> float:
-    """Return the length of the longest path of the points `motion_px` (points, times, 2)."""
+    """The length of the longest path of the points `motion_px` (points, times, 2)."""
     steps = motion_px[:, 1:] - motion_px[:, :-1]
     return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
 
@@ -383,7 +383,7 @@ def resample_poses(poses: Array, count: int) -> Array:
 
 
 def motion_blur_kernel(motion_px: Array) -> NDArray[np.float32] | None:
-    """Return the blur kernel of the path at the image's middle; None if it is too short to see."""
+    """The blur kernel of the path at the image's middle; None if it is too short to see."""
     path = motion_px[0] - motion_px[0].mean(axis=0)
     reach = float(np.abs(path).max())
     if reach < SHARP_MOTION_PX / 2.0:
@@ -418,7 +418,7 @@ SNOW_LINES_PER_FRAME = 12.0
 def add_analogue_faults(
     image: NDArray[np.uint8], strength: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Return the picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
+    """The picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
     height, width = image.shape
     shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
     for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):

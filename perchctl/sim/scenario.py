@@ -117,7 +117,7 @@ class Scenario:
     extra: dict[str, float] = field(default_factory=dict)
 
     def radio_bursts(self) -> RadioBursts | None:
-        """Return the times at which the flight's radio is silent; None without losses."""
+        """The times at which the flight's radio is silent; None without losses."""
         return (
             RadioBursts(self.seed, self.radio_loss, self.radio_burst_s) if self.radio_loss else None
         )
@@ -151,7 +151,7 @@ _LEAST_GAP_S = 1.0
 
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
-    """Return the seed's scenario. Values are drawn in a fixed order, so a range added at the end
+    """The seed's scenario. Values are drawn in a fixed order, so a range added at the end
     leaves a seed's earlier ones; the groups of harder worlds come from other streams."""
     sim = profile.simulation
     rng = np.random.default_rng([seed, _STREAM])

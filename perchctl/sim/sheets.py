@@ -77,7 +77,7 @@ class Sheet:
         self._levels: dict[int, SheetTexture] = {}
 
     def texture(self, image_px_per_m: float) -> SheetTexture:
-        """Return the sheet's texture at the resolution for an image of that scale."""
+        """The sheet's texture at the resolution for an image of that scale."""
         ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
         # Level -1 is the finest resolution with single texels, for views nearer than it suits.
         level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
@@ -220,7 +220,7 @@ def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def union_box(boxes: Sequence[Box]) -> Box:
-    """Return the smallest box around all `boxes`."""
+    """The smallest box around all `boxes`."""
     rows, cols = (
         slice(min(each.start for each in spans), max(each.stop for each in spans))
         for spans in zip(*boxes, strict=True)
@@ -229,7 +229,7 @@ def union_box(boxes: Sequence[Box]) -> Box:
 
 
 def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
-    """Return the rows and columns of pixels in a box with a margin around it."""
+    """The rows and columns of pixels in a box with a margin around it."""
     rows, cols = (
         slice(max(COARSE_PX * each.start - margin_px, 0), COARSE_PX * each.stop + margin_px)
         for each in box

@@ -144,14 +144,14 @@ class World:
         )
 
     def gear_tip_m(self) -> tuple[float, float, float]:
-        """Return the gear's tip in world axes."""
+        """The gear's tip in world axes."""
         gx, gy, gz = self._scenario.gear_body_m
         rows = zip((self.x_m, self.y_m, self.z_m), self._R, strict=True)
         x, y, z = (place + a * gx + b * gy + c * gz for place, (a, b, c) in rows)
         return x, y, z
 
     def gear_miss_m(self) -> float:
-        """Return the horizontal distance of the gear's tip from the target's centre."""
+        """The horizontal distance of the gear's tip from the target's centre."""
         tip = self.gear_tip_m()
         target = self.magnet.target_xy_m
         return math.hypot(tip[0] - target[0], tip[1] - target[1])
@@ -219,7 +219,7 @@ class World:
         )
 
     def push_n_and_on_floor(self) -> tuple[float, bool]:
-        """Return the push between vehicle and ceiling, N, and whether the floor is touched."""
+        """The push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
         wrench = np.zeros(6)
         for i, pair in enumerate(self._data.contact.geom.tolist()):
@@ -299,7 +299,7 @@ class Magnet:
         self.let_go = False  # for good: it pulls no more
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
-        """Return the pull on the gear's tip at `tip_m`, world axes."""
+        """The pull on the gear's tip at `tip_m`, world axes."""
         scenario = self._scenario
         gap_m = max(0.0, scenario.ceiling_z_m - tip_m[2])
         target_x, target_y = self.target_xy_m
@@ -355,7 +355,7 @@ class Wind:
             self._gusts.append([(amplitude, w, phase) for w, phase in terms])
 
     def at(self, t_s: float) -> Vector:
-        """Return the wind at t, m/s, world axes; exactly zero in still air."""
+        """The wind at t, m/s, world axes; exactly zero in still air."""
         if self._still:
             return (0.0, 0.0, 0.0)
         x, y, z = (

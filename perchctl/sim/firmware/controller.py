@@ -55,7 +55,7 @@ class Setpoint:
     thrust: float = 0.0
 
     def level_setpoint(self) -> Setpoint:
-        """Return the setpoint flown while setpoints are missing: level, no yaw rate, same z."""
+        """The setpoint flown while setpoints are missing: level, no yaw rate, same z."""
         mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, VELOCITY)
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
@@ -96,7 +96,7 @@ class Pid:
         self._measured = measured
 
     def update(self, desired: float, measured: float, is_angle: bool = False) -> float:
-        """Return the output after one period; an angle's error is wrapped to +-180 degrees."""
+        """The output after one period; an angle's error is wrapped to +-180 degrees."""
         error, change = desired - measured, measured - self._measured
         if is_angle:
             error, change = wrap_deg(error), wrap_deg(change)
@@ -111,7 +111,7 @@ class Pid:
 
 
 def wrap_deg(angle: float) -> float:
-    """Return the same angle within +-180 degrees."""
+    """The same angle within +-180 degrees."""
     return math.remainder(angle, 360.0)
 
 

@@ -78,7 +78,7 @@ class Imu:
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
-        """Return the mean of the values added since the last reading, with the sensors' errors."""
+        """The mean of the values added since the last reading, with the sensors' errors."""
         if len(self._white) < 6:
             self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
         take = self._white.pop
@@ -239,7 +239,7 @@ def normalize_quaternion(quaternion: Quaternion) -> Quaternion:
 
 
 def multiply_quaternions(first: Quaternion, second: Quaternion) -> Quaternion:
-    """Return the turn by `second` and then by `first`."""
+    """The turn by `second` and then by `first`."""
     w, x, y, z = first
     a, b, c, d = second
     return (

@@ -130,7 +130,7 @@ class HighLevelPlanner:
         self.state = FLYING
 
     def setpoint(self, t_s: float) -> Setpoint:
-        """Return the setpoint at t; a null one (motors off) while idle."""
+        """The setpoint at t; a null one (motors off) while idle."""
         if self.state == LANDING and self.finished(t_s):
             self.state = IDLE
         if self.state == IDLE:
