@@ -41,7 +41,7 @@ class Channel(Connection):
     EOFError when the other end is gone."""
 
     def receive(self, timeout_s: float | None = None) -> Any:
-        """Return the next message. Raises TimeoutError after `timeout_s` without one, EOFError when
+        """The next message. Raises TimeoutError after `timeout_s` without one, EOFError when
         the other end is gone."""
         if not self.poll(timeout_s):
             raise TimeoutError("no message came")
@@ -70,7 +70,7 @@ def spawn(code: str, output: int | IO[bytes]) -> tuple[subprocess.Popen[bytes], 
 
 
 def connect_to_parent() -> Channel:
-    """Return the connection of a `spawn`ed child to its parent, and report that it is up."""
+    """The connection of a `spawn`ed child to its parent, and report that it is up."""
     channel = Channel(int(sys.argv[2]))
     channel.send(None)
     return channel
@@ -101,7 +101,7 @@ def wait_or_kill(child: subprocess.Popen[bytes], timeout_s: float) -> None:
 
 
 def last_line(output: IO[bytes]) -> str:
-    """Return the last line that a child has printed, with a colon before it, for a message."""
+    """The last line that a child has printed, with a colon before it, for a message."""
     if output.closed:
         return ""
     output.seek(0)

@@ -41,17 +41,17 @@ def _install(extra: str) -> str:
 
 
 def no_simulator(missing: str | None = "mujoco") -> UsageError:
-    """Return the error for a missing extra ``sim``, of which `missing` is a part."""
+    """The error for a missing extra ``sim``, of which `missing` is a part."""
     return UsageError(f"the simulator is not installed ({missing} is missing); {_install('sim')}")
 
 
 def no_motion_capture(needed_by: str = "positioning by motion capture") -> UsageError:
-    """Return the error for a missing extra ``mocap``."""
+    """The error for a missing extra ``mocap``."""
     return UsageError(f"{needed_by} needs the library motioncapture; {_install('mocap')}")
 
 
 def broken_motion_capture(why: str) -> UsageError:
-    """Return the error for an extra ``mocap`` that is installed, and cannot be loaded."""
+    """The error for an extra ``mocap`` that is installed, and cannot be loaded."""
     return UsageError(
         f"the library motioncapture cannot be loaded: {why}; reinstall it with: "
         f"{sys.executable} -m pip install --force-reinstall 'perchctl[mocap]'"
@@ -59,7 +59,7 @@ def broken_motion_capture(why: str) -> UsageError:
 
 
 def no_cluster(why: str = "it is missing") -> UsageError:
-    """Return the error for an extra ``cluster`` that is missing, or cannot be loaded."""
+    """The error for an extra ``cluster`` that is missing, or cannot be loaded."""
     return UsageError(f"--cluster needs the library distributed ({why}); {_install('cluster')}")
 
 

@@ -35,7 +35,7 @@ _READ_BYTES = 4096
 
 
 def file_kind(path: Path) -> str:
-    """Return what a file seems to be, as in ``a picture``; ``another kind of file`` if unknown.
+    """What a file seems to be, as in ``a picture``; ``another kind of file`` if unknown.
 
     For messages about a file of the wrong kind; never raises.
     """
@@ -92,7 +92,7 @@ def same_file(one: Path, other: Path) -> bool:
 def write_error(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
-    """Return the operating system's refusal as an error of one sentence."""
+    """The operating system's refusal as an error of one sentence."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 
 
@@ -136,7 +136,7 @@ def _refusals_of(path: Path) -> Iterator[None]:
 
 
 def file_mode(path: Path) -> int:
-    """Return a file's permissions. Raises OSError."""
+    """A file's permissions. Raises OSError."""
     return stat.S_IMODE(path.stat().st_mode)
 
 

@@ -38,12 +38,12 @@ def finite(values: Array) -> bool:
 
 
 def wrap_rad(angle_rad: float) -> float:
-    """Return the same angle in (-pi, pi]."""
+    """The same angle in (-pi, pi]."""
     return -((-angle_rad + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 def rot_z(yaw_rad: float) -> Array:
-    """Return the rotation about z, shape (3, 3)."""
+    """The rotation about z, shape (3, 3)."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -72,12 +72,12 @@ def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
 
 
 def yaw_of(R: Array) -> float:
-    """Return the heading of the rotated x axis in the xy plane, in (-pi, pi]."""
+    """The heading of the rotated x axis in the xy plane, in (-pi, pi]."""
     return math.atan2(R[1, 0], R[0, 0])
 
 
 def rotation_from_quaternion(quaternion: tuple[float, float, float, float]) -> Array:
-    """Return the rotation of a unit quaternion (w, x, y, z), shape (3, 3)."""
+    """The rotation of a unit quaternion (w, x, y, z), shape (3, 3)."""
     w, x, y, z = quaternion
     return np.array(
         [
@@ -89,7 +89,7 @@ def rotation_from_quaternion(quaternion: tuple[float, float, float, float]) -> A
 
 
 def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (w, x, y, z) with w >= 0: the inverse of
+    """The unit quaternion (w, x, y, z) with w >= 0: the inverse of
     `rotation_from_quaternion`.
 
     Each row of the products is the quaternion times four times one of its parts; the longest is
@@ -115,7 +115,7 @@ def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
 def quaternion_from_rpy(
     roll_rad: float, pitch_rad: float, yaw_rad: float
 ) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix."""
+    """The unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix."""
     cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
     cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
     cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
@@ -128,7 +128,7 @@ def quaternion_from_rpy(
 
 
 def nearest_axis(direction: Array) -> str | None:
-    """Return the axis within 30 deg of a unit vector (3,), such as ``-y``, or None."""
+    """The axis within 30 deg of a unit vector (3,), such as ``-y``, or None."""
     i = int(np.argmax(np.abs(direction)))
     if abs(float(direction[i])) < math.cos(math.radians(30.0)):
         return None
@@ -136,7 +136,7 @@ def nearest_axis(direction: Array) -> str | None:
 
 
 def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
-    """Return the homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
+    """The homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t_m
@@ -153,7 +153,7 @@ def invert_T(T_a_b: Array) -> Array:
 
 
 def circular_mean(weights: Array, angles_rad: Array) -> float:
-    """Return the weighted mean of angles on the circle, in (-pi, pi]; weights sum to one.
+    """The weighted mean of angles on the circle, in (-pi, pi]; weights sum to one.
 
     Linear in the difference from the first angle, so that it equals the plain
     weighted sum wherever no wrap is crossed (the paper's equation 8).

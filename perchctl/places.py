@@ -12,14 +12,14 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def data_folder(kind: str) -> Path:
-    """Return the folder of shipped `profiles` or `calib`: inside an installed wheel, or in the
+    """The folder of shipped `profiles` or `calib`: inside an installed wheel, or in the
     checkout."""
     shipped = _PACKAGE / "_data" / kind
     return shipped if shipped.is_dir() else _PACKAGE.parent / kind
 
 
 def data_file(kind: str, name: str) -> Path | None:
-    """Return a shipped or user file by name (with or without .yaml), or None."""
+    """A shipped or user file by name (with or without .yaml), or None."""
     for folder in (user_folder("config") / kind, data_folder(kind)):
         for candidate in (folder / name, folder / f"{name}.yaml"):
             if candidate.is_file():
@@ -28,7 +28,7 @@ def data_file(kind: str, name: str) -> Path | None:
 
 
 def file_names(kind: str) -> list[str]:
-    """Return the names, without folder and suffix, of the shipped and user files of a kind."""
+    """The names, without folder and suffix, of the shipped and user files of a kind."""
     folders = (data_folder(kind), user_folder("config") / kind)
     return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
 
@@ -44,7 +44,7 @@ def is_shipped_example(path: Path) -> bool:
 
 
 def user_folder(kind: Literal["config", "cache", "state", "runtime"]) -> Path:
-    """Return a folder of the user's by the XDG rules: for own profiles and calibrations, for what
+    """A folder of the user's by the XDG rules: for own profiles and calibrations, for what
     can be made anew, for results, or for what lives no longer than a session. It is not made."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # where the system names none, another is taken

@@ -28,7 +28,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value that the text holds, None for an empty one.
+    """The value that the text holds, None for an empty one.
 
     Raises ValueError, with a sentence, for what is not YAML or holds a key twice.
     """
@@ -46,7 +46,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def split_values(text: str) -> list[str]:
-    """Return the texts of the values between commas, as in a list; a value may itself be a list.
+    """The texts of the values between commas, as in a list; a value may itself be a list.
     Raises ValueError as `parse_yaml` does."""
     row = f"[{text}]"
     parse_yaml(row)
@@ -56,5 +56,5 @@ def split_values(text: str) -> list[str]:
 
 
 def clip_text(text: str, most: int = _MOST_SHOWN) -> str:
-    """Return the text, or its beginning if it is longer than `most`."""
+    """The text, or its beginning if it is longer than `most`."""
     return text if len(text) <= most else f"{text[: most - 3]}..."

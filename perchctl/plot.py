@@ -29,7 +29,7 @@ FORMATS = tuple(_METADATA)
 
 
 def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
-    """Return an empty figure whose panels do not overlap."""
+    """An empty figure whose panels do not overlap."""
     figure = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -43,7 +43,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def figure_bytes(figure: Figure, suffix: str = ".png") -> bytes:
-    """Return the figure in one of `FORMATS`, the same bytes for the same figure."""
+    """The figure in one of `FORMATS`, the same bytes for the same figure."""
     content = BytesIO()
     with rc_context({"svg.hashsalt": "perchctl"}):
         # The layout's solver differs in its last bits from one call to the next.

@@ -38,7 +38,7 @@ def restore_ctrl_c() -> None:
 
 
 def failure_record(sentence: str, code: int) -> str:
-    """Return the JSON text that `--json` prints for a failure."""
+    """The JSON text that `--json` prints for a failure."""
     import json
 
     return json.dumps({"error": sentence, "exit_code": code})

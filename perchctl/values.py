@@ -16,7 +16,7 @@ else:
     """Of the fields; none where the class has to be built by its own `__init__`."""
 
     def replace(value: Any, /, **changes: Any) -> Any:
-        """Return the dataclass with these changes, as `dataclasses.replace` does, which asks for
+        """The dataclass with these changes, as `dataclasses.replace` does, which asks for
         each field by name, several times: for a value with forty fields this takes a twentieth of
         its time. What a `cached_property` has kept stays behind."""
         kind = value.__class__

@@ -48,7 +48,7 @@ class FlightComparison:
         }
 
     def record(self) -> dict[str, Any]:
-        """Return the comparison for JSON, in SI units; differences are B minus A."""
+        """The comparison for JSON, in SI units; differences are B minus A."""
         a, b = (_flight_record(flight) for flight in self.flights)
         return {
             "a": a,
@@ -59,7 +59,7 @@ class FlightComparison:
         }
 
     def text(self) -> str:
-        """Return the comparison as a text table."""
+        """The comparison as a text table."""
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:
@@ -117,7 +117,7 @@ def _row(name: str, a: str, b: str, difference: str) -> str:
 
 
 def profile_differences(profile_a: Any, profile_b: Any) -> dict[str, tuple[Any, Any]]:
-    """Return the dotted keys in which two profiles (nested dicts, as from JSON) differ, each with
+    """The dotted keys in which two profiles (nested dicts, as from JSON) differ, each with
     the values of A and B."""
     a, b = _flat(profile_a), _flat(profile_b)
     return {

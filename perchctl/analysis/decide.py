@@ -40,7 +40,7 @@ class ReplayedDecision:
 
 
 def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
-    """Return the turns before the first one missing from the log, and a sentence that names the
+    """The turns before the first one missing from the log, and a sentence that names the
     missing turn (empty if none is). Errors: InvalidValue."""
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
@@ -103,7 +103,7 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
 
 
 def field_difference(name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
-    """Return the first subfield of field `name` in which two values differ, or None. Values of
+    """The first subfield of field `name` in which two values differ, or None. Values of
     different classes are returned whole, as text with their class."""
     if type(recorded) is not type(replayed):
         return name, _shown(recorded), _shown(replayed)
@@ -111,7 +111,7 @@ def field_difference(name: str, recorded: Any, replayed: Any) -> FieldDifference
 
 
 def first_field_difference(fields: Iterable[FieldDifference]) -> FieldDifference | None:
-    """Return the first difference among fields (name, recorded and replayed value), or None."""
+    """The first difference among fields (name, recorded and replayed value), or None."""
     return next((d for field in fields if (d := field_difference(*field)) is not None), None)
 
 

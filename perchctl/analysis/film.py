@@ -104,7 +104,7 @@ class _Stage:
         self._still = self._canvas.copy_from_bbox(self._figure.bbox)
 
     def drawn(self, index: int, image: Rgb | None, newest: dict[str, Any]) -> Rgb:
-        """Return a tick's picture, (height, width, 3); `newest`: the record of the newest frame."""
+        """A tick's picture, (height, width, 3); `newest`: the record of the newest frame."""
         record, t_s = self._flight.log.records[index], float(self._flight.log.t_s[index])
         if image is not None:
             self._image.set_data(image)
@@ -182,7 +182,7 @@ class _Stage:
 
 
 def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
-    """Return the vehicle's centre in each tick, (n, 2) m: horizontal distance from the target and
+    """The vehicle's centre in each tick, (n, 2) m: horizontal distance from the target and
     height above ground, in the vertical plane through the target and the take-off point; and the
     target's height, None if it was never seen. Errors: InvalidValue for a log without positions."""
     log = flight.log

@@ -73,7 +73,7 @@ class Measures:
     telemetry_age_p99_s: float | None = _number("telemetry's age, 99 %", "ms", 1e3, 0)
 
     def value_text(self, name: str) -> str:
-        """Return the figure `name` in its display unit, without the unit; ``-`` if unknown."""
+        """The figure `name` in its display unit, without the unit; ``-`` if unknown."""
         (of,) = [f for f in fields(self) if f.name == name]
         value = getattr(self, name)
         if value is None:
@@ -204,12 +204,12 @@ class FlightAnalysis:
     # --- single ticks
 
     def tracked_values(self, log_field: str) -> Array:
-        """Return a log field of each tick, (n,), NaN while the target is not tracked."""
+        """A log field of each tick, (n,), NaN while the target is not tracked."""
         remembered = [record.get("tracked") is False for record in self.log.records]
         return np.where(remembered, np.nan, self.log.column(log_field))
 
     def value_at(self, t_s: float, log_field: str) -> float:
-        """Return a log field at `t_s`; NaN if it is missing or not a number."""
+        """A log field at `t_s`; NaN if it is missing or not a number."""
         records = self.log.records
         value = records[self.log.index_at(t_s)].get(log_field) if records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -218,7 +218,7 @@ class FlightAnalysis:
 
 
 def contact_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
-    """Return the ascent that led to the last contact; None without a contact."""
+    """The ascent that led to the last contact; None without a contact."""
     ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
     return ascents[-1] if ascents else None
 
@@ -252,7 +252,7 @@ class Takeover:
 
 
 def group_takeovers(log: FlightLog) -> tuple[Takeover, ...]:
-    """Return the series of commands that other senders than the flight loop sent, oldest first."""
+    """The series of commands that other senders than the flight loop sent, oldest first."""
     goes: list[list[SentCommand]] = []
     for each in sorted(log.sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None

@@ -65,7 +65,7 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
 
 
 def flight_png(flight: FlightAnalysis) -> bytes:
-    """Return the picture of a flight as a PNG; the log has at least one tick."""
+    """The picture of a flight as a PNG; the log has at least one tick."""
     return figure_bytes(flight_figure(flight))
 
 

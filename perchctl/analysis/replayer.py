@@ -139,7 +139,7 @@ class Replay:
         return found
 
     def record(self) -> dict[str, Any]:
-        """Return the replay in JSON types.
+        """The replay in JSON types.
 
         `ticks`, `differences` and `first_difference` are the planner's; `pictures` (perception) is
         None without pictures; `changed` is empty for the flown profile.
@@ -162,7 +162,7 @@ class Replay:
         }
 
     def lines(self) -> list[str]:
-        """Return the replay's lines for people, without `notes`."""
+        """The replay's lines for people, without `notes`."""
         lines = [f"changed:   {', '.join(self.changed_keys)}"] if self.changed_keys else []
         text = "all with the same commands"
         if self.differences:
@@ -223,13 +223,13 @@ def replay(
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
-    """Return the dotted keys in which two profiles differ, without name, description and date."""
+    """The dotted keys in which two profiles differ, without name, description and date."""
     found = profile_differences(one.model_dump(mode="json"), other.model_dump(mode="json"))
     return tuple(key for key in found if key not in ("name", "description", "date"))
 
 
 def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
-    """Return the pipeline with the flown calibration and mask, unless the changed keys name others.
+    """The pipeline with the flown calibration and mask, unless the changed keys name others.
     Errors: InvalidValue, NotFound."""
     camera = log.flown_camera
     if camera is None or "camera.calibration" in changed:

@@ -149,7 +149,7 @@ POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-
 
 
 def report_html(flights: Sequence[ReportedFlight], with_film: bool = False) -> str:
-    """Return the report of at least one flight as self-contained HTML. Raises InvalidValue for
+    """The report of at least one flight as self-contained HTML. Raises InvalidValue for
     invalid values in a log."""
     articles = []
     for number, told in enumerate(flights, start=1):
@@ -197,7 +197,7 @@ def _templates() -> jinja2.Environment:
 
 
 def film_url_and_problem(flight: FlightAnalysis) -> tuple[str, str]:
-    """Return the flight's film as a `data:` URL, and why the film or its camera pictures are
+    """The flight's film as a `data:` URL, and why the film or its camera pictures are
     missing; each may be empty. The log has at least one tick."""
     path = flight.log.path
     is_recorded = path_beside(path, ".mcap").is_file()

@@ -19,7 +19,7 @@ _HANG = 11
 
 
 def show_record(flight: FlightAnalysis) -> dict[str, Any]:
-    """Return the content of `show_text` for JSON: SI units, times from the flight's first turn."""
+    """The content of `show_text` for JSON: SI units, times from the flight's first turn."""
     log, end, header = flight.log, flight.summary, flight.log.header
     return {
         "log": str(log.path),
@@ -97,7 +97,7 @@ def _origin(log: FlightLog) -> str:
 
 
 def utc_text(started_utc: Any) -> str:
-    """Return the `started_utc` of a log header as readable text."""
+    """The `started_utc` of a log header as readable text."""
     return str(started_utc).replace("T", " ").replace("+00:00", " UTC")
 
 
@@ -139,7 +139,7 @@ def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
 
 
 def printable(text: str) -> str:
-    """Return the text with control characters, which a terminal would execute, as ``?``."""
+    """The text with control characters, which a terminal would execute, as ``?``."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
@@ -164,7 +164,7 @@ def with_hanging_indent(prefix: str, text: str) -> list[str]:
 
 
 def newest_logs(folder: Path, limit: int | None = None) -> list[Path]:
-    """Return the folder's flight logs (``flight_*.jsonl``, ``.jsonl.gz``), at most `limit`, sorted
+    """The folder's flight logs (``flight_*.jsonl``, ``.jsonl.gz``), at most `limit`, sorted
     by the time of their last record, newest first. Errors: NotFound."""
     if not folder.is_dir():
         raise NotFound(f"there is no folder {folder} with flight logs: name a log, or its folder")

@@ -20,7 +20,7 @@ GAP_PERIODS = 2.5
 
 
 def percentile(values: Array, percent: float) -> float:
-    """Return a percentile of the values that are not NaN; NaN if all are."""
+    """A percentile of the values that are not NaN; NaN if all are."""
     known = values[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else math.nan
 
@@ -58,7 +58,7 @@ class Frames:
 
 
 def read_frames(log: FlightLog) -> Frames:
-    """Return the frame timing of a flight; gaps are found relative to the median period."""
+    """The frame timing of a flight; gaps are found relative to the median period."""
     records = [record for record in log.records if record.get("frame_t_s") is not None]
     times_s = log.to_flight_s(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
@@ -120,7 +120,7 @@ class TargetLoss:
 
 
 def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
-    """Return all losses in order; none at the ceiling, where no pictures are evaluated."""
+    """All losses in order; none at the ceiling, where no pictures are evaluated."""
     stays = log.phases
     starts_s = [float(t_s) for t_s in frames.times_with_target_s]
     ends_s = [*starts_s[1:], log.end_s]

@@ -45,7 +45,7 @@ class Sentence:
 
 
 def tell_story(flight: FlightAnalysis) -> tuple[Sentence, ...]:
-    """Return the events of a flight in order of time; empty for a log without ticks."""
+    """The events of a flight in order of time; empty for a log without ticks."""
     if not flight.log.records:
         return ()
     told = [

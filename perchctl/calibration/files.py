@@ -24,7 +24,7 @@ MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "eq
 
 
 def profile_camera(config: CameraConfig) -> CameraModel:
-    """Return the calibrated camera of a profile. Raises as `load_calibration`."""
+    """The calibrated camera of a profile. Raises as `load_calibration`."""
     return load_calibration(config.calibration)
 
 
@@ -168,7 +168,7 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
 def calibration_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
-    """Return the content of a calibration file; `notes` are further keys, which ROS readers ignore;
+    """The content of a calibration file; `notes` are further keys, which ROS readers ignore;
     arrays are (n, m)."""
     # ROS wants five coefficients of plumb_bob.
     short = camera.model == "plumb_bob" and camera.dist.size == 4

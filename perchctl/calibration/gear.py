@@ -29,7 +29,7 @@ _CLOSED_PX, _EDGE_PX = 7, 3  # gaps that are gear; blur around it
 def learn_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of the pixels that the vehicle covers, by the pictures of a recording,
+    """The mask (h, w) of the pixels that the vehicle covers, by the pictures of a recording,
     or of a live camera for `LIVE_S` or until `stopped`.
 
     Raises:

@@ -55,7 +55,7 @@ class _Picture:
     data: bytearray
 
     def pixels(self) -> NDArray[np.uint8] | None:
-        """Return the grey picture (h, w) of complete raw or JPEG data of its size, else None."""
+        """The grey picture (h, w) of complete raw or JPEG data of its size, else None."""
         shape, data = (self.height, self.width), bytes(self.data)
         if len(data) != self.size:
             return None
@@ -163,7 +163,7 @@ def has_mosaic(image: NDArray[np.uint8]) -> bool:
 
 
 def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the picture smoothed to grey: a quarter red, half green, a quarter blue.
+    """The picture smoothed to grey: a quarter red, half green, a quarter blue.
 
     The weights 1 2 1 along rows and columns cancel any pattern with a period of two pixels, so this
     works for each order of the colour filters, and for a JPEG.

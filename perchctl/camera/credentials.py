@@ -16,7 +16,7 @@ _SECRET = re.compile(
 
 
 def without_password(text: str) -> str:
-    """Return the text without user names and passwords in URLs, and without the values of
+    """The text without user names and passwords in URLs, and without the values of
     ``password=`` and similar keys. In doubt too much is removed."""
     if start := _URL.match(text):  # all of it is one URL, spaces in the password too
         text = start.group() + _without_name(text[start.end() :])
@@ -35,7 +35,7 @@ def _without_name(rest: str) -> str:
 
 
 def profile_record(profile: Profile) -> dict[str, Any]:
-    """Return all keys of the profile for JSON, with passwords removed: a profile read back from it
+    """All keys of the profile for JSON, with passwords removed: a profile read back from it
     cannot open a camera that needs one."""
     record = profile.model_dump(mode="json")
     record["camera"]["source"] = without_password(profile.camera.source)

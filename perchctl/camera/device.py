@@ -25,7 +25,7 @@ REOPEN_EVERY_S = 1.0
 def open_video_capture(
     place: str, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> Any:
-    """Return an opened cv2.VideoCapture of `camera_number(place)`, set to `size_px` and to the
+    """An opened cv2.VideoCapture of `camera_number(place)`, set to `size_px` and to the
     format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
@@ -148,7 +148,7 @@ def _of_system(number: int, attribute: str, names: Path) -> str:
 
 
 def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> int:
-    """Return the number of the camera that the text after ``camera:`` names: a number, a name or
+    """The number of the camera that the text after ``camera:`` names: a number, a name or
     part of a name (quotes and case do not matter), or a device path.
 
     Errors: InvalidValue if several cameras match; NotFound.

@@ -47,7 +47,7 @@ class RecordedSource:
         return self._ahead is None
 
     def poll(self, now_s: float) -> Frame | None:
-        """Return the next frame, with the recording's own time; None at the end."""
+        """The next frame, with the recording's own time; None at the end."""
         if self._ahead is None:
             return None
         image, t_s = self._ahead
@@ -133,7 +133,7 @@ class ImagesSource(RecordedSource):
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
-    """Return the grey picture of a file's bytes.
+    """The grey picture of a file's bytes.
 
     Raises ValueError for one that is cut off, or that OpenCV does not read.
     """
@@ -149,7 +149,7 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:
-    """Return the files of a folder, glob or list, each once, naturally sorted. Raises NotFound."""
+    """The files of a folder, glob or list, each once, naturally sorted. Raises NotFound."""
     if not isinstance(where, str):
         return sorted(set(where), key=_natural)
     folder = Path(where)

@@ -26,7 +26,7 @@ _SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def jpeg_end_and_size(data: bytes | bytearray) -> tuple[int, tuple[int, int]] | None:
-    """Return the length of the JPEG at the start of `data`, and its width and height; None if it is
+    """The length of the JPEG at the start of `data`, and its width and height; None if it is
     incomplete.
 
     For a damaged JPEG (a marker is missing, or another picture begins) return the offset of the
@@ -98,7 +98,7 @@ class JpegSplitter:
 
 
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the grey picture of any bytes, None if OpenCV cannot decode them; raises nothing."""
+    """The grey picture of any bytes, None if OpenCV cannot decode them; raises nothing."""
     if not data:
         return None  # of an empty array OpenCV makes an error
     try:

@@ -54,7 +54,7 @@ class SourceName:
 
 
 def parse_source(text: str) -> SourceName:
-    """Return the source of a text: a scheme in either case and its place, or a bare path of video,
+    """The source of a text: a scheme in either case and its place, or a bare path of video,
     picture, pattern or folder. Nothing is opened.
 
     Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path

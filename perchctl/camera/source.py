@@ -43,7 +43,7 @@ class NewestSlot:
             self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)
 
     def take(self) -> Frame | None:
-        """Return the newest frame; None if it was returned already."""
+        """The newest frame; None if it was returned already."""
         frame, self._frame = self._frame, None
         return frame
 
@@ -75,10 +75,10 @@ class FrameSource(Protocol):
         """Width and height of the frames, once the first has come."""
 
     def poll(self, now_s: float) -> Frame | None:
-        """Return the newest frame, or None if there is none since the last call."""
+        """The newest frame, or None if there is none since the last call."""
 
     def problem(self, now_s: float) -> str | None:
-        """Return one sentence if the source is gone, else None."""
+        """One sentence if the source is gone, else None."""
 
     def describe(self) -> str: ...
 
@@ -86,7 +86,7 @@ class FrameSource(Protocol):
 
 
 def to_grey(image: Any) -> Grey:
-    """Return a contiguous 8-bit grey picture of grey, BGR or BGRA, 8 or 16 bits."""
+    """A contiguous 8-bit grey picture of grey, BGR or BGRA, 8 or 16 bits."""
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     if image.ndim == 3 and image.shape[2] == 1:
@@ -278,7 +278,7 @@ class WrappedSource:
 
 
 def mirrored_note(config: CameraConfig) -> str:
-    """Return a sentence: the picture is mirrored, and how to correct this profile."""
+    """A sentence: the picture is mirrored, and how to correct this profile."""
     advice = "switch that off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror, so take camera.mirrored out of the profile"
@@ -286,5 +286,5 @@ def mirrored_note(config: CameraConfig) -> str:
 
 
 def unmirror_frame(frame: Frame) -> Frame:
-    """Return the frame flipped left to right, without its original JPEG bytes."""
+    """The frame flipped left to right, without its original JPEG bytes."""
     return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)

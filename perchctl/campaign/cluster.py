@@ -55,7 +55,7 @@ class WorkerRequirements:
 
 
 def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """Return what a flight's result depends on, by name: versions of perchctl and its libraries,
+    """What a flight's result depends on, by name: versions of perchctl and its libraries,
     hashes of the `profiles`, and the number of `threads`."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",
@@ -68,7 +68,7 @@ def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, s
 
 
 def worker_requirements(profiles: Sequence[Profile]) -> WorkerRequirements:
-    """Return the requirements of a campaign that begins now."""
+    """The requirements of a campaign that begins now."""
     state = flight_environment(profiles, threads=1)
     return WorkerRequirements(secrets.token_hex(16), tuple(profiles), state)
 

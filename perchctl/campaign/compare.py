@@ -93,14 +93,14 @@ MISS = ("miss_m",)
 
 
 def compare_variants(results: Iterable[FlightResult]) -> Comparison:
-    """Return the comparison of two profiles over the seeds flown with both."""
+    """The comparison of two profiles over the seeds flown with both."""
     return compare_pairs([(a, b) for a, b in results_by_seed(results, 2)])
 
 
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """Return the comparison of two flights per seed. `comparisons`: number of comparisons that
+    """The comparison of two flights per seed. `comparisons`: number of comparisons that
     share the 5 % significance level."""
     questions = comparisons * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
@@ -150,7 +150,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
-    """Return the comparison as a table, with the proven differences below."""
+    """The comparison as a table, with the proven differences below."""
     flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
@@ -195,7 +195,7 @@ class Sweep:
     profiles: tuple[Profile, ...]
 
     def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
-        """Return the figures of each value (a cell) for JSON, over the seeds flown with all values.
+        """The figures of each value (a cell) for JSON, over the seeds flown with all values.
         `best`: the value with the most successes, then the smallest median miss;
         `best_against_own`: `Comparison` of the original value (A) with `best` (B), None if these
         are the same."""
@@ -214,7 +214,7 @@ class Sweep:
         return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
 
     def text(self, record: dict[str, Any]) -> str:
-        """Return a sweep's `record` as a table, with the comparison of the best value."""
+        """A sweep's `record` as a table, with the comparison of the best value."""
         rows: list[tuple[str, ...]] = [(self.key, "success", "miss [mm]: median", "p95", "")]
         for cell in record["cells"]:
             misses = ("-" if m is None else f"{1e3 * m:.1f}" for m in cell["miss_m"].values())
@@ -229,7 +229,7 @@ class Sweep:
 
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
-    """Return the sweep of the text ``key=value,value``, values as in a profile file. Errors:
+    """The sweep of the text ``key=value,value``, values as in a profile file. Errors:
     UsageError, InvalidValue."""
     key, equals, text = (part.strip() for part in sweep.partition("="))
     try:

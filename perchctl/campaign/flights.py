@@ -89,7 +89,7 @@ def fly_seed(
 
 
 def seed_log_path(seed: int, log_dir: Path) -> Path:
-    """Return the path of a seed's log in `log_dir`."""
+    """The path of a seed's log in `log_dir`."""
     return log_dir / f"flight_seed{seed}.jsonl"
 
 

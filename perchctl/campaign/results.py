@@ -75,7 +75,7 @@ class FlightResult(CampaignFlight):
 
 
 def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
-    """Return a campaign's figures, ready for JSON.
+    """A campaign's figures, ready for JSON.
 
     `rates` are shares with intervals. `miss_m` is over perched flights (None without; p95 by linear
     interpolation). `worst_seeds` names at most `WORST` bad flights.
@@ -94,7 +94,7 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
 
 
 def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
-    """Return the median and the 95th percentile of misses for JSON; None without any."""
+    """The median and the 95th percentile of misses for JSON; None without any."""
     if not misses_m:
         return {"median": None, "p95": None}
     median_m, p95_m = np.percentile(misses_m, (50, 95)).round(6).tolist()
@@ -102,13 +102,13 @@ def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
-    """Return the bad flights, in order of outcome (aborted, landed, refused, perched) and seed."""
+    """The bad flights, in order of outcome (aborted, landed, refused, perched) and seed."""
     bad = [r for r in results if r.is_bad]
     return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
 
 
 def all_refused_error(results: Sequence[FlightResult]) -> SafetyAbort | None:
-    """Return the error of a campaign whose flights were all refused (so the seeds are not the
+    """The error of a campaign whose flights were all refused (so the seeds are not the
     cause); None for any other."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
@@ -117,7 +117,7 @@ def all_refused_error(results: Sequence[FlightResult]) -> SafetyAbort | None:
 
 
 def campaign_table(results: Sequence[FlightResult]) -> str:
-    """Return the campaign's figures and its worst flights as plain text."""
+    """The campaign's figures and its worst flights as plain text."""
     figures = campaign_summary(results)
     lines = [f"{name:<18}{text}" for name, text in _rows(figures, results)]
     bad = worst_first(results)
@@ -174,14 +174,14 @@ LEVEL = 0.95
 
 
 def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
-    """Return the exact two-sided confidence interval of a rate after `k` of `n` (Clopper and
+    """The exact two-sided confidence interval of a rate after `k` of `n` (Clopper and
     Pearson, 1934): it contains the true rate in at least `level` of all campaigns."""
     found = binomtest(k, n).proportion_ci(level, method="exact")
     return float(found.low), float(found.high)
 
 
 def rate_text(k: int, n: int) -> str:
-    """Return a rate with its interval: ``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4
+    """A rate with its interval: ``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4
     %)``."""
     if n == 0:
         return "0 of 0"
@@ -194,7 +194,7 @@ def rate_text(k: int, n: int) -> str:
 
 
 def rate_record(k: int, n: int) -> dict[str, float | list[float]]:
-    """Return a rate and its interval for JSON; empty if `n` is 0."""
+    """A rate and its interval for JSON; empty if `n` is 0."""
     if n == 0:
         return {}
     return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n)]}

@@ -105,7 +105,7 @@ _MUST_AGREE = {"source": "program", "profile_sha256": "profile", "faults": "sele
 
 
 def campaign_header(profile: Profile, faults: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return the first line of a new campaign's file.
+    """The first line of a new campaign's file.
 
     `perchctl` is the version, `source` the hash of the source code, `profile` the profile's name,
     `profile_sha256` the hash of calibration and profile without name and description. `faults`:
@@ -122,7 +122,7 @@ def campaign_header(profile: Profile, faults: Sequence[str] | None = None) -> di
 
 
 def profile_sha256(profile: Profile) -> str:
-    """Return the SHA-256 of all values of a profile that may change a flight."""
+    """The SHA-256 of all values of a profile that may change a flight."""
     values = profile.model_dump(mode="json", exclude={"name", "description"})
     text = json.dumps([values, camera_record(profile)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -130,7 +130,7 @@ def profile_sha256(profile: Profile) -> str:
 
 @cache
 def source_sha256(root: Path = SOURCE) -> str:
-    """Return the SHA-256 of names and content of all modules below `root`; cached, so later changes
+    """The SHA-256 of names and content of all modules below `root`; cached, so later changes
     of the files do not count."""
     whole = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):

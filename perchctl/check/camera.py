@@ -52,7 +52,7 @@ _ADVICE = {
 
 
 def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
-    """Return the rows of a camera that fails: one failed, the others skipped."""
+    """The rows of a camera that fails: one failed, the others skipped."""
     found, semicolon, advice = str(error).rpartition("; ")
     if not semicolon:
         found, advice = str(error), "see docs/check.md; perchctl check --cameras lists the cameras"
@@ -70,7 +70,7 @@ def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) ->
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """Return the rows on the pictures of a rehearsal."""
+    """The rows on the pictures of a rehearsal."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = picture_row_names(profile)
@@ -207,7 +207,7 @@ IN_VIEW = "in view"
 
 
 def picture_row_names(profile: Profile) -> tuple[str, ...]:
-    """Return the names of the pictures' rows, in their order."""
+    """The names of the pictures' rows, in their order."""
     return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
 
 

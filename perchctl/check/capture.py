@@ -64,7 +64,7 @@ class CaptureSamples:
     problem: str | None = None
 
     def body_poses(self, config: PositioningConfig) -> list[VehiclePose]:
-        """Return the vehicle's poses by the motion capture, corrected for latency, oldest first."""
+        """The vehicle's poses by the motion capture, corrected for latency, oldest first."""
         return [
             VehiclePose.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
             for frame in self.frames
@@ -101,7 +101,7 @@ BODY_ROWS = ("body", "body place")
 
 
 def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
-    """Return the rows of a motion capture that cannot be opened or sends nothing."""
+    """The rows of a motion capture that cannot be opened or sends nothing."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
     return [Row("capture", *failed(why, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
@@ -264,7 +264,7 @@ def pair_motion(
 
 
 def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """Return the alignment by all pairs of times between which the vehicle turned; None if it
+    """The alignment by all pairs of times between which the vehicle turned; None if it
     turned about fewer than two axes."""
     i, j = np.triu_indices(len(moved.R_vehicle), 1)
     size = (moved.R_vehicle[j] * moved.R_vehicle[i].inv()).magnitude()
@@ -385,7 +385,7 @@ COMPARED = "compared"
 def comparison_rows(
     config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
 ) -> list[Row]:
-    """Return one row on whether `fly` finds a saved lift comparison with this motion capture; none
+    """One row on whether `fly` finds a saved lift comparison with this motion capture; none
     without a motion capture, or for the simulated vehicle."""
     if config.by != "mocap" or simulated:
         return []

@@ -35,7 +35,7 @@ LOOKS_UP = math.cos(math.radians(45.0))
 
 
 def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
-    """Return a row for each check of the profile, the most important first.
+    """A row for each check of the profile, the most important first.
 
     `source` replaces the profile's. Opens no link and no camera; reads the calibration file. Raises
     nothing.
@@ -49,7 +49,7 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
 
 
 def offline_rows(options: FlyOptions) -> list[Row]:
-    """Return the rows on the computer's disk and the profile, without opening a link or camera."""
+    """The rows on the computer's disk and the profile, without opening a link or camera."""
     return [
         evaluate_row("log folder", log_finding, options.log_dir),
         *profile_rows(options.profile, source=options.source),
@@ -57,7 +57,7 @@ def offline_rows(options: FlyOptions) -> list[Row]:
 
 
 def warnings_before_flight(options: FlyOptions) -> list[str]:
-    """Return a sentence for each offline row that warns. Errors: SafetyAbort for the first row that
+    """A sentence for each offline row that warns. Errors: SafetyAbort for the first row that
     fails; InvalidValue, NotFound (calibration file); InvalidValue (log folder)."""
     profile_camera(options.profile.camera)
     check_writable(options.log_dir / "flight.jsonl", force=True)

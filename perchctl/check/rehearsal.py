@@ -95,7 +95,7 @@ class _TelemetryOnly:
 
 
 def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
-    """Return a stand-in for the link that gives a rehearsal its telemetry."""
+    """A stand-in for the link that gives a rehearsal its telemetry."""
     by_target = profile.positioning.by == "target"
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 

@@ -54,7 +54,7 @@ P = ParamSpec("P")
 
 
 def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs: P.kwargs) -> Row:
-    """Return the row with the finding of `judge`, skipped if it raises `Unanswerable`."""
+    """The row with the finding of `judge`, skipped if it raises `Unanswerable`."""
     try:
         return Row(name, *judge(*args, **kwargs))
     except Unanswerable as unknown:
@@ -64,37 +64,37 @@ def evaluate_row(name: str, judge: Callable[P, Finding], *args: P.args, **kwargs
 def evaluate_rows(
     judges: Mapping[str, Callable[P, Finding]], *args: P.args, **kwargs: P.kwargs
 ) -> list[Row]:
-    """Return a row for each judge (a check function), in the mapping's order."""
+    """A row for each judge (a check function), in the mapping's order."""
     return [evaluate_row(name, judge, *args, **kwargs) for name, judge in judges.items()]
 
 
 def skipped_rows(names: Iterable[str], why: str, advice: str = "") -> list[Row]:
-    """Return a skipped row for each name, all with the same reason."""
+    """A skipped row for each name, all with the same reason."""
     return [Row(name, *skipped(why, advice)) for name in names]
 
 
 def passed(found: str) -> Finding:
-    """Return a passing finding; `found` is the observation, with units."""
+    """A passing finding; `found` is the observation, with units."""
     return Finding(Verdict.PASS, found)
 
 
 def warned(found: str, advice: str) -> Finding:
-    """Return a warning finding, with advice."""
+    """A warning finding, with advice."""
     return Finding(Verdict.WARN, found, advice)
 
 
 def failed(found: str, advice: str) -> Finding:
-    """Return a failing finding, with advice."""
+    """A failing finding, with advice."""
     return Finding(Verdict.FAIL, found, advice)
 
 
 def skipped(why: str, advice: str = "") -> Finding:
-    """Return a skipped finding, with the reason."""
+    """A skipped finding, with the reason."""
     return Finding(Verdict.SKIPPED, why, advice)
 
 
 def problem_finding(problem: Problem | None, found: str) -> Finding:
-    """Return a failing finding for `problem`, by `fly`'s criteria; if None, one that passes."""
+    """A failing finding for `problem`, by `fly`'s criteria; if None, one that passes."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 
@@ -108,6 +108,6 @@ def limits_finding(
 
 
 def worst_finding(*findings: Finding) -> Finding:
-    """Return the worst finding; of equally bad ones the first."""
+    """The worst finding; of equally bad ones the first."""
     order = (Verdict.PASS, Verdict.SKIPPED, Verdict.WARN, Verdict.FAIL)
     return max(findings, key=lambda finding: order.index(finding.verdict))

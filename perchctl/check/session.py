@@ -39,7 +39,7 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """Return the rows of `--scan`: the vehicles that answer at the default address and at that of
+    """The rows of `--scan`: the vehicles that answer at the default address and at that of
     `uri`. Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)

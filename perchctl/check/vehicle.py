@@ -237,7 +237,7 @@ MOVED_G = 0.05
 
 
 def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list[Telemetry]:
-    """Return the vehicle's telemetry of `duration_s`, while it is lifted by hand."""
+    """The vehicle's telemetry of `duration_s`, while it is lifted by hand."""
     seen: list[Telemetry] = []
     for _ in range(max(1, round(duration_s / 0.1))):
         wait(0.1)
@@ -269,7 +269,7 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
 
 
 def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
-    """Return a row for the radio, and one for each vehicle that answers, from the result of
+    """A row for the radio, and one for each vehicle that answers, from the result of
     `find_uris_and_problem`."""
     radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")
     if radio_problem:

@@ -108,7 +108,7 @@ class LivePage:
     # --- for the server's threads ---
 
     def state(self) -> dict[str, Any]:
-        """Return the JSON that the page polls: the keys of `describe` (rows of name, text and
+        """The JSON that the page polls: the keys of `describe` (rows of name, text and
         optional bar length 0..1; note, phase, battery, over), title, fresh (whether pictures come),
         stop (``none``, ``ready``, ``requested``, ``over``), age_s of the values (None if no update
         is due), and the card of `end`, or None."""
@@ -361,7 +361,7 @@ class Sketch:
 
 
 def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float) -> Sketch:
-    """Return the frame with its marker outlines and the axes of the target's pose; only the frame
+    """The frame with its marker outlines and the axes of the target's pose; only the frame
     if `output` is None. `large_side_m` is the side of the large marker."""
     if output is None or output.detections.frame_index != frame.index:
         return Sketch(frame.image)
@@ -376,7 +376,7 @@ def make_sketch(frame: Frame, output: PipelineOutput | None, large_side_m: float
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
-    """Return the picture with its overlay, BGR (h, w, 3) uint8. Lines far outside the picture, and
+    """The picture with its overlay, BGR (h, w, 3) uint8. Lines far outside the picture, and
     axes with a tip behind the camera, are left out."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:

@@ -85,7 +85,7 @@ class FlightPage:
 
 
 def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
-    """Return the page's state for a tick: phase, battery, the rows of the terminal's panel, whether
+    """The page's state for a tick: phase, battery, the rows of the terminal's panel, whether
     the flight is over, and for the page's drawings the height, the target's offset and distance
     above in m (None: no target), and `drawing_sizes`."""
     state, volts, target = tick.state, tick.telemetry.battery_v, tick.target

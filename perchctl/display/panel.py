@@ -78,7 +78,7 @@ def _age(seconds: float) -> str:
 
 
 def event_text(event: Event) -> str:
-    """Return an event as one line."""
+    """An event as one line."""
     match event.kind:
         case EventKind.PHASE:
             text = f"{event.phase.value if event.phase else '?'}: {event.reason}"
@@ -189,7 +189,7 @@ def _new_live(stream: TextIO) -> Live:
 
 
 def status_panel(tick: Tick) -> Panel:
-    """Return the status panel of a tick: at most `WIDTH` columns and eight lines, nine with
+    """The status panel of a tick: at most `WIDTH` columns and eight lines, nine with
     external positions."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)

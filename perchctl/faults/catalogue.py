@@ -544,7 +544,7 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
 def draw_fault_case(
     fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario
 ) -> Case:
-    """Return a case of the given fault and phase with everything else drawn."""
+    """A case of the given fault and phase with everything else drawn."""
     source = DrawInputs(rng, scenario)
     moment_s = uniform(0.0, USUAL_S[phase])(source)
     effects = _value(fault.draw, source)

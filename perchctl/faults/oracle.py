@@ -88,7 +88,7 @@ class Sample(NamedTuple):
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """Return how deep a slip may be, m; `hold_ratio`: the magnet's hold over the weight."""
+    """How deep a slip may be, m; `hold_ratio`: the magnet's hold over the weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
@@ -386,7 +386,7 @@ def last_transition(report: FlightReport) -> str:
 
 
 def report_claims(report: FlightReport) -> Claims:
-    """Return all claims that a report makes about the vehicle."""
+    """All claims that a report makes about the vehicle."""
     claims = ROW_CLAIMS.get(last_transition(report), set()) | PHASE_CLAIMS.get(report.phase, set())
     locked = {"locked"} if report.locked else set()
     return claims | OUTCOME_CLAIMS[report.outcome] | locked

@@ -80,7 +80,7 @@ SHARES = {
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
-    """Return a campaign's figures as a record for JSON.
+    """A campaign's figures as a record for JSON.
 
     The count of a flag leaves out flights in which an expected outcome covers it. `unavoidable` is
     the number of flights with a covered flag, `expected_outcomes` that of flights with each cause;

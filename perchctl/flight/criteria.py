@@ -226,7 +226,7 @@ class GroundCriteria:
 
 
 def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """Return the problem of a capture whose vertical is not that of the vehicle's own attitude."""
+    """The problem of a capture whose vertical is not that of the vehicle's own attitude."""
     if place.quaternion is None:
         return None
     # The world's vertical in the capture's axes, if its body's axes are the vehicle's.
@@ -247,7 +247,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
 
 
 def feed_name(profile: Profile) -> str:
-    """Return the source of the external positions, in words."""
+    """The source of the external positions, in words."""
     by_target = profile.positioning.by == "target"
     return "the sight of the target" if by_target else "the motion capture"
 
@@ -261,7 +261,7 @@ class RestCheck:
     def moved_body_problem(
         self, place: ExternalPosition | None, profile: Profile
     ) -> Problem | None:
-        """Return the problem of a body that has moved since the vehicle came to rest.
+        """The problem of a body that has moved since the vehicle came to rest.
 
         To be called in each turn with fresh telemetry and a fresh position; `place` is None while
         the vehicle does not stand still, which restarts the check."""
@@ -278,7 +278,7 @@ class RestCheck:
 
 
 def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
-    """Return the problem of external positions that are not sent, or are too old."""
+    """The problem of external positions that are not sent, or are too old."""
     if status.problem is not None:
         return Problem(status.problem, "see perchctl check")
     if status.age_s <= profile.positioning.hold_s:
@@ -288,7 +288,7 @@ def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:
 
 
 def estimate_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """Return the problem of a state estimate whose position or heading differs from `place`."""
+    """The problem of a state estimate whose position or heading differs from `place`."""
     away_m = math.dist(place.position_m, telemetry.position_m)
     turned_deg = 0.0
     if place.quaternion is not None:

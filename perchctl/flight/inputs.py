@@ -165,7 +165,7 @@ class FlightInputs:
             self.last_good_frame_s = now_s  # the picture came: the camera is not gone
 
     def observation(self, now_s: float) -> Observation:
-        """Return the observation with the fields of `SENSED_FIELDS`; the loop adds the others."""
+        """The observation with the fields of `SENSED_FIELDS`; the loop adds the others."""
         perception, newest = self.perception, self.history.newest
         assert newest is not None
         return Observation(
@@ -193,7 +193,7 @@ class FlightInputs:
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
-        """Return the target's estimate at the present; None before one was seen. It is not
+        """The target's estimate at the present; None before one was seen. It is not
         `tracked` while no good frames come or are searched, since the filter coasts by frames."""
         target = self.perception.target(now_s, spread=self.recorded)
         if self._positioning is not None:  # else the estimate runs away
@@ -267,7 +267,7 @@ class TargetPositioning:
     def with_fixed_target(
         self, target: TargetEstimate | None, history: History
     ) -> TargetEstimate | None:
-        """Return the estimate with the target's known place; unchanged until the place is known."""
+        """The estimate with the target's known place; unchanged until the place is known."""
         newest = history.newest
         now = None if newest is None else attitude_at(history, newest.t_s)
         return target if target is None or now is None else self.feed.with_fixed_target(target, now)
@@ -375,7 +375,7 @@ class TurnReporter:
         command: Command,
         feed: FeedStatus | None,
     ) -> Turn:
-        """Return the turn, once its command was sent."""
+        """The turn, once its command was sent."""
         self._open = None
         return Turn(
             number=self._counted(),
@@ -405,7 +405,7 @@ class TurnReporter:
 
 
 def external_positions(status: FeedStatus | None) -> ExternalPositions | None:
-    """Return the feed's status as the log has it."""
+    """The feed's status as the log has it."""
     if status is None:
         return None
     return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

@@ -85,7 +85,7 @@ class LockstepSource:
 
 
 def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
-    """Return a source of the vehicle's camera; it unmirrors frames if the profile says so."""
+    """A source of the vehicle's camera; it unmirrors frames if the profile says so."""
     source = LockstepSource(vehicle, profile.camera.start_latency_s)
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
@@ -214,7 +214,7 @@ def fly_lockstep(
 
 
 def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """Return a feed of the simulated motion capture that is called at the link's time; None
+    """A feed of the simulated motion capture that is called at the link's time; None
     without a capture.
 
     Lets the time pass until the vehicle's body is seen, and starts the estimate there. Raises

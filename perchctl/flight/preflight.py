@@ -144,7 +144,7 @@ Start = tuple[float, float, float]  # where it stands, in the world of the targe
 def view_problem(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
-    """Return the problem of a way up that loses the target: no marker would be wholly in the
+    """The problem of a way up that loses the target: no marker would be wholly in the
     picture of a vehicle that leans a little, at take-off height over the start or over
     `planner.approach_xy_m`. `yaw_rad`: its heading at the start."""
     planner, (x, y, z) = profile.planner, start_m
@@ -172,7 +172,7 @@ def view_problem(
 def target_view_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
 ) -> TargetView:
-    """Return the target as seen from a level vehicle at `body_m`, in the target's world."""
+    """The target as seen from a level vehicle at `body_m`, in the target's world."""
     return view_from(
         np.array(body_m),
         yaw_rad,

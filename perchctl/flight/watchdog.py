@@ -119,7 +119,7 @@ class Watchdog:
     def poll(
         self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
     ) -> Command | None:
-        """Return the command to send in the loop's place, or None. `waiting`: unread samples."""
+        """The command to send in the loop's place, or None. `waiting`: unread samples."""
         last = self._last
         if self._cut_ordered:
             return self._cut(now_s, newest)

@@ -67,7 +67,7 @@ class Connection:
         self.cf.connection_failed.add_callback(self._on_failed)
 
     def open(self, uri: str, timeout_s: float) -> bool:
-        """Return True once the vehicle is connected, or refused (`lost`), within `timeout_s`."""
+        """True once the vehicle is connected, or refused (`lost`), within `timeout_s`."""
         # Opening a radio may block in its driver: it gets a thread and a bound.
         start_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):

@@ -55,7 +55,7 @@ def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
 
 
 def estimator_start_parameters(start: VehiclePose) -> dict[str, float]:
-    """Return the `kalman.initial*` parameters that make a reset start the estimator at `start`."""
+    """The `kalman.initial*` parameters that make a reset start the estimator at `start`."""
     x, y, z = (float(part) for part in start.position_m)
     values = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(start.R)}
     return {f"kalman.initial{name}": value for name, value in values.items()}

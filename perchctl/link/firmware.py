@@ -81,7 +81,7 @@ def _read_back(parameters: Any, name: str) -> str | None:
 
 
 def read_parameters(cf: Any) -> dict[str, float]:
-    """Return all parameters by name, as read when the link was opened."""
+    """All parameters by name, as read when the link was opened."""
     return {
         f"{group}.{name}": float(value)
         for group, values in cf.param.values.items()

@@ -161,7 +161,7 @@ class ProbeLink(ReadOnlyLink):
         return int(self._cf.platform.get_protocol_version())
 
     def parameters(self) -> dict[str, float]:
-        """Return all parameters by name, as read when the link was opened."""
+        """All parameters by name, as read when the link was opened."""
         return read_parameters(self._cf)
 
     def age_s(self) -> float:
@@ -170,7 +170,7 @@ class ProbeLink(ReadOnlyLink):
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
     def lost(self) -> str | None:
-        """Return why the link is gone, None while it is there."""
+        """Why the link is gone, None while it is there."""
         return "it was closed" if self.connection is None else self.connection.lost
 
     def round_trips_s(self, duration_s: float) -> list[float]:

@@ -328,12 +328,12 @@ def unconfirmed_reason(c: Context) -> str:
 
 
 def cut_row(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
-    """Return a row of the table: cut and lock the motors at once, in any airborne phase."""
+    """A row of the table: cut and lock the motors at once, in any airborne phase."""
     return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, stop=EmergencyStop())
 
 
 def end_row(name: str, bit: int, reason: str) -> Transition:
-    """Return a row of the table: the supervisor set `bit`, so stop the motors and abort."""
+    """A row of the table: the supervisor set `bit`, so stop the motors and abort."""
 
     def when(c: Context) -> bool:
         return c.telemetry.has_bit(bit)
@@ -344,17 +344,17 @@ def end_row(name: str, bit: int, reason: str) -> Transition:
 def land_row(
     name: str, phases: Set[Phase], when: Predicate, reason: Reason, outcome: Outcome = O.SAFETY
 ) -> Transition:
-    """Return a row of the table: finish the mission and begin the way down."""
+    """A row of the table: finish the mission and begin the way down."""
     return Transition(name, phases, when, P.LANDING, reason, S.LAND, outcome)
 
 
 def back_off_row(name: str, phases: Set[Phase], when: Predicate, reason: Reason) -> Transition:
-    """Return a row of the table: the attempt failed, so descend a little and try again."""
+    """A row of the table: the attempt failed, so descend a little and try again."""
     return Transition(name, phases, when, P.RECOVER, reason, S.BACK_OFF)
 
 
 def give_up_row(name: str, when: Predicate, reason: Reason) -> Transition:
-    """Return a row of the table: the landing was not completed normally."""
+    """A row of the table: the landing was not completed normally."""
     return Transition(name, {P.LANDING}, when, P.ABORTED, reason, S.LAND, O.SAFETY)
 
 

@@ -53,7 +53,7 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """Return the estimate with one more picture in its sums, and once a second with their solution.
+    """The estimate with one more picture in its sums, and once a second with their solution.
 
     `t_s` is the picture's arrival less the profile's latency. A pose that is not finite, too near,
     or without the attitude of its time is ignored.
@@ -145,7 +145,7 @@ def rows_variance_range(
     delay_s: float,
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
-    """Return a frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
+    """A frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
     variance (3,) of the target's place; and its range, m.
 
     `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
@@ -205,7 +205,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """Return the sums with one frame more, by its `rows_variance_range`. After a gap, or a jump,
+    """The sums with one frame more, by its `rows_variance_range`. After a gap, or a jump,
     the level starts anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
@@ -235,7 +235,7 @@ def add_rows(
 
 
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
-    """Return the errors of latency and mounting; None with less than a second of frames.
+    """The errors of latency and mounting; None with less than a second of frames.
 
     `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
     """

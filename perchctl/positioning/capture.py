@@ -56,7 +56,7 @@ class CaptureFailure:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """Return the child's connection: Vicon and VRPN take a port in the host's name, the others as
+    """The child's connection: Vicon and VRPN take a port in the host's name, the others as
     an option of its own."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
@@ -68,7 +68,7 @@ def capture_setup(config: PositioningConfig) -> CaptureSetup:
 def open_capture(
     config: PositioningConfig, clock: Callable[[], float] = time.monotonic
 ) -> MotionCapture:
-    """Return the motion capture once it is connected and its first frame has come.
+    """The motion capture once it is connected and its first frame has come.
 
     Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
     without an answer in `config.connect_timeout_s`.
@@ -106,14 +106,14 @@ class MotionCapture:
             raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """Return the newest frame since the last call, if possible one that shows the body."""
+        """The newest frame since the last call, if possible one that shows the body."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
             frames[-1] if frames else None
         )
 
     def frames(self) -> list[CaptureFrame]:
-        """Return all frames since the last call or poll, oldest first."""
+        """All frames since the last call or poll, oldest first."""
         return [self._frames.popleft() for _ in range(len(self._frames))]
 
     def problem(self, now_s: float) -> str | None:

@@ -42,7 +42,7 @@ class CaptureComparison(BaseModel):
     found: str = ""
 
     def objection_and_advice(self, now: datetime) -> tuple[str, str] | None:
-        """Return why no flight may rely on this comparison, and what to do; None if it passed, at
+        """Why no flight may rely on this comparison, and what to do; None if it passed, at
         most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
             return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
@@ -56,7 +56,7 @@ class CaptureComparison(BaseModel):
         return None
 
     def text(self, now: datetime) -> str:
-        """Return the comparison's date in words."""
+        """The comparison's date in words."""
         assert self.at is not None
         return f"compared by hand on {self.at.astimezone(now.tzinfo):%d %b %Y %H:%M}"
 
@@ -66,13 +66,13 @@ def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:
 
 
 def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
-    """Return a vehicle's comparison file; `vehicle` is as `perchctl.link.vehicle_uri` has it."""
+    """A vehicle's comparison file; `vehicle` is as `perchctl.link.vehicle_uri` has it."""
     of = repr(_set_up(config, vehicle)).encode()
     return user_folder("state") / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """Return the vehicle's comparison in this set-up; an unmade one if no file can be read."""
+    """The vehicle's comparison in this set-up; an unmade one if no file can be read."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())

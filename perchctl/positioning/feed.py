@@ -110,11 +110,11 @@ class SendingRate:
             self._times_s.popleft()
 
     def silent_s(self, now_s: float) -> float:
-        """Return the seconds since the newest position was sent; infinite before the first."""
+        """The seconds since the newest position was sent; infinite before the first."""
         return now_s - self._times_s[-1] if self._times_s else math.inf
 
     def sent_hz(self, now_s: float) -> float:
-        """Return how many positions were sent in the last second."""
+        """How many positions were sent in the last second."""
         return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
 
 
@@ -190,7 +190,7 @@ class PositionFeed:
             self._turned_s, self._problem = now_s, problem
 
     def place(self) -> VehiclePose | None:
-        """Return the newest pose that was sent, even if only its position was; None before that."""
+        """The newest pose that was sent, even if only its position was; None before that."""
         return self._placed
 
     def status(self, now_s: float) -> FeedStatus:
@@ -264,7 +264,7 @@ class VehiclePose:
 
     @classmethod
     def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> VehiclePose:
-        """Return the vehicle's pose, from that of the capture's rigid body and the profile's
+        """The vehicle's pose, from that of the capture's rigid body and the profile's
         offset: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
         roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
         length = math.sqrt(sum(part * part for part in pose.quaternion))
@@ -291,7 +291,7 @@ class PoseValidator:
         """Why the newest frame with news was not believed; None if it was."""
 
     def validate(self, frame: CaptureFrame, now_s: float) -> VehiclePose | None:
-        """Return the vehicle's pose at the frame's exposure; None if it may not be sent, for the
+        """The vehicle's pose at the frame's exposure; None if it may not be sent, for the
         cause in `problem`, or if the frame is not new."""
         arrived_s = min(frame.t_s, now_s)  # nothing arrives later than now
         if not math.isfinite(arrived_s) or arrived_s <= self._arrived_s:

@@ -46,12 +46,12 @@ NOWHERE = Place(np.zeros(3), 0.0)
 
 
 def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Place:
-    """Return the target's place by its pose in a picture and the body's attitude and position."""
+    """The target's place by its pose in a picture and the body's attitude and position."""
     return Place(*to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
 def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
-    """Return the body's place under a still target; of `attitude` only roll and pitch count."""
+    """The body's place under a still target; of `attitude` only roll and pitch count."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
@@ -86,7 +86,7 @@ class TargetFeed:
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
-        """Return the position, m, of a level body with the gear in the target's centre and the
+        """The position, m, of a level body with the gear in the target's centre and the
         estimated heading `yaw_rad`; None before the target's place is known."""
         if self.target is None:
             return None
@@ -95,7 +95,7 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
-        """Return the estimate with the target's known place, as the state estimate has it by its
+        """The estimate with the target's known place, as the state estimate has it by its
         learned offset `off`; unchanged until the place is known."""
         if self.target is None:
             return seen
@@ -135,7 +135,7 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the feed's status; a target not seen from the ground is a problem, too."""
+        """The feed's status; a target not seen from the ground is a problem, too."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None

@@ -15,7 +15,7 @@ BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
 def key(default: Any, meaning: str, **constraints: Any) -> Any:
-    """Return the pydantic `Field` of a profile key, with the description that users read. A
+    """The pydantic `Field` of a profile key, with the description that users read. A
     default of ... makes the key required."""
     return Field(default, description=meaning, **constraints)
 
@@ -93,7 +93,7 @@ UNITS_OF = {
 
 
 def key_unit(path: str) -> str:
-    """Return the unit that the ending of a key's name stands for; empty without one."""
+    """The unit that the ending of a key's name stands for; empty without one."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
@@ -105,7 +105,7 @@ def key_unit(path: str) -> str:
 def split_constant_keys(
     values: dict[str, Any], model: type[BaseModel], path: str = ""
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return a profile's values without the keys that have become constants (class variables of
+    """A profile's values without the keys that have become constants (class variables of
     `model` or of its nested models); a note for each such key with the constant's value; and an
     error sentence for each with another value.
     """

@@ -30,7 +30,7 @@ from perchctl.profile.schema import Profile
 
 
 def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
-    """Return the profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; values in
+    """The profile with each ``key=value``, such as ``planner.align.xy_m=0.03``; values in
     YAML. `option` names the command-line option in messages.
 
     Raises:
@@ -65,7 +65,7 @@ def _parsed(setting: str, option: str) -> tuple[str, str]:
 
 
 def profile_value(profile: Profile, dotted: str) -> Any:
-    """Return the value at a dotted key, in JSON types; None if there is no such key."""
+    """The value at a dotted key, in JSON types; None if there is no such key."""
     value: Any = profile.model_dump(mode="json")
     for name in dotted.split("."):
         value = value.get(name) if isinstance(value, dict) else None
@@ -93,7 +93,7 @@ _DECIMALS = 6
 
 
 def writable_profile(name: str) -> Path:
-    """Return the file of a user's own profile, with links resolved.
+    """The file of a user's own profile, with links resolved.
 
     Raises:
         NotFound: no such profile.
@@ -145,7 +145,7 @@ def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
 
 
 def replace_values(text: str, values: Mapping[str, Value]) -> str:
-    """Return a profile's text with the values under their dotted keys, as in ``camera.latency_s``.
+    """A profile's text with the values under their dotted keys, as in ``camera.latency_s``.
 
     Comments, order and quotes stay. A list of the same length keeps its layout; a missing key is
     added at its section's end, a missing section at the file's end.

@@ -94,7 +94,7 @@ _WIDTH = 80
 
 
 def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
-    """Return a profile's keys as YAML, each under a comment with meaning, unit and allowed values.
+    """A profile's keys as YAML, each under a comment with meaning, unit and allowed values.
 
     Read back, the keys have the same values. `paths`: dotted paths of the keys; None: all.
     """
@@ -134,14 +134,14 @@ def _comment(key: Key) -> str:
 
 
 def yaml_scalar(value: Any) -> str:
-    """Return the value in YAML, on one line."""
+    """The value in YAML, on one line."""
     plain = list(value) if isinstance(value, tuple) else value
     text: str = yaml.safe_dump([plain], default_flow_style=True, width=10**9, allow_unicode=True)
     return text.strip()[1:-1]
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
+    """The JSON schema of a profile's file: types, bounds, defaults, meanings and units."""
     schema = Profile.model_json_schema()
     for section in (schema, *schema["$defs"].values()):
         section.pop("title", None)

@@ -47,7 +47,7 @@ class Limit:
         return bool(eval(_KEY.sub(_read, self.relation), {"profile": profile}))
 
     def violation_text(self, profile: Any) -> str:
-        """Return a sentence: the broken relation with each key's value, and the consequence."""
+        """A sentence: the broken relation with each key's value, and the consequence."""
 
         def shown(found: re.Match[str]) -> str:
             value = eval(_read(found), {"profile": profile})

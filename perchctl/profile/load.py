@@ -38,7 +38,7 @@ def is_profile_path(name: str) -> bool:
 
 
 def find_profile(name: str) -> Path:
-    """Return the file of a profile given by path or name; NotFound names the choices."""
+    """The file of a profile given by path or name; NotFound names the choices."""
     if is_profile_path(name):
         path = Path(name).expanduser()
         if path.is_file():
@@ -116,7 +116,7 @@ def _read_weights(name: str) -> WeightsConfig:
 
 
 def find_calibration(name: str) -> Path:
-    """Return a calibration file by its path, or by its name in `calib/`."""
+    """A calibration file by its path, or by its name in `calib/`."""
     given = Path(name).expanduser()
     if given.is_file():
         return given
@@ -135,7 +135,7 @@ _WHITE = 127
 
 
 def find_mask(name: str) -> Path:
-    """Return a mask's file; a loaded profile names it by its full path."""
+    """A mask's file; a loaded profile names it by its full path."""
     path = Path(name)
     if not path.is_file():
         raise NotFound(
@@ -146,7 +146,7 @@ def find_mask(name: str) -> Path:
 
 
 def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return where the vehicle covers a picture of that width and height: booleans (height, width),
+    """Where the vehicle covers a picture of that width and height: booleans (height, width),
     true where the file is white. Errors: NotFound, InvalidValue."""
     path = find_mask(name)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -272,7 +272,7 @@ def _one_sentence(path: Path, error: ValidationError) -> str:
 
 
 def key_and_reason(error: ValidationError) -> tuple[str, str]:
-    """Return the key of the first error, empty if it concerns several keys, and its reason."""
+    """The key of the first error, empty if it concerns several keys, and its reason."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":

@@ -74,7 +74,7 @@ class Profile(Section):
 
     @classmethod
     def constant_key_errors(cls, values: dict[str, Any]) -> list[str]:
-        """Return a sentence for each key that is now a constant of another value."""
+        """A sentence for each key that is now a constant of another value."""
         return split_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")

@@ -19,13 +19,13 @@ from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 @cache
 def dictionary_names() -> tuple[str, ...]:
-    """Return all predefined dictionaries of the installed OpenCV, sorted."""
+    """All predefined dictionaries of the installed OpenCV, sorted."""
     return tuple(sorted(n for n in dir(cv2.aruco) if re.fullmatch(r"DICT_[A-Z0-9_]+", n)))
 
 
 @cache
 def aruco_dictionary(name: str) -> Any:
-    """Return the cv2.aruco dictionary of that name. Raises ValueError with the choices."""
+    """The cv2.aruco dictionary of that name. Raises ValueError with the choices."""
     if name not in dictionary_names():
         raise ValueError(
             f"dictionary {name!r} is unknown; allowed are {', '.join(dictionary_names())}"
@@ -34,7 +34,7 @@ def aruco_dictionary(name: str) -> Any:
 
 
 def dictionary_size(name: str) -> int:
-    """Return how many ids the dictionary holds (0 .. count - 1)."""
+    """How many ids the dictionary holds (0 .. count - 1)."""
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 

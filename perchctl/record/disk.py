@@ -41,7 +41,7 @@ class DiskFile:
         return done
 
     def tell(self) -> int:
-        """Return the length of the file."""
+        """The length of the file."""
         return self._good_bytes
 
     def flush(self) -> None:
@@ -50,7 +50,7 @@ class DiskFile:
             os.fsync(self._fd)
 
     def free_bytes(self) -> int:
-        """Return the free space on the file's disk. Raises OSError."""
+        """The free space on the file's disk. Raises OSError."""
         return shutil.disk_usage(self._path).free
 
     def close(self) -> None:

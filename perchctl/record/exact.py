@@ -83,7 +83,7 @@ def _members(hint: Any) -> tuple[Any, ...]:
 
 
 def from_exact_json(kind: type[T], data: Any) -> T:
-    """Return the value of `kind` that `to_exact_json` wrote. A missing field has its default.
+    """The value of `kind` that `to_exact_json` wrote. A missing field has its default.
 
     Raises ValueError, which names the field, for data of another form.
     """
@@ -176,7 +176,7 @@ def to_rounded_json(value: Any) -> Any:
 
 
 def encode_line(record: Mapping[str, Any]) -> bytes:
-    """Return the record as one line, keys in the record's own order, ended by a newline.
+    """The record as one line, keys in the record's own order, ended by a newline.
 
     Top-level keys whose value is None are left out.
     """
@@ -190,7 +190,7 @@ def json_line(values: Mapping[str, Any]) -> bytes:
 
 
 def decode_line(line: bytes) -> dict[str, Any]:
-    """Return the record of a line. Raises ValueError for anything that is not one JSON object."""
+    """The record of a line. Raises ValueError for anything that is not one JSON object."""
     try:
         record = json.loads(line.decode("utf-8"))
     except RecursionError:

@@ -115,7 +115,7 @@ FIELDS: dict[str, str] = {
 
 
 def event_record(event: Event) -> dict[str, Any]:
-    """Return an event as a flat record. Severities are continue, hold, back off, land and stop."""
+    """An event as a flat record. Severities are continue, hold, back off, land and stop."""
     return {
         "t_s": event.t_s,
         "event": event.kind.value,
@@ -132,7 +132,7 @@ def tick_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """Return a tick as a flat record of all `FIELDS` in order, with a simulation's truth if any."""
+    """A tick as a flat record of all `FIELDS` in order, with a simulation's truth if any."""
     seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
         "t_s": tick.t_s,
@@ -225,7 +225,7 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
 
 
 def command_values(command: Command) -> Mapping[str, Any]:
-    """Return the values of a command by the names of a tick's fields: ``cmd`` and its numbers."""
+    """The values of a command by the names of a tick's fields: ``cmd`` and its numbers."""
     match command:
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
             return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}

@@ -43,7 +43,7 @@ SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
 def image_message(ns: int, frame: Frame) -> CompressedImage:
-    """Return a picture's message: the camera's own JPEG, or else a PNG."""
+    """A picture's message: the camera's own JPEG, or else a PNG."""
     data = frame.encoded
     if data is None:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]
@@ -84,7 +84,7 @@ def to_stamp(ns: int) -> Timestamp:
 
 
 def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
-    """Return the markers' outlines in the frame of a tick's record; empty for
+    """The markers' outlines in the frame of a tick's record; empty for
     a frame without the target, which clears the previous outlines."""
     return ImageAnnotations(
         timestamp=to_stamp(ns),
@@ -103,7 +103,7 @@ def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
 
 
 def fixed_transforms(profile: Profile) -> list[FrameTransform]:
-    """Return the transforms from the body to camera and gear, which are fixed."""
+    """The transforms from the body to camera and gear, which are fixed."""
     T_body_cam, gear_m = profile.camera.mount.T_body_cam, profile.vehicle.gear_body_m
     q = quaternion_from_rotation(T_body_cam[:3, :3])
     level = (1.0, 0.0, 0.0, 0.0)

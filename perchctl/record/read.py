@@ -96,7 +96,7 @@ class FlightLog:
         return [parse_exact(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
-        """Return a field over the ticks, shape (n,); NaN where it is missing.
+        """A field over the ticks, shape (n,); NaN where it is missing.
 
         Raises InvalidValue for a value that is no number.
         """
@@ -107,7 +107,7 @@ class FlightLog:
         return np.array(values, dtype=np.float64)
 
     def texts(self, key: str) -> list[str]:
-        """Return a field over the ticks as text, empty where it is missing."""
+        """A field over the ticks as text, empty where it is missing."""
         return [str(record.get(key) or "") for record in self.records]
 
     @cached_property
@@ -136,7 +136,7 @@ class FlightLog:
         return tuple(spans)
 
     def csv(self) -> str:
-        """Return the ticks as CSV: a line of names, then a line each tick, with times from 0; a
+        """The ticks as CSV: a line of names, then a line each tick, with times from 0; a
         missing value is empty. Errors: InvalidValue for a log without ticks."""
         if not self.records:
             raise InvalidValue(f"{self.path}: the log holds no ticks, there is nothing to export")
@@ -173,11 +173,11 @@ class FlightLog:
         return self.to_flight_s(float(self.records[-1]["t_s"])) if self.records else 0.0
 
     def index_at(self, t_s: float) -> int:
-        """Return the index of the last tick up to `t_s`, counted from the first turn."""
+        """The index of the last tick up to `t_s`, counted from the first turn."""
         return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
 
     def tick_slice(self, start_s: float, end_s: float) -> slice:
-        """Return the ticks in [start_s, end_s), times since the first turn."""
+        """The ticks in [start_s, end_s), times since the first turn."""
         first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
         return slice(int(first), int(last))
 
@@ -224,7 +224,7 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """Return the mask (height, width), True on the gear, or None. Errors: InvalidValue."""
+        """The mask (height, width), True on the gear, or None. Errors: InvalidValue."""
         text = self.header.get("mask")
         if text is None:
             return None
@@ -369,7 +369,7 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse_turn(record: dict[str, Any]) -> Turn:
-    """Return the turn of a record, to the same bits. Errors: InvalidValue."""
+    """The turn of a record, to the same bits. Errors: InvalidValue."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
         # The newest sample of the turn stands in the line once.
@@ -380,7 +380,7 @@ def parse_turn(record: dict[str, Any]) -> Turn:
 
 
 def parse_exact(kind: type[Exact], record: Mapping[str, Any]) -> Exact:
-    """Return the `Turn` or `SentCommand` of a record, bit-identical. Errors: InvalidValue."""
+    """The `Turn` or `SentCommand` of a record, bit-identical. Errors: InvalidValue."""
     try:
         return from_exact_json(kind, _without_kind(record))
     except ValueError as error:

@@ -64,7 +64,7 @@ class FlightSummary:
 
     @classmethod
     def from_log(cls, log: FlightLog) -> FlightSummary:
-        """Return the summary by the log's summary record, or without one by its ticks."""
+        """The summary by the log's summary record, or without one by its ticks."""
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
         ends = f"ends in {log.phases[-1].phase}" if log.phases else "holds no flight"
@@ -90,7 +90,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """Return the record for `LogWatcher.end`, which adds the log's own losses."""
+        """The record for `LogWatcher.end`, which adds the log's own losses."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,
@@ -108,7 +108,7 @@ class FlightSummary:
         }
 
     def text(self, log_path: Path | None = None) -> str:
-        """Return a few lines about the flight, without colour and a last line break."""
+        """A few lines about the flight, without colour and a last line break."""
         lines = [f"{self.outcome.upper()}: {self.reason}".rstrip(": ")]
         if self.cause and self.cause != self.outcome:
             lines[0] += f" [{self.cause}]"

@@ -146,11 +146,11 @@ class LogWatcher:
         return log
 
     def watched(self, source: FrameSource) -> FrameSource:
-        """Return the source, wrapped so that its frames are recorded if there is a recorder."""
+        """The source, wrapped so that its frames are recorded if there is a recorder."""
         return source if self.recorder is None else WrappedSource(source, self.recorder.write_frame)
 
     def remarks(self) -> list[str]:
-        """Return the recording's problem, a sentence, at the first call after it occurred."""
+        """The recording's problem, a sentence, at the first call after it occurred."""
         problem = None if self.recorder is None else self.recorder.problem
         if problem is None or self._has_remarked:
             return []
@@ -293,12 +293,12 @@ class LogWatcher:
 
 
 def sent_line(sent: SentCommand) -> bytes:
-    """Return a command sent outside of loop turns as one exact line of the log."""
+    """A command sent outside of loop turns as one exact line of the log."""
     return json_line({"kind": "sent", **to_exact_json(sent)})
 
 
 def turn_line(turn: Turn) -> bytes:
-    """Return a turn as one exact line of the log, by the fields of `perchctl.mission.Turn`."""
+    """A turn as one exact line of the log, by the fields of `perchctl.mission.Turn`."""
     record = {"kind": "turn", **to_exact_json(turn)}
     obs, samples = turn.observation, turn.taken.late or turn.taken.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
@@ -314,19 +314,19 @@ def _explain(error: OSError) -> str:
 
 
 def path_beside(log: Path | str, suffix: str) -> Path:
-    """Return the path of a log, packed or not, with another ending, such as ``.png``."""
+    """The path of a log, packed or not, with another ending, such as ``.png``."""
     path = Path(log)
     whole = path.with_suffix("") if path.suffix == ".gz" else path
     return whole.with_name(whole.stem + suffix)
 
 
 def recording_path(path: Path | str) -> Path:
-    """Return the recording's path, by the log's or by its own."""
+    """The recording's path, by the log's or by its own."""
     return path_beside(path, ".mcap")
 
 
 def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
-    """Return the path of a flight that starts now: ``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl``
+    """The path of a flight that starts now: ``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl``
     in the directory. A campaign names its logs ``flight_seed<seed>.jsonl``."""
     safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
     return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"

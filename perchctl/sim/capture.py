@@ -290,7 +290,7 @@ def _models(names: Sequence[str]) -> bytes:
 
 
 def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
-    """Return a frame's message; bodies of `names` missing in it are marked as not tracked."""
+    """A frame's message; bodies of `names` missing in it are marked as not tracked."""
     parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
     parts.append(struct.pack("<i", len(names)))
     for index, name in enumerate(names, 1):

@@ -284,7 +284,7 @@ class Renderer:
 
 
 def as_blocks(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Return a view of a picture (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
+    """A view of a picture (h, w, ...) as its blocks (rows, columns, 8, 8, ...)."""
     height, width, *rest = pixels.shape
     shape = (height // COARSE_PX, COARSE_PX, width // COARSE_PX, COARSE_PX, *rest)
     return pixels.reshape(shape).swapaxes(1, 2)
@@ -334,7 +334,7 @@ STEP = 2.0**-17
 
 
 def round_pose(T_target_cam: Array) -> Array:
-    """Return a still camera's pose (4, 4), rounded to steps of `STEP`."""
+    """A still camera's pose (4, 4), rounded to steps of `STEP`."""
     steps = np.full((3, 4), STEP)
     steps[:, 3] *= 2.0 ** np.floor(np.log2(max(abs(float(T_target_cam[2, 3])), 1e-3)))
     T = np.eye(4)
@@ -361,7 +361,7 @@ def longest_path_px(motion_px: Array) -> float:
 
 
 def blur_sample_count(length_px: float) -> int:
-    """Return how many poses the blur of a path of that length needs; 1 for a sharp frame."""
+    """How many poses the blur of a path of that length needs; 1 for a sharp frame."""
     if length_px < SHARP_MOTION_PX:
         return 1
     return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)

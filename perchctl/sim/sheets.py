@@ -124,7 +124,7 @@ class CeilingTexture:
         self._levels: dict[int, Picture] = {}
 
     def tile_and_texels_per_m(self, image_px_per_m: float) -> tuple[Picture, float]:
-        """Return a seamless square tile of `CEILING_TEXTURE_PX`, and its texels per metre: 1 to 2
+        """A seamless square tile of `CEILING_TEXTURE_PX`, and its texels per metre: 1 to 2
         per image pixel, or the nearest level."""
         finest = TILE_FINEST_PX / TILE_M
         level = math.floor(math.log2(finest / max(image_px_per_m, 1.0)))
@@ -179,7 +179,7 @@ class PlacedSheet:
     to_sheet: Array | None = None  # None: the same plane
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
-        """Return where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
+        """Where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
         target's axes; None where it is out of view.
 
         `length_px` is the picture's longest motion in the exposure."""
@@ -251,5 +251,5 @@ def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
 
 @lru_cache(maxsize=4)
 def printed_sheet(target_json: str) -> Sheet:
-    """Return a target's sheet; flights share its textures, which cost more than a second."""
+    """A target's sheet; flights share its textures, which cost more than a second."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))

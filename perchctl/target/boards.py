@@ -80,7 +80,7 @@ class Board:
         return columns - 1, rows - 1
 
     def corners_m(self) -> Array:
-        """Return the inner corners (n, 3) in metres, row by row from the top left one; x right,
+        """The inner corners (n, 3) in metres, row by row from the top left one; x right,
         y down. The origin is the top left corner of the print, as that of
         `cv2.aruco.CharucoBoard.getChessboardCorners`; on a chessboard it is the first corner."""
         first = 1 if self.kind == "charuco" else 0
@@ -92,7 +92,7 @@ class Board:
         return np.stack([xs.ravel(), ys.ravel(), np.zeros(xs.size)], axis=1)
 
     def notation(self) -> str:
-        """Return the text from which `parse` makes this very board."""
+        """The text from which `parse` makes this very board."""
         text = f"{self.kind}:{self.columns}x{self.rows}:{mm_text(self.square_m)}mm"
         if self.marker_m is not None:
             text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
@@ -103,7 +103,7 @@ class Board:
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """Return the board of a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
+        """The board of a notation such as ``charuco:10x7:25mm:18mm:DICT_5X5_100``.
 
         Raises InvalidValue, which names the wrong part.
         """
@@ -128,7 +128,7 @@ class Board:
         return board.with_measured_sides(measured)[0] if measured else board
 
     def with_measured_sides(self, text: str) -> tuple[Board, list[str]]:
-        """Return the same board with the measured sides of its black area, ``249.3x174.6mm``, and
+        """The same board with the measured sides of its black area, ``249.3x174.6mm``, and
         notes for the user. Raises InvalidValue."""
         sides = re.fullmatch(r"([\d.]+)x([\d.]+)(mm)?", text)
         if sides is None:
@@ -142,7 +142,7 @@ class Board:
         return replace(self, scale=(across, down)), first + second
 
     def cv2_board(self) -> Any:
-        """Return a `cv2.aruco.CharucoBoard` for a detector. Raises ValueError for a chessboard."""
+        """A `cv2.aruco.CharucoBoard` for a detector. Raises ValueError for a chessboard."""
         if self.kind != "charuco" or self.marker_m is None or self.dictionary is None:
             raise ValueError("only a charuco board is one of OpenCV's own")
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
@@ -172,7 +172,7 @@ def _wrong(text: str, why: str) -> InvalidValue:
 
 
 def board_rectangles(board: Board) -> list[Rectangle]:
-    """Return the black area as rectangles, m; origin in the board's centre, x right, y up."""
+    """The black area as rectangles, m; origin in the board's centre, x right, y up."""
     columns, rows = board.squares
     width, height = board.size_m
     found: list[Rectangle] = []
@@ -197,6 +197,6 @@ def board_rectangles(board: Board) -> list[Rectangle]:
 
 
 def black_squares(board: Board) -> NDArray[np.bool_]:
-    """Return which squares are black (rows, columns), row 0 on top; markers fill the others."""
+    """Which squares are black (rows, columns), row 0 on top; markers fill the others."""
     columns, rows = board.squares
     return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)

@@ -137,7 +137,7 @@ def _px(side_px: float | None) -> str:
 
 
 def focal_px(camera: CameraModel) -> float:
-    """Return the mean focal length in px."""
+    """The mean focal length in px."""
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 
@@ -148,7 +148,7 @@ def make_design(
     profile: Profile,
     ceiling_m: float | None = None,
 ) -> TargetDesign:
-    """Return the design for a profile and a ceiling at `ceiling_m` over the floor (None: unknown):
+    """The design for a profile and a ceiling at `ceiling_m` over the floor (None: unknown):
     far ranges by trials of the detector, near ones by geometry."""
     f = focal_px(camera)
     view = FieldOfView(camera)

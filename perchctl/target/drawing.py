@@ -64,30 +64,30 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Return the exact share of black, 0..1, in each pixel's window, (size_px, size_px)."""
+        """The exact share of black, 0..1, in each pixel's window, (size_px, size_px)."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """Return the sheet's share of each pixel's window, 0..1, (size_px, size_px)."""
+        """The sheet's share of each pixel's window, 0..1, (size_px, size_px)."""
         half = self.sheet_side_m / 2.0
         w = pixel_overlap(np.array([-half, half]), px_per_m, size_px, window_px)
         return np.asarray(w @ w.T)
 
     def bitmap(self, px_per_m: float) -> NDArray[np.uint8]:
-        """Return the whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its
+        """The whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its
         area; row 0 is at the top of the print, the centre in the middle of the picture."""
         size = max(1, int(np.ceil(self.sheet_side_m * px_per_m - 1e-9)))
         return np.rint(255.0 * (1.0 - self.ink_coverage(px_per_m, size))).astype(np.uint8)
 
     def rectangles(self) -> list[Rectangle]:
-        """Return the black area as few, large, non-overlapping rectangles (for a PDF)."""
+        """The black area as few, large, non-overlapping rectangles (for a PDF)."""
         return merge_black_cells(self.black, self.edges_m, -self.edges_m)
 
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
-    """Return the black cells of a marker with its border, shape (n, n), row 0 at the top."""
+    """The black cells of a marker with its border, shape (n, n), row 0 at the top."""
     dictionary = aruco_dictionary(marker.dictionary)
     n = int(dictionary.markerSize) + 2 * BORDER_BITS
     picture = cv2.aruco.generateImageMarker(dictionary, marker.id, n, borderBits=BORDER_BITS)
@@ -95,13 +95,13 @@ def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
 
 
 def marker_corners_m(side_m: float) -> Array:
-    """Return the corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
+    """The corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
 def draw_target(target: TargetConfig) -> TargetDrawing:
-    """Return the drawing of both markers; sizes are taken from the configuration.
+    """The drawing of both markers; sizes are taken from the configuration.
 
     The white ring is one cell of the small marker wide, or as wide as the large
     marker's black cells under it allow. Where the large marker's own centre is
@@ -167,7 +167,7 @@ def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> ND
 
 
 def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-    """Return the share of each pixel's window that lies in each interval of `edges_m`, (size_px,
+    """The share of each pixel's window that lies in each interval of `edges_m`, (size_px,
     n).
 
     Pixel i is centred at ``(i - (size_px - 1) / 2) / px_per_m``; its window is
@@ -180,7 +180,7 @@ def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: floa
 
 
 def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
-    """Return the black cells of a grid as few, large, non-overlapping rectangles.
+    """The black cells of a grid as few, large, non-overlapping rectangles.
 
     `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. Few and
     large, because viewers draw hair lines between rectangles that touch.
@@ -221,7 +221,7 @@ _LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*
 
 
 def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float:
-    """Return the metres of ``150mm``, ``15cm`` or ``0.15m``.
+    """The metres of ``150mm``, ``15cm`` or ``0.15m``.
 
     `what` names the value in the error; a number without a unit is taken in `bare_unit`,
     and refused where that is None. Raises InvalidValue.
@@ -246,7 +246,7 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
 def print_scale(
     name: str, option: str, measured_m: float, spec_m: float, source: str
 ) -> tuple[float, list[str]]:
-    """Return a print's measured over its nominal length, and notes for the user, in which `name`
+    """A print's measured over its nominal length, and notes for the user, in which `name`
     and `option` name the length, and `source` its nominal value's origin.
 
     Raises InvalidValue for a scale that no printer makes, as by a length in the wrong unit.

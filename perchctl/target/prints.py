@@ -25,7 +25,7 @@ MEASURED_SIGMA = 0.001
 def measured_target(
     nominal: TargetConfig, sides_m: Mapping[str, float]
 ) -> tuple[TargetConfig, list[str]]:
-    """Return the target with the measured sides of ``large`` and ``small``, and notes for the
+    """The target with the measured sides of ``large`` and ``small``, and notes for the
     user. With both sides given, `size_sigma` falls to `MEASURED_SIGMA`.
 
     Raises InvalidValue for a side that no printer makes of the nominal one.
@@ -66,7 +66,7 @@ _MAD_TO_SIGMA = 1.4826
 def size_ratio(
     large_px: Array, small_px: Array, camera: CameraModel, target: TargetConfig
 ) -> tuple[float, float] | None:
-    """Return the small marker's size relative to the large one's, over the ratio in the profile
+    """The small marker's size relative to the large one's, over the ratio in the profile
     (1.01 is printed 1 % too large), from one frame's corners, (4, 2) px each; and the share by
     which corners may err systematically. None where the corners span no plane."""
     rays = undistort(np.concatenate([large_px, small_px]), camera)

@@ -29,7 +29,7 @@ class ArucoReader:
         self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
 
     def read(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
-        """Return the corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
+        """The corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
         corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
         if ids is None or len(corners) == 0:
             return {}
@@ -66,7 +66,7 @@ _PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
 def smallest_side_px(
     target: TargetConfig, marker: str, blur_px: float, picture_px: int
 ) -> float | None:
-    """Return the smallest side, px, at which the marker, facing the camera at any turn, is found in
+    """The smallest side, px, at which the marker, facing the camera at any turn, is found in
     `FOUND_RATE` of the pictures; None if even `SIDE_RANGE_PX[1]` is too small.
 
     Args:

@@ -57,7 +57,7 @@ def target_pdf(
     origin: str = "",
     date: datetime.date | None = None,
 ) -> bytes:
-    """Return the target's sheet, front and back, as a PDF; the same bytes for the same target.
+    """The target's sheet, front and back, as a PDF; the same bytes for the same target.
 
     The quiet zone is the largest, up to one cell, that leaves room for rulers and caption.
 
@@ -86,7 +86,7 @@ def target_pdf(
 
 
 def board_pdf(board: Board, page: str) -> bytes:
-    """Return a board in the middle of the page, upright or across as it fits, with its rulers, as a
+    """A board in the middle of the page, upright or across as it fits, with its rulers, as a
     PDF; `page` as in `target_pdf`. Raises InvalidValue where it does not fit."""
     width, height = (1e3 * side for side in board.size_m)
     side = UNPRINTABLE + _RULER_DEPTH

@@ -46,7 +46,7 @@ class FieldOfView:
         return bool((np.hypot(x, y) <= reach * z).all())
 
     def nearest_m(self, outline_m: Array, R: Array, offset_m: Array) -> float | None:
-        """Return the distance d from which on ``R (x, y, d) + offset`` is in the picture for all
+        """The distance d from which on ``R (x, y, d) + offset`` is in the picture for all
         points (x, y) of `outline_m` (n, 2); None without such a distance."""
 
         def seen(d: float) -> bool:
@@ -77,7 +77,7 @@ def circle_outline(side_m: float) -> Array:
 
 
 def outline_points_3d(outline_m: Array, z_m: float) -> Array:
-    """Return the outline's points (x, y, `z_m`), (n, 3)."""
+    """The outline's points (x, y, `z_m`), (n, 3)."""
     return np.column_stack([outline_m, np.full(len(outline_m), z_m)])
 
 
@@ -95,7 +95,7 @@ LEAST_UP = 0.2
 
 
 def reliable_side_px(detected_px: float | None = None) -> float:
-    """Return the smallest side, px, of a large marker that the search on the ground reliably finds.
+    """The smallest side, px, of a large marker that the search on the ground reliably finds.
 
     `detected_px`: the smallest side detected through the camera's blur; None if not measured."""
     return SURE_PX if detected_px is None else max(SURE_PX, BLURRED * detected_px)
@@ -124,7 +124,7 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
 def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
-    """Return how far off the axis of a camera, `height_m` below, a marker is wholly in the picture
+    """How far off the axis of a camera, `height_m` below, a marker is wholly in the picture
     at any turn; None if not even on the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
@@ -177,7 +177,7 @@ def view_from(
     camera: CameraModel,
     mount: Mounting,
 ) -> TargetView:
-    """Return how a level vehicle sees a level target; positions (3,) in one world, z up."""
+    """How a level vehicle sees a level target; positions (3,) in one world, z up."""
     T = mount.T_body_cam
     field = FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]
@@ -241,7 +241,7 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
-    """Return the blind range of the profile's `camera.mount` and `vehicle.gear_body_m`."""
+    """The blind range of the profile's `camera.mount` and `vehicle.gear_body_m`."""
     R, offset = camera_rotation_and_gear(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
@@ -274,7 +274,7 @@ def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> 
 
 
 def camera_rotation_and_gear(profile: Profile) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) from body to camera axes, and the gear's tip in the camera, m."""
+    """The rotation (3, 3) from body to camera axes, and the gear's tip in the camera, m."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T
     return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])

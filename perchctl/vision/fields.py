@@ -65,14 +65,14 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """Return a combed picture's top and bottom field, each (h, w), or else just the picture."""
+    """A combed picture's top and bottom field, each (h, w), or else just the picture."""
     if not is_combed(image):
         return (image,)
     return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
 def interpolate_field(image: Grey, first_row: int) -> Grey:
-    """Return the field that begins at `first_row`, with its missing rows interpolated."""
+    """The field that begins at `first_row`, with its missing rows interpolated."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -86,19 +86,19 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Return an edge's standard deviation along an interpolated field's rows, given its blur."""
+    """An edge's standard deviation along an interpolated field's rows, given its blur."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
 def classify_fields(frame: Frame) -> Frame:
-    """Return the frame with `fields` set to ``woven`` or ``whole``, unless it is set."""
+    """The frame with `fields` set to ``woven`` or ``whole``, unless it is set."""
     if frame.fields is not None:
         return frame
     return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
 def field_frames(frame: Frame) -> tuple[Frame, Frame]:
-    """Return the top and the bottom field, both at the frame's time."""
+    """The top and the bottom field, both at the frame's time."""
     return (
         replace(frame, image=interpolate_field(frame.image, 0), fields="top", encoded=None),
         replace(frame, image=interpolate_field(frame.image, 1), fields="bottom", encoded=None),
@@ -106,7 +106,7 @@ def field_frames(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return the new state, and the pictures of a stream's frame in time order: one, or two fields
+    """The new state, and the pictures of a stream's frame in time order: one, or two fields
     half a period apart around the frame's time.
 
     In a stream without fields so far, only every third frame is examined.

@@ -93,7 +93,7 @@ class Measurement:
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
-    """Return the filter's constants. The velocity's first sigma is 5 cm/s in the world, and in the
+    """The filter's constants. The velocity's first sigma is 5 cm/s in the world, and in the
     level frame 30 cm/s, or 1 m/s with measured noise."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
@@ -120,18 +120,18 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
 
 
 def tilt_jacobian(way_m: Array) -> Array:
-    """Return the Jacobian (3, 2), m/rad, of a vector `way_m` (3,) rotated about level x and y."""
+    """The Jacobian (3, 2), m/rad, of a vector `way_m` (3,) rotated about level x and y."""
     x, y, z = way_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
 def transition_matrix(dt_s: float) -> Array:
-    """Return the state transition matrix F (8, 8) of the paper's equation 1, over `dt_s`."""
+    """The state transition matrix F (8, 8) of the paper's equation 1, over `dt_s`."""
     return _STILL + dt_s * _MOVES
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """Return the process noise Q (8, 8) over `dt_s` of a target at `position_m` (3,)."""
+    """The process noise Q (8, 8) over `dt_s` of a target at `position_m` (3,)."""
     noise = setup.process
     if noise is None:
         return setup.Q
@@ -158,7 +158,7 @@ def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
 
 
 def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """Return a track at its first measurement."""
+    """A track at its first measurement."""
     x = np.zeros(8)
     x[MEASURED] = measured.z
     x[YAW] = wrap_rad(float(measured.z[0]))
@@ -177,7 +177,7 @@ def step_track(
     t_s: float,
     setup: FilterSetup,
 ) -> MarkerTrack | None:
-    """Return the track predicted to a frame's time and, if the marker was measured, updated.
+    """The track predicted to a frame's time and, if the marker was measured, updated.
 
     Args:
         track: the track so far, None before the first measurement.
@@ -232,7 +232,7 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
 ) -> MarkerTrack:
-    """Return the track predicted to `t_s`; its covariance is predicted only with `spread`."""
+    """The track predicted to `t_s`; its covariance is predicted only with `spread`."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track

@@ -54,7 +54,7 @@ def distort(normalised: Array, camera: CameraModel) -> Array:
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """Return the pixels (n, 2) of points (n, 3) in a frame of pose rvec, tvec in the camera."""
+    """The pixels (n, 2) of points (n, 3) in a frame of pose rvec, tvec in the camera."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _projected(points, rvec, tvec, camera)

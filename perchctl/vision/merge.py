@@ -102,7 +102,7 @@ def measure_markers(
 def merge_tracks(
     tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
 ) -> MergedTarget | None:
-    """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
+    """The target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
     `fed` update, or else from the tracks measured last; None without tracks."""
     if not tracks:
         return None
@@ -149,7 +149,7 @@ FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
 
 
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the markers with their corners moved to the frame's time.
+    """The markers with their corners moved to the frame's time.
 
     If `setup.readout_s` is None, the corners stay, and `common_px` is their shift by a likely
     read-out time; otherwise `common_px` and the spread hold the shift's error."""
@@ -189,7 +189,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 
 
 def detected_stage(large: bool, small: bool) -> Stage:
-    """Return the stage in which just these markers are detected."""
+    """The stage in which just these markers are detected."""
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
@@ -221,6 +221,6 @@ def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bo
 
 
 def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """Return the pose whose position has the smaller spread."""
+    """The pose whose position has the smaller spread."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

@@ -68,7 +68,7 @@ class Pipeline:
 def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
-    """Return the profile's pipeline for a calibrated camera; several streams may share it.
+    """The profile's pipeline for a calibrated camera; several streams may share it.
 
     `covered`: pixels (h, w) that the vehicle covers in the camera's pictures; None: read
     `camera.mask`. Errors: NotFound, InvalidValue (`camera.mask`)."""
@@ -108,7 +108,7 @@ def make_pipeline(
 
 
 def camera_profile(profile: Profile) -> Profile:
-    """Return the profile for tracking by a camera alone: without mounting and gear, so that poses
+    """The profile for tracking by a camera alone: without mounting and gear, so that poses
     are in the camera frame, and with a pose of each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
@@ -123,7 +123,7 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
-    """Return the new state, and the pictures of a frame, each for its own `step`: one, or the two
+    """The new state, and the pictures of a frame, each for its own `step`: one, or the two
     fields of an interlaced camera in time order."""
     fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
@@ -215,7 +215,7 @@ def estimate(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> TargetEstimate | None:
-    """Return the target at a moment after the newest frame, for the vehicle's attitude of then.
+    """The target at a moment after the newest frame, for the vehicle's attitude of then.
 
     A tracked target is predicted by its filter and carried on by the vehicle's motion. A target no
     longer tracked stays at its last place in the world. None before the first measurement. Without

@@ -57,7 +57,7 @@ class PoseSetup:
 
 
 def square_corners(side_m: float) -> Array:
-    """Return the corners TL TR BR BL of a marker in its own axes, (4, 3)."""
+    """The corners TL TR BR BL of a marker in its own axes, (4, 3)."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
@@ -75,7 +75,7 @@ def estimate_pose(
     previous_normal_cam: Array | None = None,
     start: PoseCandidate | None = None,
 ) -> MarkerPose | None:
-    """Return the pose from one marker's corners, or from both markers' corners at once.
+    """The pose from one marker's corners, or from both markers' corners at once.
 
     `start`, the same frame's joint pose, is refined on these corners instead of solving anew, as
     its tilt is already decided. None if the corners give no pose: no finite solution in front of
@@ -163,17 +163,17 @@ def _level_pose(
 
 
 def rotation_matrix(rvec: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a rotation vector (3,) rad."""
+    """The rotation matrix (3, 3) of a rotation vector (3,) rad."""
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
 def rotation_vector(R: Array) -> Array:
-    """Return the rotation vector (3,) rad of a rotation matrix (3, 3)."""
+    """The rotation vector (3,) rad of a rotation matrix (3, 3)."""
     return np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
 
 
 def normal_cam(pose: MarkerPose) -> Array:
-    """Return the marker's z axis (out of the paper) in camera axes, (3,)."""
+    """The marker's z axis (out of the paper) in camera axes, (3,)."""
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
@@ -236,7 +236,7 @@ class TiltPrior:
 
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
-    """Return the better of a planar marker's two possible poses; None if neither is valid."""
+    """The better of a planar marker's two possible poses; None if neither is valid."""
     candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
@@ -290,7 +290,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
-    """Return the covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and
+    """The covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and
     the pose's change (6,) by one standard deviation of the sheet's curl.
 
     The covariance covers the corners' noise (at least as large as the residuals), shifts that all
@@ -326,7 +326,7 @@ def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
 
 
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
-    """Return the angle between the marker's normal and the expected one."""
+    """The angle between the marker's normal and the expected one."""
     normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
@@ -398,7 +398,7 @@ def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPri
 
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
-    """Return the distances of corners (n, 3) from the sheet's plane, at one standard deviation of
+    """The distances of corners (n, 3) from the sheet's plane, at one standard deviation of
     each kind of curl: the whole rim to one side, or two corners to either.
     (2n, 2) m, for x and y of each corner."""
     x, y = object_m[:, 0], object_m[:, 1]
@@ -456,7 +456,7 @@ def weigh_corners(
     K: Array,
     lift: Array,
 ) -> WeightedCorners:
-    """Return the corners of one or both detections with their weights."""
+    """The corners of one or both detections with their weights."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)

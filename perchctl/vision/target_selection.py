@@ -46,7 +46,7 @@ def marker_offset_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return a marker's distance from the own target's place (an `OwnOffset`), m."""
+    """A marker's distance from the own target's place (an `OwnOffset`), m."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
@@ -57,7 +57,7 @@ def marker_offset_m(
 def target_offset_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """Return the distance of a target from the own target's place."""
+    """The distance of a target from the own target's place."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -67,7 +67,7 @@ def target_offset_m(
 def refusal_text(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Return why a pose is another vehicle's target; None for the own target."""
+    """Why a pose is another vehicle's target; None for the own target."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = target_offset_m(pose, attitude, place, setup)
@@ -114,7 +114,7 @@ def track_measurement(
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """Return a pose as a measurement for the filter."""
+    """A pose as a measurement for the filter."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
@@ -142,7 +142,7 @@ def track_measurement(
 def relative_bias_m(
     bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
 ) -> Array:
-    """Return the effect (3, 4) of constant errors on the vector from gear to target, level axes:
+    """The effect (3, 4) of constant errors on the vector from gear to target, level axes:
     `bias_m` (3, 4) of the target less the effect of roll and pitch errors on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(bias_m)

@@ -49,7 +49,7 @@ class TrackSetup:
     own_place: OwnTargetPlace
 
     def constants(self, in_world: bool) -> FilterSetup:
-        """Return the filters' constants in the world or the level frame."""
+        """The filters' constants in the world or the level frame."""
         return self.world if in_world else self.level
 
 
@@ -72,7 +72,7 @@ def update_tracks(
     in_world: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Return the tracks after a frame, updated with the poses that the gate accepts."""
+    """The tracks after a frame, updated with the poses that the gate accepts."""
     constants = setup.constants(in_world)
     fed = {
         name: track_measurement(pose, attitude, in_world, constants, setup.pose)
@@ -173,7 +173,7 @@ class GateVerdict:
 def judge_pose(
     lock: Lock | None, rival: RivalTrack | None, sight: FramePose, constants: FilterSetup
 ) -> GateVerdict:
-    """Return the gate's verdict on a frame's pose."""
+    """The gate's verdict on a frame's pose."""
     lock, rival = drop_expired(lock, rival, sight.t_s)
     if rival is not None and rival.in_world != sight.in_world:
         rival = None
@@ -200,7 +200,7 @@ def judge_pose(
 def drop_expired(
     lock: Lock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[Lock | None, RivalTrack | None]:
-    """Return the lock and the rival, None for each that has expired at `t_s`."""
+    """The lock and the rival, None for each that has expired at `t_s`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
@@ -217,7 +217,7 @@ def drop_expired(
 def update_lock(
     lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
 ) -> Lock:
-    """Return the lock after an accepted pose, with the track that the pose updated."""
+    """The lock after an accepted pose, with the track that the pose updated."""
     anew = verdict.restarts and not verdict.same_target
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
@@ -362,7 +362,7 @@ _FORGOTTEN = 0.1  # of what was learned, with each picture
 def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Return both markers' expected corners, (4, 2) px, and their pose: the last sighting, moved by
+    """Both markers' expected corners, (4, 2) px, and their pose: the last sighting, moved by
     the vehicle's motion.
 
     Without both attitudes: None and the unmoved pose; without a recent sighting: both None."""
@@ -391,7 +391,7 @@ def expected_corners(
 def update_sighting(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
-    """Return the sighting of a new pose, with the errors of the estimated motion since `before`."""
+    """The sighting of a new pose, with the errors of the estimated motion since `before`."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s

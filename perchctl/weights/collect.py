@@ -96,7 +96,7 @@ def _vector(pose: MarkerPose | None) -> Array | None:
 
 
 def position_fault(readings: list[MarkerReading]) -> str | None:
-    """Return why a position must be taken again, in one sentence; None when it is good."""
+    """Why a position must be taken again, in one sentence; None when it is good."""
     count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames came"
@@ -118,7 +118,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
-    """Return the CSV lines of a position."""
+    """The CSV lines of a position."""
     return "".join(csv_row(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
@@ -228,7 +228,7 @@ class MocapPoses:
         self._gear, self._now, self._wait = gear_body_m, now, wait
 
     def actual_pose(self, ask: Ask) -> ActualPose:
-        """Return the median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
+        """The median of `SAMPLES` captured poses. Raises ConnectionFailed, NotFound."""
         self._capture.poll(self._now())  # an older one does not count
         frames: list[CaptureFrame] = []
         until_s = self._now() + WITHIN_S

@@ -64,12 +64,12 @@ class Measurements:
 
 
 def wrap_angles(angle_rad: Any) -> Any:
-    """Return the angles, of any shape, wrapped to (-pi, pi]."""
+    """The angles, of any shape, wrapped to (-pi, pi]."""
     return -((-angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
-    """Return the CSV line of a frame: the large, small and actual pose, each (4,) or None."""
+    """The CSV line of a frame: the large, small and actual pose, each (4,) or None."""
     cells = [str(position), f"{t_s:.6f}"]
     for pose in poses:
         cells += [""] * 4 if pose is None else [f"{float(value):.8f}" for value in pose]
@@ -77,7 +77,7 @@ def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
 
 
 def read_data(path: Path) -> Measurements:
-    """Return a file's rows for the fit. Raises NotFound, InvalidValue with line or position."""
+    """A file's rows for the fit. Raises NotFound, InvalidValue with line or position."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
             lines, table = _read_table(path, csv.reader(text, skipinitialspace=True))

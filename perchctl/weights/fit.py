@@ -78,7 +78,7 @@ class MarkerErrors:
 
 
 def marker_errors(data: Measurements) -> MarkerErrors:
-    """Return the errors of the rows with both markers."""
+    """The errors of the rows with both markers."""
     rows = np.flatnonzero(data.has_both)
     rows = rows[np.argsort(data.position[rows], kind="stable")]
     positions, starts = np.unique(data.position[rows], return_index=True)
@@ -119,7 +119,7 @@ def t_quantile(degrees: int) -> float:
 
 
 def closed_form_weights(sums: Array) -> Array:
-    """Return the weights (..., 4) with the least variance of the merged error; NaN where all
+    """The weights (..., 4) with the least variance of the merged error; NaN where all
     weights fit alike. `sums` is (6, ..., 4), as `MarkerErrors.sums`."""
     a, b, aa, bb, ab = sums[1:] / np.maximum(sums[0], 1.0)
     var_a, var_b, cov = aa - a * a, bb - b * b, ab - a * b
@@ -143,7 +143,7 @@ _STREAM = (0, 601)
 
 
 def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]:
-    """Return the final weights of LMS, (4,), not clipped, and the final weights with each position
+    """The final weights of LMS, (4,), not clipped, and the final weights with each position
     left out in turn, (g, 4).
 
     LMS begins at the weight `start` and takes the rows, less the mean errors, in a shuffled order.
@@ -199,7 +199,7 @@ class FittedWeights:
 
 
 def fit_all(errors: MarkerErrors) -> dict[str, FittedWeights]:
-    """Return both methods' weights by name. Raises InvalidValue where all weights fit alike."""
+    """Both methods' weights by name. Raises InvalidValue where all weights fit alike."""
     total = errors.sums.sum(axis=1)
     closed = closed_form_weights(total)
     if np.isnan(closed).any():
@@ -244,7 +244,7 @@ class Evidence:
         return np.where(self.better == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """Return the RMS error of `name` (m, rad) and its 95 % interval's half width, (4,) each."""
+        """The RMS error of `name` (m, rad) and its 95 % interval's half width, (4,) each."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
@@ -255,14 +255,14 @@ class Evidence:
         return reference - rms, _half_width(of_reference - influence)
 
     def proven(self, name: str) -> NDArray[np.bool_]:
-        """Return True where the whole interval of the gain over the better single marker is above
+        """True where the whole interval of the gain over the better single marker is above
         zero, (4,)."""
         gain, half = self.rms_gain(name, self.better_squares)
         return np.asarray(gain - half > 0.0)
 
 
 def evaluate_weights(errors: MarkerErrors, weights: Mapping[str, Array]) -> Evidence:
-    """Return the errors of the fitted weights, the paper's, and each marker alone. `weights` by
+    """The errors of the fitted weights, the paper's, and each marker alone. `weights` by
     method: (4,), or one row per position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums
     known = {"large": np.ones(4), "small": np.zeros(4), "paper": np.array(PAPER_WEIGHTS)}

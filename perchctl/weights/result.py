@@ -105,7 +105,7 @@ def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
 
 
 def weights_record(result: FitResult) -> dict[str, Any]:
-    """Return the result as the JSON object of `--json`. Lengths in m, angles in rad."""
+    """The result as the JSON object of `--json`. Lengths in m, angles in rad."""
     record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),
@@ -156,7 +156,7 @@ _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
 
 def report_text(result: FitResult) -> str:
-    """Return the report: verdict, errors, gains and weights."""
+    """The report: verdict, errors, gains and weights."""
     errors = result.errors
     left_out = int((~errors.use).any(axis=1).sum())
     data = (

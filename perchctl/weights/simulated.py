@@ -69,7 +69,7 @@ class SimulatedStand:
             session.append(session_rows(position, readings, place.actual))
 
     def place(self, position: int) -> CameraPlace:
-        """Return the camera place of a position, counted from 1. Each position has its own part of
+        """The camera place of a position, counted from 1. Each position has its own part of
         the range z3 to z2, so even few cover the range. Raises InvalidValue."""
         merge = self._profile.merge
         rng = np.random.default_rng([self._seed, _STREAM, position])

@@ -69,7 +69,7 @@ def lens_parameters(camera: CameraModel) -> Array:
 
 
 def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
-    """Return the camera of lens `model`, and the board poses, with the least squared residuals.
+    """The camera of lens `model`, and the board poses, with the least squared residuals.
 
     Raises NoSolution.
     """
@@ -117,7 +117,7 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Ca
 def projection_derivatives(
     camera: CameraModel, pose: Array, points_m: Array
 ) -> tuple[Array, Array]:
-    """Return the Jacobians of the pixels of points (n, 3) at a pose (rvec, tvec; (6,)) with respect
+    """The Jacobians of the pixels of points (n, 3) at a pose (rvec, tvec; (6,)) with respect
     to the lens parameters, (2 n, p), and to the pose, (2 n, 6)."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
@@ -131,7 +131,7 @@ def projection_derivatives(
 
 
 def lens_covariance(views: Sequence[BoardView], fit: CameraFit) -> Array:
-    """Return the covariance (p, p) of the lens parameters, marginalized over the board poses."""
+    """The covariance (p, p) of the lens parameters, marginalized over the board poses."""
     rows = []
     for view, pose, residual in zip(views, fit.poses, fit.residuals, strict=True):
         lens, outside = projection_derivatives(fit.camera, pose, view.corners_m)
@@ -165,7 +165,7 @@ _REJECTION_ROUNDS = 10
 def reject_outliers(
     views: Sequence[BoardView], fit: CameraFit
 ) -> tuple[CameraFit, list[BoardView], list[Rejection]]:
-    """Return the fit without outliers, the views used, and the rejected views and corners.
+    """The fit without outliers, the views used, and the rejected views and corners.
 
     Raises:
         InvalidValue: too many views do not fit one camera. NoSolution.
@@ -240,7 +240,7 @@ def jackknife_covariance(
     curvature_factor: float = 1.0,
     information_factor: float = 1.0,
 ) -> Array:
-    """Return the covariance (p, p) of a least-squares solution: the inverse information, enlarged
+    """The covariance (p, p) of a least-squares solution: the inverse information, enlarged
     to the variances of the delete-one-block jackknife where these are larger.
 
     Args:
@@ -273,6 +273,6 @@ def jackknife_covariance(
 
 
 def student_to_normal_ratio(degrees_of_freedom: int) -> float:
-    """Return the ratio of the 95 % half-widths of Student's t and the normal distribution; fewer
+    """The ratio of the 95 % half-widths of Student's t and the normal distribution; fewer
     than 3 degrees of freedom count as 3."""
     return float(stdtrit(max(degrees_of_freedom, 3), 0.975)) / SIGMAS_95

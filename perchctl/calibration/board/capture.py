@@ -76,7 +76,7 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """Return how a view shows the board, (5,): the corners' centre x, y and the board's size,
+    """How a view shows the board, (5,): the corners' centre x, y and the board's size,
     relative to the picture, and the tilts: how much farther away the right side is than the left,
     and the lower side than the upper."""
     w, h = view.size_px
@@ -96,12 +96,12 @@ def view_signature(view: BoardView, board: Board) -> Array:
 
 
 def signature_distance(one: Array, other: Array) -> float:
-    """Return the distance of two signatures; beyond `NEW_BEYOND` a view counts as new."""
+    """The distance of two signatures; beyond `NEW_BEYOND` a view counts as new."""
     return float(np.abs(one - other) @ _WEIGHTS)
 
 
 def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
-    """Return the share, 0..1, of its goal that each of `AXES` has reached."""
+    """The share, 0..1, of its goal that each of `AXES` has reached."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
     spread = {"x": x, "y": y, "size": size, "tilt": sum(tilts) / 2.0}
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
@@ -194,7 +194,7 @@ class GuidedCapture:
         return False
 
     def guided_frame(self, frame: Frame, view: BoardView | str, taken: bool) -> GuidedFrame:
-        """Return a frame with outline, coverage and advice."""
+        """A frame with outline, coverage and advice."""
         outlines: tuple[tuple[str, Array], ...] = ()
         if isinstance(view, BoardView):
             hull = cv2.convexHull(view.corners_px.astype(np.float32)).reshape(-1, 2)
@@ -216,7 +216,7 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """Return one instruction, in directions of the picture, towards the gap in the least covered of
+    """One instruction, in directions of the picture, towards the gap in the least covered of
     `AXES`."""
     done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])

@@ -64,7 +64,7 @@ class CheckResult:
     rejections: tuple[Rejection, ...]
 
     def record(self, file: Path) -> dict[str, Any]:
-        """Return the object of `calibrate check --json`."""
+        """The object of `calibrate check --json`."""
         return {
             "pass": self.passed,
             "reason": self.reason,

@@ -73,7 +73,7 @@ class FoundViews:
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """Return the view of a board in a grey picture (h, w), or why there is none. In an interlaced
+    """The view of a board in a grey picture (h, w), or why there is none. In an interlaced
     picture the first field is used, as a moving board has two positions."""
     image = split_fields(image)[0]
     h, w = image.shape
@@ -197,7 +197,7 @@ class SaddleFit:
 def fit_saddles(
     image: NDArray[np.uint8], corners_px: Array, axes_px: Array, white_rim: float = 1.0
 ) -> SaddleFit:
-    """Return the corners refined to hundredths of a pixel.
+    """The corners refined to hundredths of a pixel.
 
     Args:
         image: grey picture (h, w).

@@ -44,12 +44,12 @@ class ErrorAtRange:
 
 
 def allowed_error_mm(z_m: float) -> float:
-    """Return the position error that perching allows: the larger of 1 mm and 1 % of distance."""
+    """The position error that perching allows: the larger of 1 mm and 1 % of distance."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
 def covered_cells(views: Sequence[BoardView]) -> NDArray[np.bool_]:
-    """Return a mask (rows, columns) of the picture's grid cells inside some board's corners."""
+    """A mask (rows, columns) of the picture's grid cells inside some board's corners."""
     rows, columns = CELLS
     cells_seen = np.zeros(CELLS, dtype=np.uint8)
     for view in views:
@@ -82,7 +82,7 @@ def predict_errors(
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """Return the target's position errors (n,) if pictures of camera `truth` are evaluated with
+    """The target's position errors (n,) if pictures of camera `truth` are evaluated with
     `camera`, at n places at distance z_m; the first is on the axis."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)

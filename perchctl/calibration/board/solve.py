@@ -120,7 +120,7 @@ class Calibration:
         return [*lines, *self.defects, self.verdict_text]
 
     def record(self) -> dict[str, Any]:
-        """Return the results for `calibrate --json`."""
+        """The results for `calibrate --json`."""
         names = PARAMETERS[self.camera.model]
         values = self.fit.parameters.tolist()
         return {
@@ -141,7 +141,7 @@ class Calibration:
         }
 
     def file_text(self, name: str, date: str) -> str:
-        """Return the content of the calibration file, with quality and covariance."""
+        """The content of the calibration file, with quality and covariance."""
         return calibration_text(
             self.camera,
             name,
@@ -305,7 +305,7 @@ def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
 
 
 def tilts_deg(poses: Array) -> Array:
-    """Return the tilt of each board (poses (v, 6)) against the image plane, (v,)."""
+    """The tilt of each board (poses (v, 6)) against the image plane, (v,)."""
     normals = np.array([cv2.Rodrigues(pose[:3])[0][2, 2] for pose in poses])
     return np.asarray(np.degrees(np.arccos(np.minimum(np.abs(normals), 1.0))), dtype=np.float64)
 

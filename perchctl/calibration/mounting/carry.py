@@ -267,7 +267,7 @@ _HALF_COUNTED_RAD = 0.02
 
 
 def guess_rotation_and_latency(gyro: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
-    """Return a first estimate of R_body_cam and of the latency in s. Raises InvalidValue without
+    """A first estimate of R_body_cam and of the latency in s. Raises InvalidValue without
     pairs of pictures some tenths of a second apart."""
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
@@ -351,21 +351,21 @@ class PoseResiduals:
         return jacobian.reshape(-1, p).T @ weighted, -weighted.T @ self.misfit[poses].ravel()
 
     def step(self, prior_offset: Array | float = 0.0) -> Array:
-        """Return the Gauss-Newton step (p,); `prior_offset` (p,) is the parameters' offset from the
+        """The Gauss-Newton step (p,); `prior_offset` (p,) is the parameters' offset from the
         prior's mean."""
         information, gradient = self.normal_equations()
         pull = self.prior @ np.broadcast_to(prior_offset, gradient.shape)
         return np.asarray(np.linalg.solve(information + self.prior, gradient - pull))
 
     def after_step(self, step: Array) -> PoseResiduals:
-        """Return the residuals after a step (p,), to first order."""
+        """The residuals after a step (p,), to first order."""
         misfit = self.misfit + self.jacobian @ step
         return replace(
             self, misfit=misfit, robust_weights=_weights(_distance2(misfit, self.inverse_cov))
         )
 
     def covariance(self) -> Array:
-        """Return the parameters' covariance (p, p), by a block jackknife, as errors of consecutive
+        """The parameters' covariance (p, p), by a block jackknife, as errors of consecutive
         pictures may correlate."""
         blocks = [
             self.normal_equations(k) for k in np.array_split(np.arange(len(self.misfit)), BLOCKS)
@@ -409,7 +409,7 @@ def _weights(distance2: Array) -> Array:
 
 
 def _robust_shares(distance2: Array) -> tuple[float, float]:
-    """Return the curvature and information factors of robust weights for `jackknife_covariance`."""
+    """The curvature and information factors of robust weights for `jackknife_covariance`."""
     w = _weights(distance2)
     curved = float((w * (1.0 - 2.0 * distance2 / (3 * (FREEDOM + distance2)))).mean())
     pushed = float((w**2 * distance2).mean()) / 3

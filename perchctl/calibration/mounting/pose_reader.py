@@ -38,7 +38,7 @@ class PoseReader:
         self.trouble = ""
 
     def read_poses(self, frame: Frame) -> list[TargetPose]:
-        """Return the target's poses in a frame: one, or one in each of its two fields."""
+        """The target's poses in a frame: one, or one in each of its two fields."""
         judged = self._perception.health.assess(frame, self._live)
         if judged == "repeated":
             return []

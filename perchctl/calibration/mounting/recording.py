@@ -84,7 +84,7 @@ class MountingRecording:
 
     @staticmethod
     def read(path: Path) -> list[MountingRecording]:
-        """Return the recordings of a file, in its order.
+        """The recordings of a file, in its order.
 
         Raises:
             NotFound: no such file.
@@ -142,7 +142,7 @@ class PoseArrays:
 
 
 def pose_arrays(recording: MountingRecording) -> PoseArrays:
-    """Return the poses of a recording as arrays, by time."""
+    """The poses of a recording as arrays, by time."""
     poses = sorted(recording.poses, key=lambda pose: pose.t_s)
     return PoseArrays(
         t_s=np.array([p.t_s for p in poses]),
@@ -194,7 +194,7 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
 
 
 def missing_motion(recording: MountingRecording) -> list[str]:
-    """Return which motion is still missing, in a few words each; empty when it is enough."""
+    """Which motion is still missing, in a few words each; empty when it is enough."""
     part = recording.part
     poses = recording.poses
     attitudes = recording.attitudes

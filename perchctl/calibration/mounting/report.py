@@ -70,7 +70,7 @@ class MountingReport:
         return np.asarray(T[:3, :3].T @ (np.array(self.profile.vehicle.gear_body_m) - T[:3, 3]))
 
     def new_profile_values(self) -> dict[str, float | tuple[float, ...]]:
-        """Return the measured values to write into the profile, by dotted key, without the latency
+        """The measured values to write into the profile, by dotted key, without the latency
         if the profile leaves it to be measured in each flight."""
         values: dict[str, float | tuple[float, ...]] = {}
         if self.rotation is not None:
@@ -82,7 +82,7 @@ class MountingReport:
         return values
 
     def keys_text(self) -> str:
-        """Return the new values as YAML for the profile."""
+        """The new values as YAML for the profile."""
         lines = []
         for key, value in self.new_profile_values().items():
             numbers = value if isinstance(value, tuple) else (value,)
@@ -108,7 +108,7 @@ class MountingReport:
         return values
 
     def record(self) -> dict[str, Any]:
-        """Return the results for `calibrate mount --json`: measured values, sigmas, the profile's
+        """The results for `calibrate mount --json`: measured values, sigmas, the profile's
         values, and its new ones."""
         values = self._values()
         return {v.key: v.measured.tolist() for v in values} | {
@@ -118,7 +118,7 @@ class MountingReport:
         }
 
     def lines(self) -> list[str]:
-        """Return a line for each value, with its 95 % interval and the profile's value."""
+        """A line for each value, with its 95 % interval and the profile's value."""
         return [line for value in self._values() for line in value.lines()]
 
 

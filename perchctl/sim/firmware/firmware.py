@@ -161,7 +161,7 @@ class Firmware:
         )
 
     def log_value(self, name: str) -> float:
-        """Return a log variable in its own units (degrees, g, pitch nose up).
+        """A log variable in its own units (degrees, g, pitch nose up).
 
         Raises KeyError for an unknown name.
         """

@@ -43,7 +43,7 @@ _SHEET = 1.3  # half sides of a marker that are surely paper
 def find_expected_blurred(
     picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
-    """Return the first marker found near its `expected` corners (4, 2) px; empty if none.
+    """The first marker found near its `expected` corners (4, 2) px; empty if none.
 
     An even or odd `turn` chooses fits that start with little or with much blur; None: both."""
     image, patterns = picture.image, picture.setup.patterns
@@ -65,7 +65,7 @@ def find_expected_blurred(
 
 
 def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """Return the marker that the best of the picture's quadrilaterals shows; empty if none does."""
+    """The marker that the best of the picture's quadrilaterals shows; empty if none does."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -167,7 +167,7 @@ def align_marker(
     max_sigma: float = _MAX_SIGMA,
     alone: bool = True,
 ) -> RefinedCorners | None:
-    """Return the marker fitted by its drawing; None unless the picture looks like the drawing.
+    """The marker fitted by its drawing; None unless the picture looks like the drawing.
 
     `reach` is the allowed distance of the corners from `start_px`, and `max_sigma` their
     largest spread, both in sides. If `alone`, the codeword must be distinctive; otherwise the

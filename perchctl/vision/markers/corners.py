@@ -32,25 +32,25 @@ _INCREMENTS: Array = np.array(
 
 
 def homography_from_unit(corners: Array) -> Array:
-    """Return the homography (3, 3) of the unit square to corners (4, 2)."""
+    """The homography (3, 3) of the unit square to corners (4, 2)."""
     H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def homography_to_unit(corners: Array) -> Array:
-    """Return the homography (3, 3) of corners (4, 2) to the unit square."""
+    """The homography (3, 3) of corners (4, 2) to the unit square."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
     return np.asarray(H, dtype=np.float64)
 
 
 def apply_homography(H: Array, points: Array) -> Array:
-    """Return the points (..., 2) mapped by the homography."""
+    """The points (..., 2) mapped by the homography."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
 def homography_jacobian(homography: Array) -> Array:
-    """Return the Jacobian (8, 8) of the projected corners of the unit square with respect to the
+    """The Jacobian (8, 8) of the projected corners of the unit square with respect to the
     terms `p` of `increment_homography`, at a homography (3, 3)."""
     q = _UNIT1.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
@@ -66,13 +66,13 @@ def increment_homography(H: Array, p: Array) -> Array:
 
 
 def side_lengths_px(corners_px: Array) -> Array:
-    """Return the lengths of the four sides, (..., 4)."""
+    """The lengths of the four sides, (..., 4)."""
     d = corners_px.take(NEXT, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
 
 def mean_side_px(corners_px: Array) -> float:
-    """Return the mean length of the sides of one square (4, 2)."""
+    """The mean length of the sides of one square (4, 2)."""
     a, b, c, d = corners_px.tolist()
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
@@ -92,7 +92,7 @@ def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> b
 
 
 def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """Return the corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
+    """The corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
     without a camera, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = apply_homography(homography_from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
@@ -102,7 +102,7 @@ def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = N
 def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Return both markers' corners; a missing marker is derived from the other one."""
+    """Both markers' corners; a missing marker is derived from the other one."""
     both = dict(expected)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], ratio, camera)
@@ -137,7 +137,7 @@ class RefinedCorners:
 
 
 def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Return the corners (4, 2) by `cv2.cornerSubPix`, or the raw ones."""
+    """The corners (4, 2) by `cv2.cornerSubPix`, or the raw ones."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)

@@ -230,7 +230,7 @@ class Overview:
 
 @lru_cache(maxsize=8)
 def make_lattice(camera: CameraModel) -> Lattice:
-    """Return the lattice over a camera's picture."""
+    """The lattice over a camera's picture."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _RIM_POINTS)
     low, high = np.zeros_like(s), np.ones_like(s)
@@ -267,7 +267,7 @@ def make_lattice(camera: CameraModel) -> Lattice:
 def make_overview(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """Return the reduced picture at the lattice's nodes, seen where `mask` (image shape) is 0."""
+    """The reduced picture at the lattice's nodes, seen where `mask` (image shape) is 0."""
     lattice = make_lattice(camera)
     seen = lattice.inside
     if mask is not None:
@@ -288,7 +288,7 @@ def _coarse(fine: Grey) -> Grey:
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Return the whiteness of the drawing projected by H (3, 3), at nodes and `margin` around."""
+    """The whiteness of the drawing projected by H (3, 3), at nodes and `margin` around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -310,7 +310,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
 
 
 def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """Return the correlation with the drawing projected by H, and its gain in grey levels."""
+    """The correlation with the drawing projected by H, and its gain in grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -355,7 +355,7 @@ Texture = tuple[NDArray[np.float32], Array]
 
 @lru_cache(maxsize=8)
 def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
-    """Return the edges of both markers; tolerances are in cells."""
+    """The edges of both markers; tolerances are in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -382,7 +382,7 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
 
 @lru_cache(maxsize=8)
 def make_texture(drawing: Drawing) -> Texture:
-    """Return a picture of the drawing up to `PAPER`, and the map (3, 3) to its columns and rows."""
+    """A picture of the drawing up to `PAPER`, and the map (3, 3) to its columns and rows."""
     axis = make_grid(_TEXELS, PAPER).axis
     wide = render_cells(drawing, axis, PAPER / _TEXELS)
     more = (len(wide) - _TEXELS) // 2
@@ -509,7 +509,7 @@ def fit_pose(
 
 
 def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """Return the result that `fit_pose` would have for a perfect picture at that pose."""
+    """The result that `fit_pose` would have for a perfect picture at that pose."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:

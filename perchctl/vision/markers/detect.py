@@ -231,7 +231,7 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """Return the last corners (4, 2) px, extrapolated to `t_s` by their flow."""
+    """The last corners (4, 2) px, extrapolated to `t_s` by their flow."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -279,7 +279,7 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
-    """Return the `seen` markers with better corners, and any other visible marker. A marker found
+    """The `seen` markers with better corners, and any other visible marker. A marker found
     by a search alone is dropped unless its lines suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
@@ -347,7 +347,7 @@ def fit_lines(
 def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """Return the expected markers whose sides and cells are all confirmed in the picture."""
+    """The expected markers whose sides and cells are all confirmed in the picture."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]
@@ -369,7 +369,7 @@ def add_partly_visible(
     seen: _Found,
     shift: EdgeShift | None = None,
 ) -> _Found:
-    """Return the `seen` markers of `follow_markers` plus those fitted to their visible part. If
+    """The `seen` markers of `follow_markers` plus those fitted to their visible part. If
     the small marker was seen, the large one is expected around it."""
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
@@ -390,7 +390,7 @@ def add_partly_visible(
 
 
 def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """Return the large marker around a detected small one; the large one may be partly covered or
+    """The large marker around a detected small one; the large one may be partly covered or
     cut off."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.other_corners(small.corners_px, "large")
@@ -424,7 +424,7 @@ _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def mean_of_fields(a: Detections, b: Detections) -> Detections:
-    """Return the mean of both fields' corners, valid for either order of the fields. If one marker
+    """The mean of both fields' corners, valid for either order of the fields. If one marker
     is in both fields, a marker in only one field is left out."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:

@@ -52,7 +52,7 @@ class DetectorSetup:
 def make_aruco_detector(
     config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
 ) -> DetectorSetup:
-    """Return the setup for a target, with dictionaries of its markers' ids alone."""
+    """The setup for a target, with dictionaries of its markers' ids alone."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -134,7 +134,7 @@ _TINY = 1e-4
 
 
 def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
-    """Return the mask (h, w) of the vehicle in a frame; for a single field it is widened, as the
+    """The mask (h, w) of the vehicle in a frame; for a single field it is widened, as the
     missing rows are interpolated."""
     if mask is None or frame.fields not in ("top", "bottom"):
         return mask
@@ -142,7 +142,7 @@ def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
 
 
 def fill_hidden(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """Return the picture with its hidden pixels filled smoothly from their surroundings."""
+    """The picture with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))

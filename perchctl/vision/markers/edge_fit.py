@@ -57,14 +57,14 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def profile_places(lengths_px: Array) -> Array:
-    """Return the profiles' places along sides of `lengths_px` (rows,), as shares (rows, n) of a
+    """The profiles' places along sides of `lengths_px` (rows,), as shares (rows, n) of a
     side, away from the corners, where the next side blurs."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
 
 def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Return where the profiles cross the sides, in the picture, and the unit normals there, to the
+    """Where the profiles cross the sides, in the picture, and the unit normals there, to the
     left of the way from start to end as the picture is seen (outwards for a marker whose corners
     run clockwise): each (rows, n, 2).
 
@@ -88,7 +88,7 @@ def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> 
 def sample_profiles(
     image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array
 ) -> Floats:
-    """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
+    """The grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
     repeated outside.
 
     On float pictures OpenCV 5 interpolates at the exact position; on bytes, other
@@ -258,7 +258,7 @@ def _intersect(lines: Array) -> Array:
 
 
 def shift_prior_px(white_grey: float) -> float:
-    """Return the standard deviation of an unmeasured edge shift, given white paper's grey level."""
+    """The standard deviation of an unmeasured edge shift, given white paper's grey level."""
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
@@ -413,7 +413,7 @@ class EdgeData:
 
 
 def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Sides | None:
-    """Return the sides of markers for measuring; None if one is not a quadrilateral."""
+    """The sides of markers for measuring; None if one is not a quadrilateral."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -441,7 +441,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 def measure_edges(
     image: NDArray[np.uint8], markers: Sides, camera: CameraModel, with_inner: bool
 ) -> tuple[EdgeData, EdgeData | None]:
-    """Return the edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
+    """The edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
     marker `markers.widest`; None without `with_inner`, or if the marker's cells are too narrow."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
@@ -479,13 +479,13 @@ def measure_edges(
 
 
 def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """Return the half lengths of the windows around the edges and of the profiles, px."""
+    """The half lengths of the windows around the edges and of the profiles, px."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> NeighbourEdges:
-    """Return the neighbours of edges at places `s` (rows, n): four rows a rim, then four of the
+    """The neighbours of edges at places `s` (rows, n): four rows a rim, then four of the
     inner edges of the border of rim `inner` if `s` has them."""
     inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
     possible = np.ones(s.shape, np.bool_)
@@ -586,7 +586,7 @@ class _Profiles:
         self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), 1.0)
 
     def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the edges by one window around all middles, and which count."""
+        """The edges by one window around all middles, and which count."""
         spread = self.u * (_PER_NEAR / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -598,7 +598,7 @@ class _Profiles:
         return np.divide(moments[..., 1], np.where(usable, total, 1.0)), usable
 
     def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Return the edges by a window around the row's line, which count, blur^2."""
+        """The edges by a window around the row's line, which count, blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
@@ -662,7 +662,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
 
 
 def row_medians(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Return each row's median over its usable values, (rows,); 0 without any."""
+    """Each row's median over its usable values, (rows,); 0 without any."""
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)
     found = values[:, PROFILES // 2]

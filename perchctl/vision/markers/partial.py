@@ -292,7 +292,7 @@ class SeenEdges:
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """Return the edges near the square projected by H (3, 3); None if too few are visible."""
+    """The edges near the square projected by H (3, 3); None if too few are visible."""
     camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):

@@ -62,7 +62,7 @@ class Pattern:
 
 
 def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """Return the rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
+    """The rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
     the border's edges."""
     n = len(bits)
 
@@ -80,7 +80,7 @@ def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
-    """Return the pattern of a marker, with spots in all cells not hidden by a marker inside."""
+    """The pattern of a marker, with spots in all cells not hidden by a marker inside."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -140,7 +140,7 @@ def fits_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) 
 
 
 def correlations(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
+    """The correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
     rolled on by 0 to 3; 0 without contrast."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
@@ -209,7 +209,7 @@ class Drawing:
 def make_drawing(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
-    """Return a marker's drawing by its inner bits, 1 = white; `centre`: the small marker's."""
+    """A marker's drawing by its inner bits, 1 = white; `centre`: the small marker's."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -232,7 +232,7 @@ def _wide(axis: Array, half_node: float) -> Array:
 
 @lru_cache(maxsize=64)
 def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """Return the whiteness at n by n nodes, and if the sheet ends, each node's share beyond."""
+    """The whiteness at n by n nodes, and if the sheet ends, each node's share beyond."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = render_cells(drawing, axis, half_node)
@@ -244,12 +244,12 @@ def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
 
 @lru_cache(maxsize=64)
 def black_square(cells: int, n: int) -> NDArray[np.float32]:
-    """Return the whiteness of a black square of `cells` cells a side, n by n nodes."""
+    """The whiteness of a black square of `cells` cells a side, n by n nodes."""
     return render_sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
 def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of the nodes at `axis` x `axis`, and of `EDGE` more nodes all around."""
+    """The whiteness of the nodes at `axis` x `axis`, and of `EDGE` more nodes all around."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
@@ -260,7 +260,7 @@ def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """Return the blurred share of each row of cells in each node (n, cells)."""
+    """The blurred share of each row of cells in each node (n, cells)."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
@@ -269,6 +269,6 @@ def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) ->
 
 
 def blur_nodes(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Return the nodes, with the margin around them, after a Gaussian blur of `sigma` nodes."""
+    """The nodes, with the margin around them, after a Gaussian blur of `sigma` nodes."""
     soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

@@ -216,7 +216,7 @@ def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations |
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """Return the correlation of `grey` with its fit, whose residual is `error`."""
+    """The correlation of `grey` with its fit, whose residual is `error`."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -315,7 +315,7 @@ class Grid:
 
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """Return the nodes in the middle of n by n parts of a square."""
+    """The nodes in the middle of n by n parts of a square."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
@@ -342,7 +342,7 @@ def distort_px(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """Return each node's shift by the lens, px (2, n * n), interpolated from a few nodes."""
+    """Each node's shift by the lens, px (2, n * n), interpolated from a few nodes."""
     uv1, between = _few(grid)
     pin = project_nodes(H, uv1)
     shift = (distort_px(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -391,7 +391,7 @@ _BLOCK = 256  # values of a row
 
 
 def gram_matrix(rows: Array) -> Array:
-    """Return the Gram matrix (k, k), ``rows @ rows.T``, of rows (k, n)."""
+    """The Gram matrix (k, k), ``rows @ rows.T``, of rows (k, n)."""
     k, n = rows.shape
     whole = n - n % _BLOCK
     blocks = rows[:, :whole].reshape(k, -1, _BLOCK).transpose(1, 0, 2)
@@ -452,7 +452,7 @@ class RenderedDrawing:
 
 @lru_cache(maxsize=16)
 def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_STEP * step)`` nodes."""
+    """The drawing at n by n nodes over its reach, blurred by ``exp(_STEP * step)`` nodes."""
     return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 

@@ -96,7 +96,7 @@ def search_halved(
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """Return the part of the picture to search, None if a window would not pay. The window holds
+    """The part of the picture to search, None if a window would not pay. The window holds
     the whole large marker if that can be in the picture."""
     h, w = shape[:2]
     if "large" in expected:
@@ -221,7 +221,7 @@ def _wholes(
 
 
 def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
-    """Return the small marker's distance from its place in the large one, over the tolerance."""
+    """The small marker's distance from its place in the large one, over the tolerance."""
     mapped = scale_square(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
