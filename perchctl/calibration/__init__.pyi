@@ -6,7 +6,7 @@ from .board.solve import calibrate_camera as calibrate_camera
 from .files import calibration_text as calibration_text
 from .files import load_calibration as load_calibration
 from .files import profile_camera as profile_camera
-from .gear import learn_mask as learn_mask
+from .gear import learn_gear_mask as learn_gear_mask
 from .live import GuidedFrame as GuidedFrame
 from .live import poll_frames as poll_frames
 from .mounting.capture import record_mounting as record_mounting

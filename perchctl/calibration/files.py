@@ -127,7 +127,6 @@ def _opencv_values(path: Path) -> _Values:
 
 
 def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> CameraModel:
-    """The camera model. Raises InvalidValue."""
     width, height = size
     if width is None or height is None:
         raise InvalidValue(
@@ -168,8 +167,8 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
 def calibration_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
-    """The content of a calibration file; `notes` are further keys, which ROS readers ignore;
-    arrays are (n, m)."""
+    """The text of a calibration file; `name` is the camera's. `notes` are further keys, ignored
+    by ROS readers, with numbers, texts or arrays (n, m)."""
     # ROS wants five coefficients of plumb_bob.
     short = camera.model == "plumb_bob" and camera.dist.size == 4
     entries: dict[str, str | float | int | Array] = {

@@ -26,7 +26,7 @@ _LEAST_SHARE = 5e-4  # of the picture, for a part of the gear
 _CLOSED_PX, _EDGE_PX = 7, 3  # gaps that are gear; blur around it
 
 
-def learn_mask(
+def learn_gear_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
     """The mask (h, w) of the pixels that the vehicle covers, by the pictures of a recording,

@@ -26,7 +26,6 @@ def without_password(text: str) -> str:
 
 
 def _without_name(rest: str) -> str:
-    """Remove name and password from a URL's part behind its scheme."""
     host, slash, path = rest.partition("/")
     if "@" in host:
         return f"{host.rpartition('@')[2]}{slash}{path}"

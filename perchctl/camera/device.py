@@ -25,7 +25,7 @@ REOPEN_EVERY_S = 1.0
 def open_video_capture(
     place: str, size_px: tuple[int, int] | None, config: CameraConfig | None
 ) -> Any:
-    """An opened cv2.VideoCapture of `camera_number(place)`, set to `size_px` and to the
+    """An opened cv2.VideoCapture of the camera named by `place`, set to `size_px` and to the
     format and rate of `config`. Raises NotFound, which lists the existing cameras."""
     number, linux = camera_number(place), sys.platform.startswith("linux")
     if linux and not Path(f"/dev/video{number}").exists():
@@ -59,7 +59,7 @@ class DeviceSource(LiveSource):
     """A camera of this computer: only the newest frame is kept, stamped when the grab returns.
 
     A bad picture is dropped. After `LOST_AFTER_FAILURES` in a row the camera counts as lost: it is
-    released, and opened again once it is back. `opener`: as `open_video_capture`.
+    released, and opened again once it is back. `opener` returns a cv2.VideoCapture.
     """
 
     reconnect_wait_s = REOPEN_EVERY_S
@@ -103,7 +103,7 @@ NAMES = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class ConnectedCamera:
-    """A camera of this computer. `stable_path`: link that is the same at every port, or empty;
+    """A camera of this computer. `stable_path`: a link, the same at every port, or empty;
     `problem`: why the camera cannot be opened, or empty."""
 
     number: int
@@ -135,7 +135,6 @@ def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[Connected
 
 
 def _video_numbers(paths: Iterable[Path]) -> list[int]:
-    """The N of each path that is a videoN."""
     numbers = (path.name.removeprefix("video") for path in paths)
     return [int(n) for n in numbers if n.isascii() and n.isdigit()]
 

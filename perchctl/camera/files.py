@@ -25,7 +25,7 @@ class RecordedSource:
     """Base of the recorded sources; `_read` returns the next picture and its time, or None.
 
     `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown. `paths`:
-    the files of pictures, in the order of their frames' indices; empty of a video.
+    the files of pictures, in the order of their frames' indices; empty for a video.
     """
 
     live = False
@@ -135,7 +135,7 @@ class ImagesSource(RecordedSource):
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """The grey picture of a file's bytes.
 
-    Raises ValueError for one that is cut off, or that OpenCV does not read.
+    Raises ValueError for a picture that is cut off, or that OpenCV does not read.
     """
     # Decoders fill the rest with grey, and say so on stderr without the file's name.
     png_ends = not data.startswith(b"\x89PNG") or b"IEND" in data

@@ -78,7 +78,6 @@ def picture_kind(image: NDArray[np.uint8]) -> FrameKind:
 
 
 def _mean_square(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """The mean square of the pixels' differences."""
     return float(cv2.norm(one, other, cv2.NORM_L2SQR)) / one.size
 
 

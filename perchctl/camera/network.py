@@ -147,7 +147,8 @@ class TransferDelay:
         self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
 
     def extra_delay_s(self, camera_s: float | None, arrival_s: float) -> float:
-        """The transfer time beyond the fastest picture's, s; 0 if `camera_s` is None."""
+        """The transfer time beyond the fastest picture's, s; 0 without `camera_s`, the camera's
+        timestamp."""
         if camera_s is None:
             return 0.0
         if camera_s < self._camera_s:

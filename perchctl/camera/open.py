@@ -80,7 +80,7 @@ def parse_source(text: str) -> SourceName:
 
 
 def _check_address(name: SourceName) -> None:
-    """Raise InvalidValue where a stream's URL has no host, or a port that cannot be."""
+    """Raise InvalidValue for a URL without host or with a wrong port."""
     try:
         parts = urlsplit(name.spec)
         is_right = name.place.startswith("//") and bool(parts.hostname) and parts.port != 0
@@ -150,7 +150,6 @@ def _live(
     clock: Clock,
     config: CameraConfig | None,
 ) -> LiveSource:
-    """A camera or stream that is not opened yet."""
     if name.scheme == "camera":
         opener = partial(open_video_capture, name.place, size_px, config)
         return DeviceSource(str(name), latency_s, clock, opener)

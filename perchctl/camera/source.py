@@ -21,7 +21,7 @@ from perchctl.vision import CameraModel, Frame
 class NewestSlot:
     """Keeps the newest picture, with the time of its first arrival.
 
-    A picture that the receiver repeats does not replace the original while that is not yet taken,
+    A picture that the receiver repeats does not replace the original until the original is taken,
     so the arrival time stays. Afterwards the repeat is given with the same index and
     `Frame.repeated`: a sign of life, not a measurement.
     """
@@ -75,10 +75,10 @@ class FrameSource(Protocol):
         """Width and height of the frames, once the first has come."""
 
     def poll(self, now_s: float) -> Frame | None:
-        """The newest frame, or None if there is none since the last call."""
+        """The newest frame (recorded: the next); None if none came since the last call."""
 
     def problem(self, now_s: float) -> str | None:
-        """One sentence if the source is gone, else None."""
+        """A sentence if the source is lost at `now_s`, else None."""
 
     def describe(self) -> str: ...
 
@@ -98,7 +98,7 @@ def to_grey(image: Any) -> Grey:
 
 
 def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str) -> None:
-    """Raises InvalidValue if frames and calibration differ in size.
+    """Raises InvalidValue, which names `source`, if frames and calibration differ in size.
 
     Frames are not scaled to fit: cropped and scaled modes of a camera may have the same aspect
     ratio, but need different calibrations.
@@ -278,7 +278,7 @@ class WrappedSource:
 
 
 def mirrored_note(config: CameraConfig) -> str:
-    """A sentence: the picture is mirrored, and how to correct this profile."""
+    """A sentence: the picture is mirrored, and how to correct the profile with `config`."""
     advice = "switch that off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
         advice = "the camera does not mirror, so take camera.mirrored out of the profile"

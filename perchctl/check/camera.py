@@ -52,7 +52,7 @@ _ADVICE = {
 
 
 def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
-    """The rows of a camera that fails: one failed, the others skipped."""
+    """The rows of a camera that fails: the first failed, the others skipped."""
     found, semicolon, advice = str(error).rpartition("; ")
     if not semicolon:
         found, advice = str(error), "see docs/check.md; perchctl check --cameras lists the cameras"
@@ -60,17 +60,17 @@ def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
     return [Row("camera", *failed(found, advice)), *skipped_rows(names, "no picture comes")]
 
 
-def size_finding(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) -> Finding:
-    """Compare the size of the pictures with the calibration's."""
-    found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, wanted_px))
-    if size_px == wanted_px:
+def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
+    """Judge the pictures' size (None: unknown) against the calibration's."""
+    found, wanted = ("x".join(map(str, size or ("unknown",))) for size in (size_px, calibrated_px))
+    if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")
     advice = "set the camera to that size, or calibrate it at this one"
     return failed(f"{found} px, calibrated at {wanted} px", advice)
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
-    """The rows on the pictures of a rehearsal."""
+    """The rows of `picture_row_names` for a rehearsal; the first failed if no picture came."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = picture_row_names(profile)
@@ -94,7 +94,7 @@ def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Judge the longest gap between pictures that arrived one after another."""
+    """Judge the longest gap between successive pictures."""
     if not rehearsal.live:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
@@ -110,7 +110,6 @@ def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    """Judge how old pictures are when they have been searched."""
     if not rehearsal.live or not rehearsal.ages_s:
         return skipped("none was looked at" if rehearsal.live else "a recording")
     age_s, limit_s = float(np.quantile(rehearsal.ages_s, 0.95)), profile.safety.max_frame_age_s
@@ -148,9 +147,9 @@ def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 
 def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
-    if not rehearsal.found:
+    if not rehearsal.target_pictures:
         return skipped("not in view", "put the vehicle under it to check the rest")
-    found = f"in {100 * rehearsal.found // rehearsal.pictures} % of the pictures"
+    found = f"in {100 * rehearsal.target_pictures // rehearsal.pictures} % of the pictures"
     target = rehearsal.target
     if target is not None:
         away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -158,7 +157,7 @@ def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
         found += f", {away_m:.2f} m from the gear (+- {spread_mm:.0f} mm)"
         if problem := GroundCriteria.target_too_near(target):
             return failed(problem.found, problem.advice)
-    if rehearsal.found < SEEN_WARN * rehearsal.pictures:
+    if rehearsal.target_pictures < SEEN_WARN * rehearsal.pictures:
         return warned(found, "nearer, sharper, or more light: see focus")
     return passed(found)
 
@@ -188,7 +187,7 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
     """Judge the view from where the vehicle stands, and on its way up: what `fly` refuses fails."""
-    if not rehearsal.found:
+    if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
     if rehearsal.target is None:
@@ -207,7 +206,7 @@ IN_VIEW = "in view"
 
 
 def picture_row_names(profile: Profile) -> tuple[str, ...]:
-    """The names of the pictures' rows, in their order."""
+    """The names of the rows of checks on pictures, in order."""
     return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
 
 
@@ -215,16 +214,18 @@ def picture_row_names(profile: Profile) -> tuple[str, ...]:
 
 
 def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
-    """Judge the loop by its processing time for a picture and by late turns."""
-    if rehearsal is None or len(rehearsal.work_s) < LEAST_RATED:
+    """Judge the loop by its processing time for a picture and by late ticks; None: skipped."""
+    if rehearsal is None or len(rehearsal.processing_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:
         return skipped("a recording comes as fast as it is read")
-    work_s = float(np.quantile(rehearsal.work_s, 0.95))
+    work_s = float(np.quantile(rehearsal.processing_s, 0.95))
     turn_s = 1.0 / profile.link.loop_hz
     period_s = rehearsal.frame_period_s or turn_s
-    late = sum(late_s > turn_s / 2.0 for late_s in rehearsal.late_s) / len(rehearsal.late_s)
-    latest_s = max(rehearsal.late_s)
+    late = sum(late_s > turn_s / 2.0 for late_s in rehearsal.tick_delays_s) / len(
+        rehearsal.tick_delays_s
+    )
+    latest_s = max(rehearsal.tick_delays_s)
     found = (
         f"{1e3 * work_s:.0f} ms a picture of {1e3 * period_s:.0f}, "
         f"{100.0 * late:.0f} % of the turns late, at most {1e3 * latest_s:.0f} ms"

@@ -101,7 +101,7 @@ BODY_ROWS = ("body", "body place")
 
 
 def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
-    """The rows of a motion capture that cannot be opened or sends nothing."""
+    """The rows of a motion capture that cannot be opened or sends nothing; `why` is shown."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
     return [Row("capture", *failed(why, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
@@ -156,7 +156,7 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
 
 
 def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) -> Finding:
-    """Judge the body's place by the criteria of `fly`."""
+    """Judge the place by the criteria of `fly`."""
     newest = samples.telemetry[-1] if samples.telemetry else None
     place = places[-1].to_external(attitude=True)
     if newest is None:
@@ -196,8 +196,8 @@ class PairedMotion:
     """Motion at n common times.
 
     Attributes:
-        R_vehicle, R_capture: attitudes by the vehicle and by the capture.
-        positions_m: by the capture, (n, 3).
+        R_vehicle, R_capture: attitudes, n each, by the vehicle and by the capture.
+        positions_m: positions (n, 3) by the capture.
         max_deviation_g: the accelerometer's largest deviation from 1 g.
     """
 
@@ -214,12 +214,12 @@ class PairedMotion:
 
 @dataclass(frozen=True, eq=False)
 class FrameAlignment:
-    """Rotations A and B (see the module).
+    """Rotations A and B with R_capture = A R_vehicle B.
 
     Attributes:
         R_world: A, from the vehicle's world to the capture's.
         R_body: B, from the capture's body axes to the vehicle's.
-        residual_share: mean share of a turn left unexplained.
+        residual_share: mean share of a rotation that A and B leave unexplained.
     """
 
     R_world: Rotation
@@ -263,20 +263,20 @@ def pair_motion(
     )
 
 
-def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
-    """The alignment by all pairs of times between which the vehicle turned; None if it
+def solve_alignment(motion: PairedMotion) -> FrameAlignment | None:
+    """The alignment by all pairs of times between which the vehicle turned; None if the vehicle
     turned about fewer than two axes."""
-    i, j = np.triu_indices(len(moved.R_vehicle), 1)
-    size = (moved.R_vehicle[j] * moved.R_vehicle[i].inv()).magnitude()
+    i, j = np.triu_indices(len(motion.R_vehicle), 1)
+    size = (motion.R_vehicle[j] * motion.R_vehicle[i].inv()).magnitude()
     kept = (size >= LEAST_STEP_RAD) & (size <= MOST_STEP_RAD)
     if kept.sum() < 3:
         return None
     i, j, size = i[kept], j[kept], size[kept]
     world_own, world_seen = (
-        (R[j] * R[i].inv()).as_rotvec() for R in (moved.R_vehicle, moved.R_capture)
+        (R[j] * R[i].inv()).as_rotvec() for R in (motion.R_vehicle, motion.R_capture)
     )
     body_own, body_seen = (
-        (R[i].inv() * R[j]).as_rotvec() for R in (moved.R_vehicle, moved.R_capture)
+        (R[i].inv() * R[j]).as_rotvec() for R in (motion.R_vehicle, motion.R_capture)
     )
     if not _has_many_axes(world_own) or not _has_many_axes(body_own):
         return None
@@ -287,7 +287,7 @@ def solve_alignment(moved: PairedMotion) -> FrameAlignment | None:
 
 
 def _has_many_axes(turns: Array) -> bool:
-    """Return whether turns, as vectors (n, 3), are about more than one axis."""
+    """Turns are vectors (n, 3)."""
     axis = np.linalg.eigh(turns.T @ turns)[1][:, 2]  # the largest comes last
     aside_rad = np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1)
     return bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
@@ -298,15 +298,15 @@ def _turned_rad(attitudes: Rotation) -> Array:
     return np.asarray((attitudes[0].inv() * attitudes).magnitude())
 
 
-def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) -> Finding:
-    """Judge whether vehicle and capture agree on the motion; return the worst finding."""
-    if moved is None:
+def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -> Finding:
+    """Judge whether vehicle and capture agree on the motion; skipped for None."""
+    if motion is None:
         return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
-    own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (moved.R_vehicle, moved.R_capture))
-    way_m = float(np.linalg.norm(moved.displacements_m, axis=1).max())
+    own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (motion.R_vehicle, motion.R_capture))
+    way_m = float(np.linalg.norm(motion.displacements_m, axis=1).max())
     body = f"rigid body {config.body!r}"
     others = "it is another body's: correct positioning.body"
-    if own_rad <= MOVED_RAD and moved.max_deviation_g <= MOVED_G:
+    if own_rad <= MOVED_RAD and motion.max_deviation_g <= MOVED_G:
         if way_m > MOVED_M or seen_rad > MOVED_RAD:
             return failed(f"the {body} moves, and the vehicle stands still", others)
         return skipped("it was not moved", HOW_TO_TURN)
@@ -315,27 +315,27 @@ def comparison_finding(moved: PairedMotion | None, config: PositioningConfig) ->
     if way_m > REACH_M:
         found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
         return failed(found, "set the unit of the capture's stream to metres")
-    turns = solve_alignment(moved)
+    turns = solve_alignment(motion)
     if turns is None:
         turned_deg = math.degrees(own_rad)
         return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
     if turns.residual_share > STRANGER:
         advice = "it is another body's, or its markers are too few or too symmetric"
         return failed(f"the {body} does not turn as the vehicle does", advice)
-    return _world_finding(turns, moved) or _body_finding(turns, moved, config)
+    return _world_finding(turns, motion) or _body_finding(turns, motion, config)
 
 
-def _risen_m(turns: FrameAlignment, moved: PairedMotion) -> Array:
+def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
     """The way (3,) from the first place to the one farthest along the capture's vertical,
     or, where that is too near for a lift, to the farthest of all."""
-    displacements_m = moved.displacements_m
+    displacements_m = motion.displacements_m
     risen_m = displacements_m[int(np.argmax(np.abs(displacements_m @ turns.vertical)))]
     if float(np.linalg.norm(risen_m)) < LIFTED_M:
         risen_m = displacements_m[int(np.argmax(np.linalg.norm(displacements_m, axis=1)))]
     return np.asarray(risen_m)
 
 
-def _world_finding(turns: FrameAlignment, moved: PairedMotion) -> Finding | None:
+def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
     """What is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
@@ -348,7 +348,7 @@ def _world_finding(turns: FrameAlignment, moved: PairedMotion) -> Finding | None
             found = f"swapped axes: up is {axis} in the motion capture"
         advice = "set its world to z up, and define the rigid body anew with the vehicle level"
         return failed(found, advice)
-    risen_m = _risen_m(turns, moved)
+    risen_m = _risen_m(turns, motion)
     way_m = float(np.linalg.norm(risen_m))
     if way_m < LIFTED_M or nearest_axis(risen_m / way_m) == "z":
         return None
@@ -359,7 +359,9 @@ def _world_finding(turns: FrameAlignment, moved: PairedMotion) -> Finding | None
     )
 
 
-def _body_finding(turns: FrameAlignment, moved: PairedMotion, config: PositioningConfig) -> Finding:
+def _body_finding(
+    turns: FrameAlignment, motion: PairedMotion, config: PositioningConfig
+) -> Finding:
     off_deg = math.degrees(float(turns.R_body.magnitude()))
     if off_deg > BODY_WARN_DEG:
         profiled = rotation_from_rpy(*(math.radians(a) for a in config.body_rpy_deg))
@@ -371,7 +373,7 @@ def _body_finding(turns: FrameAlignment, moved: PairedMotion, config: Positionin
             f"set positioning.body_rpy_deg: [{wanted}], or define the body anew",
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
-    risen_m = float(_risen_m(turns, moved) @ turns.vertical)
+    risen_m = float(_risen_m(turns, motion) @ turns.vertical)
     if risen_m < LIFTED_M:
         return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
     return passed(f"{found}; rose by {risen_m:.2f} m")
@@ -396,7 +398,7 @@ def save_comparison_row(
     finding: Finding, config: PositioningConfig, uri: str, now: datetime
 ) -> Row:
     """Save the finding of a lift comparison for `fly`, unless it was skipped, and return the row on
-    what is saved."""
+    the saved comparison."""
     passes, vehicle = finding.verdict is Verdict.PASS, vehicle_uri(uri)
     if finding.verdict is Verdict.SKIPPED:
         return _record_row(config, uri, now)

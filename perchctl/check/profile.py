@@ -37,8 +37,8 @@ LOOKS_UP = math.cos(math.radians(45.0))
 def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
     """A row for each check of the profile, the most important first.
 
-    `source` replaces the profile's. Opens no link and no camera; reads the calibration file. Raises
-    nothing.
+    `source` replaces the profile's camera source. Opens no link and no camera; reads the
+    calibration file. Raises nothing.
     """
     plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = evaluate_rows(JUDGES, plan)
@@ -74,8 +74,6 @@ def _sentence(row: Row) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """A profile, with the camera that it would be flown with."""
-
     profile: Profile
     source: str
 
@@ -134,7 +132,6 @@ JUDGES: dict[str, Callable[[_Plan], Finding]] = {
 
 
 def _limits(name: str, profile: Profile) -> Finding:
-    """One finding for all limits of a kind."""
     limits = DOUBTFUL[name]
     if profile.planner.perch.mode == "position":
         limits = tuple(limit for limit in limits if "planner.perch.thrust" not in limit.keys)

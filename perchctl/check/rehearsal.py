@@ -35,26 +35,27 @@ class Rehearsal:
     Attributes:
         arrivals: index and arrival time of each picture.
         repeats: number of repeated pictures, which other counts leave out.
-        work_s: processing time of each turn with a picture; late_s: delay of each turn.
-        ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
-        problems: number of pictures by problem.
-        newest_outputs: the last few frames; found: number of pictures with a target.
+        processing_s: time for each tick with a picture; tick_delays_s: lateness of each tick.
+        ages_s: time from each picture's exposure, by `camera.latency_s`, to its result.
+        problem: the camera's at the end, or empty; problems: number of pictures by problem.
+        newest_outputs: the last few; target_pictures: number of pictures with a target.
         silent_s: time without a picture at the end.
         target: the final estimate; None if the target was not in view.
+        print_verdict: `PrintCheck.error_and_text()`; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
     """
 
     live: bool
     problem: str = ""
     arrivals: list[tuple[int, float]] = field(default_factory=list)
-    work_s: list[float] = field(default_factory=list)
-    late_s: list[float] = field(default_factory=list)
+    processing_s: list[float] = field(default_factory=list)
+    tick_delays_s: list[float] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     problems: Counter[str] = field(default_factory=Counter)
     newest_outputs: list[tuple[Frame, PipelineOutput]] = field(default_factory=list)
     pictures: int = 0
     repeats: int = 0
-    found: int = 0
+    target_pictures: int = 0
     silent_s: float = 0.0
     target: TargetEstimate | None = None
     print_verdict: tuple[bool, str] | None = None
@@ -70,8 +71,6 @@ class Rehearsal:
 
 
 class _Noted(WrappedSource):
-    """Remembers the newest picture."""
-
     newest: Frame | None = None
 
     def poll(self, now_s: float) -> Frame | None:
@@ -81,8 +80,7 @@ class _Noted(WrappedSource):
 
 @dataclass(frozen=True)
 class _TelemetryOnly:
-    """All that the senses get of the link. With `feet_m` the vehicle stands there, since without
-    positions its estimate runs away."""
+    """With `feet_m` the vehicle stands there, since without positions its estimate runs away."""
 
     take: TakeTelemetry
     feet_m: tuple[float, float, float] | None
@@ -95,7 +93,7 @@ class _TelemetryOnly:
 
 
 def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
-    """A stand-in for the link that gives a rehearsal its telemetry."""
+    """A stand-in for the link, whose telemetry for a rehearsal is what `take` returns."""
     by_target = profile.positioning.by == "target"
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 
@@ -109,7 +107,8 @@ def rehearse(
     duration_s: float = REHEARSED_S,
     stopwatch: Callable[[], float] = time.perf_counter,
 ) -> Rehearsal:
-    """Run perception for `duration_s` at the loop's rate. The source must have the calibrated size.
+    """Run perception for `duration_s` at the loop's rate, on the telemetry of `take` and on the
+    frames of `source`, which must have the calibrated size.
 
     `stopwatch` measures processing times, as `clock` may be simulated.
     """
@@ -123,7 +122,7 @@ def rehearse(
         began_s, mark_s = clock.now(), stopwatch()
         senses.poll_inputs(began_s)
         work_s = stopwatch() - mark_s
-        done.late_s.append(max(0.0, began_s - due_s))
+        done.tick_delays_s.append(max(0.0, began_s - due_s))
         if noted.newest is not None:
             _note(done, noted.newest, senses, prints, work_s, began_s)
         due_s += period_s
@@ -159,10 +158,10 @@ def _note(
     if output is None:
         return
     if done.pictures > WARM_FRAMES:
-        done.work_s.append(work_s)
+        done.processing_s.append(work_s)
         done.ages_s.append(now_s - frame.t_s + work_s)
     seen = output.detections
-    done.found += seen.large is not None or seen.small is not None
+    done.target_pictures += seen.large is not None or seen.small is not None
     prints.add(output)
     done.newest_outputs = [*done.newest_outputs[1 - KEPT_FRAMES :], (frame, output)]
 
@@ -170,7 +169,7 @@ def _note(
 def _blur_px(
     newest_outputs: Sequence[tuple[Frame, PipelineOutput]], pipeline: Pipeline
 ) -> float | None:
-    """Measure the blur by the target's own edges; None where it was not seen."""
+    """None where the target was not seen."""
     found_px = []
     for frame, output in newest_outputs:
         for name in MARKERS:

@@ -11,7 +11,7 @@ from perchctl.flight import Problem
 
 
 class Verdict(StrEnum):
-    """Verdict of one check."""
+    """Verdict of a check: passed, warning, failed or skipped."""
 
     PASS = "pass"
     WARN = "warn"
@@ -24,7 +24,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one check."""
+    """Result of a check: what it `found`, with units, and `advice`, or empty."""
 
     name: str
     verdict: Verdict
@@ -43,7 +43,7 @@ class Finding(NamedTuple):
 
 
 class Unanswerable(Exception):
-    """A check could not be made; `finding` is its skipped finding."""
+    """A check could not be made; `finding` is the skipped finding to report."""
 
     def __init__(self, why: str, advice: str = "") -> None:
         super().__init__(why)
@@ -94,7 +94,7 @@ def skipped(why: str, advice: str = "") -> Finding:
 
 
 def problem_finding(problem: Problem | None, found: str) -> Finding:
-    """A failing finding for `problem`, by `fly`'s criteria; if None, one that passes."""
+    """A failing finding for `problem`, by `fly`'s criteria; if None, a passing finding."""
     return passed(found) if problem is None else failed(problem.found, problem.advice)
 
 

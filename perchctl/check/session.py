@@ -39,8 +39,8 @@ class CheckScope:
 
 
 def scan_rows(uri: str | None) -> list[Row]:
-    """The rows of `--scan`: the vehicles that answer at the default address and at that of
-    `uri`. Errors: InvalidValue."""
+    """The rows of `--scan`: the vehicles that answer at the default address and at `uri`
+    (None: only the former). Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return vehicle.radio_scan_rows(*find_uris_and_problem(uri or ""))
@@ -105,8 +105,8 @@ def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack)
 
 @dataclass(frozen=True)
 class VehicleChecks:
-    """Checks of a vehicle and its motion capture. `uri`: the given address; `probe` may have that
-    of a simulated vehicle."""
+    """Checks of a vehicle and its motion capture. `uri`: the given address; `probe` may have the
+    address of a simulated vehicle."""
 
     probe: ProbeLink
     uri: str
@@ -139,7 +139,7 @@ class VehicleChecks:
         return self.probe.telemetry
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
-        """The rows of the motion capture; none with decks."""
+        """Empty with decks."""
         config = self.profile.positioning
         if self.mocap is None:
             return []
@@ -157,7 +157,6 @@ class VehicleChecks:
         )
 
     def _lift_rows(self) -> Iterator[Row]:
-        """Yield the rows for which somebody has to lift the vehicle."""
         compared = self._compared_rows()
         if self.scope.with_lift:
             lifted = self._lift_finding()

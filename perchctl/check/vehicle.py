@@ -38,21 +38,21 @@ Wait = Callable[[float], None]
 class VehicleStatus:
     """State of a vehicle, as the check queried it.
 
-    `unlogged`: missing log variables; `echoes_s`: round-trip times, infinite if lost; `telemetry`:
-    the newest sample, `age_s` old; `moved_m`: displacement during the check.
+    `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
+    infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest.
     """
 
     uri: str
     protocol: int = ProbeLink.NEEDED_PROTOCOL
-    unlogged: tuple[str, ...] = ()
+    missing_variables: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
-    echoes_s: Sequence[float] = ()
+    round_trips_s: Sequence[float] = ()
     link_quality: float | None = None
     telemetry: Telemetry | None = None
     age_s: float = 0.0
     samples_hz: float = 0.0
     decks: tuple[str, ...] = ()
-    moved_m: float = 0.0
+    displacement_m: float = 0.0
 
     @property
     def known_telemetry(self) -> Telemetry:
@@ -76,14 +76,14 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
     return VehicleStatus(
         uri=uri,
         protocol=link.protocol_version(),
-        unlogged=link.missing,
+        missing_variables=link.missing,
         parameters=link.parameters(),
-        echoes_s=echoes,
+        round_trips_s=echoes,
         link_quality=link.quality,
         telemetry=later[-1] if later else None,
         age_s=link.age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
-        moved_m=math.dist(samples[0].position_m, later[-1].position_m) if samples else 0.0,
+        displacement_m=math.dist(samples[0].position_m, later[-1].position_m) if samples else 0.0,
         decks=link.decks(),
     )
 
@@ -92,9 +92,9 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
 
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    """Judge the link by its echoes, and a radio's by its quality, too."""
-    sent, quality = len(vehicle.echoes_s), vehicle.link_quality
-    back_s = sorted(filter(math.isfinite, vehicle.echoes_s))
+    """Judge the echoes, and a radio's quality, too."""
+    sent, quality = len(vehicle.round_trips_s), vehicle.link_quality
+    back_s = sorted(filter(math.isfinite, vehicle.round_trips_s))
     if not back_s:
         return failed("no packet came back", "restart the vehicle, bring the radio nearer")
     lost, p95_s = 1.0 - len(back_s) / sent, back_s[int(0.95 * (len(back_s) - 1))]
@@ -128,8 +128,8 @@ def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if vehicle.protocol < needed:
         advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
         return failed(found, advice)
-    if vehicle.unlogged:
-        found = f"{found}, not logged: {', '.join(vehicle.unlogged)}"
+    if vehicle.missing_variables:
+        found = f"{found}, not logged: {', '.join(vehicle.missing_variables)}"
         return failed(found, "update it to release 2026.08 or later")
     if vehicle.parameters.get(SELF_TEST) == 0:
         found = f"{found}, its self-test failed at boot"
@@ -171,8 +171,8 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
         return warned(f"{ESTIMATOR} {kind:g} has no position", advice)
-    if vehicle.moved_m > MOVED_WARN_M:
-        found += f", but its position moved by {1e2 * vehicle.moved_m:.0f} cm at rest"
+    if vehicle.displacement_m > MOVED_WARN_M:
+        found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
         return warned(found, "what gives the position is not steady: light, floor")
     return passed(found)
 
@@ -187,7 +187,6 @@ def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 
 def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    """Judge whether it stands level and still."""
     t, limit_deg = vehicle.known_telemetry, profile.safety.start_tilt_deg
     criteria = GroundCriteria(t, profile)
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"

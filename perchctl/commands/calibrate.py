@@ -20,7 +20,7 @@ from perchctl.calibration import (
     capture_views,
     check_calibration,
     find_views,
-    learn_mask,
+    learn_gear_mask,
     load_calibration,
 )
 from perchctl.camera import (
@@ -155,7 +155,7 @@ def mask(
         stop = stack.enter_context(Stopper().as_handler())
         if frames.live:
             say("turn the vehicle about for 20 s (Ctrl-C ends and writes the mask)")
-        covered = learn_mask(frames, stop.requested.is_set)
+        covered = learn_gear_mask(frames, stop.requested.is_set)
     write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
     share = 100.0 * covered.mean()
     say(f"wrote {output}: the vehicle covers {share:.1f} % of the picture; set camera.mask")

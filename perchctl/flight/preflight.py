@@ -158,7 +158,7 @@ def view_problem(
             advice = f"put the vehicle {sight.aside_text} from where it stands, or {advice}"
         else:
             advice = "leave planner.approach_xy_m out, or set it near the target"
-        if not sight.whole:
+        if not sight.has_marker:
             return Problem(
                 f"the target is the positioning system, and from x {over[0]:.2f}, y {over[1]:.2f} "
                 f"m at take-off height the vehicle would not see it: it would be "
@@ -190,10 +190,10 @@ def _seen_leaning(
     """The view of a vehicle that leans so that the target moves to the picture's edge."""
     level = target_view_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
-    if not (level.whole and aside_m > 1e-9):
+    if not (level.has_marker and aside_m > 1e-9):
         return level
     away = -rot_z(yaw_rad)[:2, :2] @ np.array(level.aside_m) / aside_m
     leant_m = level.height_m * math.tan(math.radians(LEAN_DEG))
     x, y = np.array(body_m[:2]) + leant_m * away
     leaning = target_view_from((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
-    return replace(level, whole=leaning.whole)
+    return replace(level, has_marker=leaning.has_marker)

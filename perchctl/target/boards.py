@@ -47,9 +47,9 @@ class Board:
     """A calibration board.
 
     Attributes:
-        columns, rows: of inner corners on a chessboard, of squares on a charuco board.
+        columns, rows: numbers of inner corners (chessboard) or of squares (charuco).
         square_m: side of the squares whose corners meet.
-        marker_m, dictionary: of charuco's markers.
+        marker_m, dictionary: the markers' side and dictionary; None on a chessboard.
         scale: measured over nominal size of the print, along width and height.
     """
 
@@ -92,7 +92,7 @@ class Board:
         return np.stack([xs.ravel(), ys.ravel(), np.zeros(xs.size)], axis=1)
 
     def notation(self) -> str:
-        """The text from which `parse` makes this very board."""
+        """The text from which `parse` makes an equal board, such as ``chessboard:9x6:25mm``."""
         text = f"{self.kind}:{self.columns}x{self.rows}:{mm_text(self.square_m)}mm"
         if self.marker_m is not None:
             text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
@@ -197,6 +197,6 @@ def board_rectangles(board: Board) -> list[Rectangle]:
 
 
 def black_squares(board: Board) -> NDArray[np.bool_]:
-    """Which squares are black (rows, columns), row 0 on top; markers fill the others."""
+    """A mask (rows, columns) of the black squares, row 0 on top; markers are in the white ones."""
     columns, rows = board.squares
     return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)

@@ -42,6 +42,7 @@ class TargetDesign:
             is whole at any turn, the gear right under the target's centre.
         start_range_m: from the camera to the target at the start of the search, at the height
             `start_height_m` (0: on the ground); None if the ceiling's height is unknown.
+        standoff_m: distance from the gear to the target before contact.
     """
 
     target: TargetConfig
@@ -54,7 +55,7 @@ class TargetDesign:
     z3_m: float | None
     z3_upright_m: float | None
     small_nearest_m: float | None
-    blind: BlindRange
+    blind_range: BlindRange
     start_range_m: float | None
     start_height_m: float
     standoff_m: float
@@ -98,7 +99,7 @@ class TargetDesign:
         """Return ranges, blind range and warnings as JSON values, metres."""
         names = ("z1_m", "z2_m", "z3_m", "z3_upright_m", "large_px", "small_px", "small_nearest_m")
         ranges = {name: getattr(self, name) for name in (*names, "start_range_m")}
-        return ranges | {"blind": vars(self.blind), "warnings": list(self.warnings)}
+        return ranges | {"blind": vars(self.blind_range), "warnings": list(self.warnings)}
 
     def text(self, camera_name: str) -> str:
         """Return ranges, mounting and warnings for people; several lines."""
@@ -116,7 +117,7 @@ class TargetDesign:
             f"{_cm(self.z3_upright_m)} where it is upright",
             "at gear": f"{_cm(self.small_nearest_m):<9} whole small marker down to here between "
             f"gear and target",
-            "mounting": self.blind.text,
+            "mounting": self.blind_range.text,
         }
         if self.start_range_m is not None:
             rows["search"] = (
@@ -175,7 +176,7 @@ def make_design(
         z3_m=view.nearest_m(circle_outline(large), *ahead),
         z3_upright_m=view.nearest_m(square_outline(large), *ahead),
         small_nearest_m=view.nearest_m(circle_outline(small), *camera_rotation_and_gear(profile)),
-        blind=blind_range(target, camera, profile),
+        blind_range=blind_range(target, camera, profile),
         start_range_m=start_m,
         start_height_m=height_m,
         standoff_m=profile.planner.ascend.standoff_m,

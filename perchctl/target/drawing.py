@@ -64,13 +64,14 @@ class TargetDrawing:
     ring_m: float
 
     def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """The exact share of black, 0..1, in each pixel's window, (size_px, size_px)."""
+        """The share of black, 0..1, in each pixel's window, (size_px, size_px), with the
+        parameters of `pixel_overlap`."""
         w = pixel_overlap(self.edges_m, px_per_m, size_px, window_px)
         # The grid is symmetric about 0, so the same weights serve rows from the top.
         return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
     def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
-        """The sheet's share of each pixel's window, 0..1, (size_px, size_px)."""
+        """The sheet's share, 0..1, of each pixel's window; as `ink_coverage`."""
         half = self.sheet_side_m / 2.0
         w = pixel_overlap(np.array([-half, half]), px_per_m, size_px, window_px)
         return np.asarray(w @ w.T)
@@ -87,7 +88,7 @@ class TargetDrawing:
 
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
-    """The black cells of a marker with its border, shape (n, n), row 0 at the top."""
+    """A mask (n, n) of the black cells of a marker with its border, row 0 at the top."""
     dictionary = aruco_dictionary(marker.dictionary)
     n = int(dictionary.markerSize) + 2 * BORDER_BITS
     picture = cv2.aruco.generateImageMarker(dictionary, marker.id, n, borderBits=BORDER_BITS)
@@ -95,7 +96,7 @@ def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
 
 
 def marker_corners_m(side_m: float) -> Array:
-    """The corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
+    """A marker's corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 

@@ -66,9 +66,9 @@ _MAD_TO_SIGMA = 1.4826
 def size_ratio(
     large_px: Array, small_px: Array, camera: CameraModel, target: TargetConfig
 ) -> tuple[float, float] | None:
-    """The small marker's size relative to the large one's, over the ratio in the profile
-    (1.01 is printed 1 % too large), from one frame's corners, (4, 2) px each; and the share by
-    which corners may err systematically. None where the corners span no plane."""
+    """The ratio of the small marker's to the large marker's size over the profile's (1.01: printed
+    1 % too large), from one frame's corners, (4, 2) px each; and the ratio's possible systematic
+    error by the corners. None where the corners span no plane."""
     rays = undistort(np.concatenate([large_px, small_px]), camera)
     seen = (rays @ camera.K[:2, :2].T + camera.K[:2, 2]).astype(np.float32)
     sides = [
@@ -113,8 +113,8 @@ class PrintCheck:
         return len(self._ratios) >= MIN_FRAMES
 
     def error_and_text(self) -> tuple[bool, str]:
-        """True if the median ratio shows a print error beyond noise and bias, and a
-        sentence."""
+        """True if the median ratio shows a print error beyond noise and bias (False for too few
+        frames), and a sentence on the ratio."""
         if not self.has_enough_frames:
             return False, (
                 f"print not judged: both markers were seen in {len(self._ratios)} frames, "

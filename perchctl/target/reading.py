@@ -109,7 +109,8 @@ def smallest_side_px(
 def sample_pictures(
     drawing: TargetDrawing, px_per_m: float, side_px: float, blur_px: float
 ) -> Iterator[NDArray[np.uint8]]:
-    """Yield `TRIALS` pictures of the centre, 3 `side_px` wide, at various turns and offsets."""
+    """Yield `TRIALS` pictures of the drawing's centre, at least 3 `side_px` wide, blurred with
+    sigma `blur_px`, at various rotations and offsets."""
     fine = 2 if blur_px >= 1.0 else 4
     size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
     n = size * fine
@@ -139,7 +140,7 @@ _READ_SIDE_PX = 480.0
 
 
 def check_target(target: TargetConfig, magnet_m: float) -> None:
-    """Raise InvalidValue for the first reason why the target cannot be read or perched on."""
+    """Raise InvalidValue if the target is unreadable, or a magnet `magnet_m` wide does not fit."""
     large, small = target.large, target.small
     if magnet_m > large.side_m:
         raise InvalidValue(

@@ -63,6 +63,7 @@ def target_pdf(
 
     Args:
         page: ``a4``, ``letter``, ``a3`` or a size such as ``220x240mm``.
+        magnet_m: diameter of the magnet, whose place is on the back.
         origin: where the sizes come from, for the caption.
 
     Raises InvalidValue for a target that cannot be read, and where the page is too small, with the
@@ -241,7 +242,6 @@ class _Paper(FPDF):
         )
 
     def start(self) -> None:
-        """Begin the next page."""
         self.add_page(orientation="portrait", format=self._format)
 
     def fill(self, rectangles: Sequence[Rectangle]) -> None:
@@ -275,15 +275,15 @@ class _Paper(FPDF):
             self.text(x - back * self.get_string_width(text), y, text)
 
 
-def wrap_texts(texts: Sequence[str], size: float, width: float) -> list[str]:
-    """Return every text in as many lines as `width` mm needs; words are never cut."""
+def wrap_texts(texts: Sequence[str], font_mm: float, width_mm: float) -> list[str]:
+    """Return the lines of all texts, broken between words to `width_mm` at font size `font_mm`."""
     pdf = FPDF(unit="mm")
     pdf.add_page()
-    pdf.set_font("helvetica", size=size * _PT_PER_MM)
+    pdf.set_font("helvetica", size=font_mm * _PT_PER_MM)
     pdf.c_margin = 0.0
     lines: list[str] = []
     for text in texts:
-        broken = pdf.multi_cell(width, text=text, dry_run=True, output=MethodReturnValue.LINES)
+        broken = pdf.multi_cell(width_mm, text=text, dry_run=True, output=MethodReturnValue.LINES)
         lines += cast(list[str], broken)
     return lines
 

@@ -64,20 +64,20 @@ class FieldOfView:
 
 
 def square_outline(side_m: float) -> Array:
-    """Return points along a square's sides, centred at 0, (n, 2)."""
+    """Return points (n, 2) along the sides of a square centred at 0."""
     s = np.linspace(-0.5, 0.5, 21) * side_m
     h = np.full_like(s, side_m / 2.0)
     return np.concatenate([np.column_stack(pair) for pair in ((s, h), (s, -h), (h, s), (-h, s))])
 
 
 def circle_outline(side_m: float) -> Array:
-    """Return points of the circle through a square's corners: the square at any turn, (n, 2)."""
+    """Return points (n, 2) of the circle through the corners of a square with that side."""
     a = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
     return np.asarray(side_m / math.sqrt(2.0) * np.column_stack([np.cos(a), np.sin(a)]))
 
 
 def outline_points_3d(outline_m: Array, z_m: float) -> Array:
-    """The outline's points (x, y, `z_m`), (n, 3)."""
+    """The points (x, y, `z_m`), (n, 3), of an outline (n, 2)."""
     return np.column_stack([outline_m, np.full(len(outline_m), z_m)])
 
 
@@ -124,8 +124,8 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
 def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
-    """How far off the axis of a camera, `height_m` below, a marker is wholly in the picture
-    at any turn; None if not even on the axis, or if the camera does not look up."""
+    """How far off the axis of a camera, `height_m` below, a marker of `side_m` is wholly in the
+    picture in any rotation; None if not even on the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -150,14 +150,14 @@ class TargetView:
     """A target's position in the view of a level vehicle.
 
     Attributes:
-        whole: whether one of its markers is wholly in the picture.
-        height_m: above the camera.
-        aside_m: from the camera's axis, forward and left; NaN for a camera that does not look up.
+        has_marker: True if a marker is whole in the picture, and large enough.
+        height_m: height above the camera.
+        aside_m: offset from the camera's axis, forward and left; NaN unless the axis points up.
         reach_m: largest distance from the axis at which the large marker is wholly in the
-            picture in any rotation; None if there is none.
+            picture in any rotation; None if not even on the axis.
     """
 
-    whole: bool
+    has_marker: bool
     height_m: float
     aside_m: tuple[float, float]
     reach_m: float | None
@@ -241,7 +241,7 @@ def _blind_words(nearest_m: float | None) -> str:
 
 
 def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> BlindRange:
-    """The blind range of the profile's `camera.mount` and `vehicle.gear_body_m`."""
+    """The blind range of a level target right above the gear, for the profile's mounting."""
     R, offset = camera_rotation_and_gear(profile)
     view = FieldOfView(camera)
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
@@ -274,7 +274,7 @@ def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> 
 
 
 def camera_rotation_and_gear(profile: Profile) -> tuple[Array, Array]:
-    """The rotation (3, 3) from body to camera axes, and the gear's tip in the camera, m."""
+    """The rotation (3, 3) from body to camera axes, and the gear's tip (3,) in them, m."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T
     return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])

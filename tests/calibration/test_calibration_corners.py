@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import learn_mask
+from perchctl.calibration import learn_gear_mask
 from perchctl.calibration.board.detect import BoardView, find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
@@ -131,7 +131,7 @@ def test_the_corners_of_an_interlaced_picture_are_its_first_fields() -> None:
 
 
 def test_what_stays_the_same_is_the_gear() -> None:
-    covered = learn_mask(Pictures(turned_about()))
+    covered = learn_gear_mask(Pictures(turned_about()))
     inner = cv2.erode(legs().astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     outer = cv2.dilate(legs().astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
     assert covered[inner].all()
@@ -141,7 +141,7 @@ def test_what_stays_the_same_is_the_gear() -> None:
 def test_what_does_not_reach_the_edge_is_no_gear() -> None:
     spot = legs()
     spot[100:130, 200:230] = True
-    assert not learn_mask(Pictures(turned_about(covered=spot)))[110:120, 210:220].any()
+    assert not learn_gear_mask(Pictures(turned_about(covered=spot)))[110:120, 210:220].any()
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_pictures_that_do_not_show_it_are_refused(
     pictures: list[np.ndarray[tuple[int, int], np.dtype[np.uint8]]], told: str
 ) -> None:
     with pytest.raises(InvalidValue, match=told):
-        learn_mask(Pictures(pictures))
+        learn_gear_mask(Pictures(pictures))
 
 
 def test_a_picture_of_the_target_is_named_as_that() -> None:

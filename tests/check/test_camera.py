@@ -183,13 +183,13 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("pictures", "warn", {"problems": Counter({VERDICT_TEXTS["snow"]: 2})}),
     ("pictures", "pass", {"repeats": 100}),
     ("focus", "warn", {"blur_px": 2.0}),
-    ("target", "warn", {"found": 3, "target": None}),
+    ("target", "warn", {"target_pictures": 3, "target": None}),
     ("target", "fail", {"target": target_at(1.0, (0.0, 0.0, 0.23), (0.0, 0.0, 0.0))}),
-    ("loop", "warn", {"work_s": [0.028] * 20}),
-    ("loop", "fail", {"work_s": [0.050] * 20}),
-    ("loop", "warn", {"late_s": [0.0] * 90 + [0.02] * 10}),
-    ("loop", "fail", {"late_s": [0.0] * 99 + [0.3]}),
-    ("loop", "skipped", {"work_s": [0.01] * 5}),
+    ("loop", "warn", {"processing_s": [0.028] * 20}),
+    ("loop", "fail", {"processing_s": [0.050] * 20}),
+    ("loop", "warn", {"tick_delays_s": [0.0] * 90 + [0.02] * 10}),
+    ("loop", "fail", {"tick_delays_s": [0.0] * 99 + [0.3]}),
+    ("loop", "skipped", {"processing_s": [0.01] * 5}),
     ("loop", "skipped", {"live": False}),
 ])  # fmt: skip
 def test_figures_make_their_row(name: str, verdict: str, changes: dict[str, Any]) -> None:
@@ -205,7 +205,7 @@ def test_what_a_receiver_gives_out_again_is_counted_once() -> None:
     assert "repetitions by the receiver" in rows["pictures"].found
     assert 23.0 < float(rows["frame rate"].found.split()[0]) < 27.5
     assert rows["lost frames"].verdict in (Verdict.PASS, Verdict.SKIPPED)
-    assert done.found == done.pictures, "nor does it make the target seem unseen"
+    assert done.target_pictures == done.pictures, "nor does it make the target seem unseen"
 
 
 @pytest.mark.parametrize(("finding", "verdict", "words"), [

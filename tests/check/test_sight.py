@@ -29,7 +29,7 @@ CAMERA = CameraModel(
 def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) -> Rehearsal:
     """Under a target that is there from where the vehicle stands."""
     target = target_at(1.0, (x, y, z), (0.0, 0.0, 0.0))
-    made = Rehearsal(live=True, pictures=60, found=60, target=target)
+    made = Rehearsal(live=True, pictures=60, target_pictures=60, target=target)
     return replace(made, **changes)
 
 
@@ -46,7 +46,7 @@ def test_under_the_target_it_passes() -> None:
 
 @pytest.mark.parametrize(("verdict", "words", "advice", "done"), [
     ("fail", "no, and fly refuses", "at most 3.2 m above the camera",
-     rehearsed(found=0, target=None)),
+     rehearsed(target_pictures=0, target=None)),
     ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
     ("warn", "not at the end", "lost frames", rehearsed(target=None)),
     ("skipped", "no picture came", "", rehearsed(pictures=0)),

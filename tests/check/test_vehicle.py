@@ -52,7 +52,7 @@ def looked_at(sim: SimProcess, silent_s: float = 0.0) -> dict[str, Row]:
         seen = query_vehicle(probe, sim.uri, LISTEN_S)
         if silent_s:
             sim.silence_link(silent_s)
-            seen = replace(seen, echoes_s=probe.round_trips_s(LISTEN_S))
+            seen = replace(seen, round_trips_s=probe.round_trips_s(LISTEN_S))
     finally:
         probe.close()
     return rows_of(seen)
@@ -122,7 +122,7 @@ def test_without_telemetry_nothing_that_hangs_on_it_passes(
 GOOD = VehicleStatus(
     uri="radio://0/80/2M/E7E7E7E7E7",
     parameters={"system.selftestPassed": 1, "stabilizer.estimator": 2},
-    echoes_s=[0.004] * 100,
+    round_trips_s=[0.004] * 100,
     link_quality=99.0,
     telemetry=AT_REST,
     age_s=0.01,
@@ -132,15 +132,15 @@ GOOD = VehicleStatus(
 
 
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
-    ("packets", "warn", {"echoes_s": [0.004] * 97 + [math.inf] * 3}),
-    ("packets", "fail", {"echoes_s": [0.004] * 80 + [math.inf] * 20}),
+    ("packets", "warn", {"round_trips_s": [0.004] * 97 + [math.inf] * 3}),
+    ("packets", "fail", {"round_trips_s": [0.004] * 80 + [math.inf] * 20}),
     ("packets", "warn", {"link_quality": 80.0}),
     ("packets", "fail", {"link_quality": 40.0}),
-    ("packets", "fail", {"echoes_s": [math.inf] * 100}),
+    ("packets", "fail", {"round_trips_s": [math.inf] * 100}),
     ("telemetry", "fail", {"samples_hz": 40.0}),
     ("telemetry", "fail", {"age_s": 0.5}),
     ("firmware", "fail", {"protocol": 11}),
-    ("firmware", "fail", {"unlogged": ("stateEstimate.x",)}),
+    ("firmware", "fail", {"missing_variables": ("stateEstimate.x",)}),
     ("firmware", "fail", {"parameters": {**GOOD.parameters, "system.selftestPassed": 0}}),
     *(
         ("supervisor", "fail", {"telemetry": said(supervisor=bits)})
@@ -153,7 +153,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
     ("estimator", "skipped", {"telemetry": said(position_variance_m2=None)}),
-    ("estimator", "warn", {"moved_m": 0.2}),
+    ("estimator", "warn", {"displacement_m": 0.2}),
     ("ground", "fail", {"telemetry": said(position_m=(0.0, 0.0, 2.1))}),
     ("ground", "fail", {"telemetry": said(position_m=(math.nan, 0.0, 0.0))}),
     ("level", "warn", {"telemetry": said(roll_rad=math.radians(5.0))}),

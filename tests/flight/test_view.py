@@ -67,9 +67,9 @@ def test_put_where_the_refusal_says_it_flies(
     away = rot_z(yaw_rad)[:2, :2] @ over.aside_m / max(math.hypot(*over.aside_m), 1e-6)
     leaning = place(*(target.position_m[:2] + leant_m * away), z, target_yaw)
     swayed = target_view_from((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
-    assert (problem is None) is (over.whole and swayed.whole)
+    assert (problem is None) is (over.has_marker and swayed.has_marker)
     if problem is None:
-        assert target_view_from(FEET, yaw_rad, target, TARGET, CAMERA).whole
+        assert target_view_from(FEET, yaw_rad, target, TARGET, CAMERA).has_marker
         return
     ways = re.findall(r"([\d.]+) m (forward|back|to the left|to the right)", problem.advice)
     signs = {"forward": (1, 0), "back": (-1, 0), "to the left": (0, 1), "to the right": (0, -1)}

@@ -95,7 +95,7 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
     near = [in_picture(mount, way + d, target_yaw - yaw_rad) for d in (
         np.array([dx, dy, 0.0]) for dx in (-0.01, 0.01) for dy in (-0.01, 0.01))]  # fmt: skip
     if all(near) or not any(near):  # else it is at the very edge
-        assert seen.whole is all(near)
+        assert seen.has_marker is all(near)
     # Walking so far brings the target onto the camera's axis.
     there = body_m + rot_z(yaw_rad) @ np.array([*seen.aside_m, 0.0])
     moved = view_from(there, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)

@@ -27,7 +27,7 @@ _FISHEYE = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
 
 
 class NoSolution(ArithmeticError):
-    """No camera fits the corners."""
+    """No camera model fits the detected board corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class CameraFit:
 
     @property
     def robust_std_px(self) -> float:
-        """Robust SD of one coordinate of the residuals, from their median distance."""
+        """Robust standard deviation of a residual's x or y, px, from the median residual."""
         return _spread_px(np.concatenate(self.residuals))
 
 
@@ -69,7 +69,8 @@ def lens_parameters(camera: CameraModel) -> Array:
 
 
 def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
-    """The camera of lens `model`, and the board poses, with the least squared residuals.
+    """The camera of lens `model` (one of `MODEL_NAMES`) and the board poses with the least
+    squared residuals.
 
     Raises NoSolution.
     """
@@ -91,7 +92,7 @@ def fit_camera(views: Sequence[BoardView], model: str) -> CameraFit:
 
 
 def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | None:
-    """Fit the board poses for a fixed camera; None if the camera cannot see some board."""
+    """Fit the board poses for a fixed camera; None if a board is not in its view."""
     poses = []
     for view in views:
         seen = undistort(view.corners_px, camera)
@@ -106,7 +107,6 @@ def fit_poses(views: Sequence[BoardView], camera: CameraModel) -> CameraFit | No
 
 
 def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> CameraFit:
-    """The fit of a camera and poses, with its residuals."""
     residuals = tuple(
         view.corners_px - project(view.corners_m, pose[:3], pose[3:], camera)
         for view, pose in zip(views, poses, strict=True)
@@ -117,8 +117,8 @@ def _fit_of(views: Sequence[BoardView], camera: CameraModel, poses: Array) -> Ca
 def projection_derivatives(
     camera: CameraModel, pose: Array, points_m: Array
 ) -> tuple[Array, Array]:
-    """The Jacobians of the pixels of points (n, 3) at a pose (rvec, tvec; (6,)) with respect
-    to the lens parameters, (2 n, p), and to the pose, (2 n, 6)."""
+    """The Jacobians of the pixels of board points (n, 3) for the board's pose (6,), rvec and tvec,
+    with respect to the lens parameters, (2 n, p), and to the pose, (2 n, 6)."""
     rvec = pose[:3].copy()
     tvec = pose[3:].copy()
     p = len(lens_parameters(camera))

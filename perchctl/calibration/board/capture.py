@@ -95,13 +95,13 @@ def view_signature(view: BoardView, board: Board) -> Array:
     return np.array([x, y, min(1.0, size), *np.clip(tilt, -1.0, 1.0)])
 
 
-def signature_distance(one: Array, other: Array) -> float:
-    """The distance of two signatures; beyond `NEW_BEYOND` a view counts as new."""
-    return float(np.abs(one - other) @ _WEIGHTS)
+def signature_distance(signature: Array, other: Array) -> float:
+    """The weighted distance of two view signatures (5,); beyond `NEW_BEYOND` a view is new."""
+    return float(np.abs(signature - other) @ _WEIGHTS)
 
 
 def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
-    """The share, 0..1, of its goal that each of `AXES` has reached."""
+    """For x, y, size and tilt, the spread of the view signatures over its goal, at most 1."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
     spread = {"x": x, "y": y, "size": size, "tilt": sum(tilts) / 2.0}
     return {axis: float(min(1.0, spread[axis] / GOALS[axis])) for axis in AXES}
@@ -130,8 +130,8 @@ def capture_views(
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
 ) -> FoundViews:
-    """Collect new, sharp, still views of the board from a video or live camera, until they cover
-    everything, the source ends, or `stopped` returns True. `show` is called on each frame.
+    """Collect new, sharp, still views of the board from a video or live camera, until they vary
+    enough, the source ends, or `stopped` returns True. `show` is called on each frame.
 
     Raises TimedOut: the camera is lost before there are `MIN_VIEWS` views.
     """
@@ -154,7 +154,7 @@ def capture_views(
 
 
 class GuidedCapture:
-    """State of a guided capture: the views `taken`, and `advice` on the next one."""
+    """State of a guided capture: the views `taken`, and `advice` on the next view."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -165,7 +165,7 @@ class GuidedCapture:
 
     @property
     def is_finished(self) -> bool:
-        """True if the views cover everything, or `MOST_VIEWS` were taken."""
+        """True if enough, varied views or `MOST_VIEWS` were taken."""
         covered = min(covered_shares(self._signatures).values()) >= 1.0
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
@@ -193,11 +193,13 @@ class GuidedCapture:
             return True
         return False
 
-    def guided_frame(self, frame: Frame, view: BoardView | str, taken: bool) -> GuidedFrame:
-        """A frame with outline, coverage and advice."""
+    def guided_frame(
+        self, frame: Frame, view_or_reason: BoardView | str, taken: bool
+    ) -> GuidedFrame:
+        """The frame with the board's outline, the coverage and the advice."""
         outlines: tuple[tuple[str, Array], ...] = ()
-        if isinstance(view, BoardView):
-            hull = cv2.convexHull(view.corners_px.astype(np.float32)).reshape(-1, 2)
+        if isinstance(view_or_reason, BoardView):
+            hull = cv2.convexHull(view_or_reason.corners_px.astype(np.float32)).reshape(-1, 2)
             outlines = (("small" if taken else "large", hull.astype(np.float64)),)
         shares = covered_shares(self._signatures).items()
         rows = [(name, f"{100 * share:.0f} %", share) for name, share in shares]
@@ -216,8 +218,8 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """One instruction, in directions of the picture, towards the gap in the least covered of
-    `AXES`."""
+    """How to move or tilt the board next, in directions of the picture: towards what the view
+    `signatures` cover least."""
     done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:

@@ -43,17 +43,17 @@ class Deviation:
     mm95: float
 
     @property
-    def limit_share(self) -> float:
-        """`mm` as a share of `allowed_error_mm`; 0 if `mm` is within `mm95`."""
+    def allowed_error_share(self) -> float:
+        """`mm` over the error that perching allows; 0 if `mm` is within `mm95`."""
         return self.mm / allowed_error_mm(self.z_m) if self.mm > self.mm95 else 0.0
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Verdict on a calibration by new pictures, with the reason.
+    """Verdict on a calibration by new pictures, and its `reason`.
 
-    rms_px: reprojection error of the checked camera (infinite if it cannot see the boards);
-    best_rms_px: that of the camera refitted to the pictures.
+    rms_px: reprojection error of the checked camera (infinite if boards are out of its view);
+    best_rms_px: error of the camera refitted to the pictures; rejections: outliers left out.
     """
 
     passed: bool
@@ -64,7 +64,7 @@ class CheckResult:
     rejections: tuple[Rejection, ...]
 
     def record(self, file: Path) -> dict[str, Any]:
-        """The object of `calibrate check --json`."""
+        """The JSON object of `calibrate check`; `file` is the checked calibration."""
         return {
             "pass": self.passed,
             "reason": self.reason,
@@ -105,14 +105,13 @@ def check_calibration(camera: CameraModel, found: FoundViews) -> CheckResult:
 def _verdict(
     fixed: CameraFit, free: CameraFit, deviations: Sequence[Deviation]
 ) -> tuple[bool, str]:
-    """Return whether the fixed camera passes, and why."""
     if fixed.rms_px > max(RMS_FACTOR * free.rms_px, RMS_FLOOR_PX):
         return False, (
             f"reprojection RMS {fixed.rms_px:.2f} px, where these pictures allow "
             f"{free.rms_px:.2f} px"
         )
-    worst = max(deviations, key=lambda d: d.limit_share, default=None)
-    if worst is not None and worst.limit_share > 0.5:
+    worst = max(deviations, key=lambda d: d.allowed_error_share, default=None)
+    if worst is not None and worst.allowed_error_share > 0.5:
         return False, (
             f"at {worst.z_m * 100:.0f} cm the target would be {worst.mm:.1f} mm from where "
             f"these pictures put it (+-{worst.mm95:.1f} mm), and "

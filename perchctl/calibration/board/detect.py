@@ -46,7 +46,7 @@ class BoardView:
         return len(self.ids)
 
     def select(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> BoardView:
-        """Return this view with only the corners of a mask or of indices."""
+        """Return this view with only the corners of `which`: a mask (n,) or indices."""
         return replace(
             self,
             ids=self.ids[which],
@@ -57,7 +57,7 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A rejected view or, if `corner_ids` has any, rejected corners of it; and the reason."""
+    """A rejected view, by name, or rejected corners of the view, if `corner_ids` has any."""
 
     view: str
     reason: str
@@ -66,14 +66,14 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class FoundViews:
-    """The detected views of a board, and the pictures without one, with the reason."""
+    """The detected views of a board, and the pictures `without_board`, each with the reason."""
 
     views: tuple[BoardView, ...]
     without_board: tuple[Rejection, ...] = ()
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
-    """The view of a board in a grey picture (h, w), or why there is none. In an interlaced
+    """The view of a board in a grey picture (h, w), or why no board was found. In an interlaced
     picture the first field is used, as a moving board has two positions."""
     image = split_fields(image)[0]
     h, w = image.shape
@@ -122,7 +122,7 @@ def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
 
 
 def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
-    """The numbers (n,) and places (n, 2) px of a chessboard's corners, or why not."""
+    """As `_charuco`, of a chessboard."""
     size = board.corner_count
     found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
     if not found:

@@ -44,12 +44,12 @@ class ErrorAtRange:
 
 
 def allowed_error_mm(z_m: float) -> float:
-    """The position error that perching allows: the larger of 1 mm and 1 % of distance."""
+    """The position error that perching allows at distance `z_m`: 1 mm or, if larger, 1 %."""
     return max(_LIMIT_FLOOR_MM, 1e3 * _LIMIT_SHARE * z_m)
 
 
 def covered_cells(views: Sequence[BoardView]) -> NDArray[np.bool_]:
-    """A mask (rows, columns) of the picture's grid cells inside some board's corners."""
+    """A mask (rows, columns) of the picture's grid cells that a board covers in some view."""
     rows, columns = CELLS
     cells_seen = np.zeros(CELLS, dtype=np.uint8)
     for view in views:
@@ -82,8 +82,9 @@ def predict_errors(
 def position_errors_mm(
     camera: CameraModel, truth: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None
 ) -> Array:
-    """The target's position errors (n,) if pictures of camera `truth` are evaluated with
-    `camera`, at n places at distance z_m; the first is on the axis."""
+    """The position errors (n,) if pictures that camera `truth` took of a target are evaluated with
+    `camera` (inf if out of its view). The n targets, at distance z_m, lie on a grid within the
+    `covered` cells of the picture (None: all); the first is on the axis."""
     corners_m = _marker_m(truth, z_m)
     places = _places(truth, z_m, covered)
     views = [

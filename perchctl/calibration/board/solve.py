@@ -49,12 +49,12 @@ class Calibration:
 
     Attributes:
         fit: the camera, and the poses and residuals of the `views`.
-        covariance: of its lens parameters, (p, p).
+        covariance: covariance (p, p) of the p lens parameters.
         views: the views used, without rejected corners.
         without_board: pictures without a board, and why.
         errors: predicted position error of the target, by distance.
         covered_cells: mask (rows, columns) of the picture's grid cells that boards covered.
-        defects: what rules out the best verdict whatever the error, with remedies.
+        defects: sentences on the views' defects, with remedies; any rules out the best verdict.
     """
 
     board: str
@@ -120,7 +120,7 @@ class Calibration:
         return [*lines, *self.defects, self.verdict_text]
 
     def record(self) -> dict[str, Any]:
-        """The results for `calibrate --json`."""
+        """The JSON object of `calibrate`."""
         names = PARAMETERS[self.camera.model]
         values = self.fit.parameters.tolist()
         return {
@@ -141,7 +141,7 @@ class Calibration:
         }
 
     def file_text(self, name: str, date: str) -> str:
-        """The content of the calibration file, with quality and covariance."""
+        """The calibration file's text, with quality and covariance; `name` is the camera's."""
         return calibration_text(
             self.camera,
             name,
@@ -251,7 +251,6 @@ _NAMES = (
 
 
 def _check_count(views: Sequence[BoardView], pictures: int) -> None:
-    """Raises InvalidValue when there are too few views to begin with."""
     if len(views) < MIN_VIEWS:
         of = f"of {pictures} pictures" if pictures > len(views) else "pictures"
         raise InvalidValue(
@@ -262,7 +261,7 @@ def _check_count(views: Sequence[BoardView], pictures: int) -> None:
 
 
 def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
-    """Raises InvalidValue when views are all frontal or leave most of the image empty."""
+    """Raises InvalidValue if all views are frontal or most of the image is empty."""
     tilts = tilts_deg(fit.poses)
     tilted = int((tilts >= MIN_TILT_DEG).sum())
     if tilted < MIN_TILTED:
@@ -280,7 +279,6 @@ def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:
 
 
 def _check_focal(parameters: Array, std: Array) -> None:
-    """Raises InvalidValue when the focal length remains unknown."""
     share = float((std[:2] / parameters[:2]).max())
     if not share <= MAX_FOCAL_ERROR:
         raise InvalidValue(
@@ -305,7 +303,7 @@ def _lacks(fit: CameraFit, views: int, covered: NDArray[np.bool_]) -> list[str]:
 
 
 def tilts_deg(poses: Array) -> Array:
-    """The tilt of each board (poses (v, 6)) against the image plane, (v,)."""
+    """The tilts (v,) of boards against the image plane, from their poses (v, 6)."""
     normals = np.array([cv2.Rodrigues(pose[:3])[0][2, 2] for pose in poses])
     return np.asarray(np.degrees(np.arccos(np.minimum(np.abs(normals), 1.0))), dtype=np.float64)
 

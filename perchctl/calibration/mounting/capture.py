@@ -75,8 +75,6 @@ def record_mounting(
 
 
 class _Progress:
-    """How far the recording of a part is."""
-
     def __init__(self, recording: MountingRecording) -> None:
         self._recording = recording
         self._least_s = LEAST_S[recording.part]
@@ -93,7 +91,6 @@ class _Progress:
         return enough or self._seconds >= MOST_S
 
     def advance_time(self, now_s: float) -> None:
-        """Count the seconds from the first frame on."""
         self._start_s = now_s if self._start_s is None else self._start_s
         self._seconds = now_s - self._start_s
 

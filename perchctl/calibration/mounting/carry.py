@@ -78,7 +78,7 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
     """Solve for the camera's rotation in the body and its latency.
 
     Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
-    agree; with what to do.
+    agree; the error has advice.
     """
     check_recording(recording, "carry")
     t_s, first = np.unique([a.t_s for a in recording.attitudes], return_index=True)
@@ -146,7 +146,6 @@ def _middle_target(
 
 
 def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
-    """Raises InvalidValue unless vehicle and camera agree, and well enough."""
     off_rad = float(np.median(np.linalg.norm(rows.misfit, axis=1)))
     if off_rad > MOST_MISFIT_RAD or rows.rejected_share > MOST_LEFT_OUT:
         raise InvalidValue(
@@ -181,10 +180,10 @@ def _check(rows: PoseResiduals, latency_s: float, cov: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class GyroRotation:
-    """The vehicle's rotation, integrated from its gyroscope, at n times, with its rates (n, 3).
+    """The vehicle's rotation (n, 3, 3) at n times, integrated from its corrected rates (n, 3).
 
-    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the rotation, in world axes, by
-    the gyroscope's bias (rad/s) and scale error.
+    `bias_jacobian` and `scale_jacobian` (n, 3, 3): derivatives of the rotation vector, in world
+    axes, by the gyroscope's bias (rad/s) and scale error.
     """
 
     t_s: Array
@@ -195,7 +194,7 @@ class GyroRotation:
 
 
 def integrate_gyro(t_s: Array, gyro_radps: Array, bias_radps: Array, scale: Array) -> GyroRotation:
-    """Integrate the gyroscope (n, 3), corrected to rate = (gyro - bias) (1 + scale).
+    """Integrate the gyroscope (n, 3), corrected to rate = (gyro - bias) (1 + scale), both (3,).
 
     The rate is taken as linear between samples; the method is of fourth order (Magnus).
     """
@@ -221,7 +220,7 @@ def _integral(values: Array, dt: Array) -> Array:
 
 
 def interpolate_rotation(gyro: GyroRotation, t_s: Array) -> GyroRotation:
-    """Interpolate the rotation at m times, which are clipped to the recording."""
+    """Interpolate the rotation at the times `t_s` (m,), clipped to the recording."""
     grid = gyro.t_s
     t_s = np.clip(t_s, grid[0], grid[-1])
     k = np.clip(np.searchsorted(grid, t_s, side="right") - 1, 0, len(grid) - 2)
@@ -343,7 +342,7 @@ class PoseResiduals:
     def normal_equations(
         self, poses: slice | NDArray[np.intp] = slice(None)
     ) -> tuple[Array, Array]:
-        """Return information (p, p) and gradient (p,) of the poses with these indices."""
+        """Return information (p, p) and gradient (p,) of the poses with the indices `poses`."""
         p = self.jacobian.shape[2]
         jacobian = self.jacobian[poses]
         weights = self.robust_weights[poses, None, None]
@@ -358,7 +357,7 @@ class PoseResiduals:
         return np.asarray(np.linalg.solve(information + self.prior, gradient - pull))
 
     def after_step(self, step: Array) -> PoseResiduals:
-        """The residuals after a step (p,), to first order."""
+        """The residuals after the parameters change by `step` (p,), to first order."""
         misfit = self.misfit + self.jacobian @ step
         return replace(
             self, misfit=misfit, robust_weights=_weights(_distance2(misfit, self.inverse_cov))
@@ -378,11 +377,11 @@ def weight_residuals(
     misfit: Array,
     cov: Array,
     prior: Array,
-    late_jacobian: Array | None = None,
+    delay_jacobian: Array | None = None,
 ) -> PoseResiduals:
     """Weight the residuals of poses by their covariances (n, 3, 3), times an estimated factor. With
-    `late_jacobian` (n, 3), misfit per second of delay, timestamp jitter is estimated and added."""
-    best_cost, best, late = np.inf, cov, late_jacobian
+    `delay_jacobian` (n, 3), misfit per second of delay, timestamp jitter is estimated and added."""
+    best_cost, best, late = np.inf, cov, delay_jacobian
     for jitter_s in (0.0,) if late is None else _JITTERS_S:
         spread = cov
         if late is not None:

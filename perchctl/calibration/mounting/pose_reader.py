@@ -25,7 +25,7 @@ class PoseReader:
     """Reads the target's pose from each frame of a stream.
 
     `mirrored` counts pictures with only a mirrored target. Of the newest picture, `outlines` are
-    the markers' names and corners (4, 2) px, and `trouble` says why it could not be searched.
+    the markers' names and corners (4, 2) px, and `trouble` names its defect, or is empty.
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
@@ -38,7 +38,7 @@ class PoseReader:
         self.trouble = ""
 
     def read_poses(self, frame: Frame) -> list[TargetPose]:
-        """The target's poses in a frame: one, or one in each of its two fields."""
+        """The target's poses in a frame: at most one, or one in each field if interlaced."""
         judged = self._perception.health.assess(frame, self._live)
         if judged == "repeated":
             return []

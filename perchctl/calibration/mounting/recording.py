@@ -173,7 +173,7 @@ MOST_LATE_S = 1.0
 
 
 def check_recording(recording: MountingRecording, part: MountingPart) -> None:
-    """Raises InvalidValue, with advice, for a recording that cannot be solved."""
+    """Raises InvalidValue, with advice, unless the recording is of `part` and can be solved."""
     attitudes = recording.attitudes
     poses = recording.poses
     if recording.part != part:
@@ -194,7 +194,7 @@ def check_recording(recording: MountingRecording, part: MountingPart) -> None:
 
 
 def missing_motion(recording: MountingRecording) -> list[str]:
-    """Which motion is still missing, in a few words each; empty when it is enough."""
+    """Advice on each motion that the recording still lacks; empty if it is complete."""
     part = recording.part
     poses = recording.poses
     attitudes = recording.attitudes

@@ -18,8 +18,8 @@ from perchctl.profile import Profile
 
 @dataclass(frozen=True, eq=False)
 class _Value:
-    """One measured number or three, their sigmas, and what the profile says, None where it says no
-    number; lines show them `scale` times as large, in `unit`."""
+    """One measured number or three; `written` is the profile's, or None. Lines show them `scale`
+    times as large, in `unit`."""
 
     name: str
     key: str
@@ -48,7 +48,7 @@ class _Value:
 
 @dataclass(frozen=True, eq=False)
 class MountingReport:
-    """The measured camera mounting of a profile's vehicle; None for a part not recorded."""
+    """The measured camera mounting: `rotation` and `pivot`, None for a part not recorded."""
 
     profile: Profile
     rotation: RotationSolution | None
@@ -91,7 +91,6 @@ class MountingReport:
         return "\n".join(lines)
 
     def _values(self) -> list[_Value]:
-        """What was measured."""
         camera, values = self.profile.camera, []
         if (rotation := self.rotation) is not None:
             angles = np.array(rotation.rpy_deg)
@@ -108,7 +107,7 @@ class MountingReport:
         return values
 
     def record(self) -> dict[str, Any]:
-        """The results for `calibrate mount --json`: measured values, sigmas, the profile's
+        """The JSON object of `calibrate mount`: measured values, sigmas, the profile's
         values, and its new ones."""
         values = self._values()
         return {v.key: v.measured.tolist() for v in values} | {
