@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from perchctl.analysis.flight import FlightAnalysis, Measures
-from perchctl.analysis.show import printable, with_hanging_indent
+from perchctl.analysis.show import printable_text, with_hanging_indent
 
 _NAME, _CELL = 32, 14
 _NOT_THERE = "not there"
@@ -22,7 +22,7 @@ class FlightComparison:
 
     @cached_property
     def phase_times(self) -> list[dict[str, Any]]:
-        """Time in each phase that A or B flew through: phase, a_s, b_s."""
+        """For each phase that A or B flew: its name `phase`, and the times in it `a_s`, `b_s`."""
         names = dict.fromkeys(stay.phase for flight in self.flights for stay in flight.log.phases)
         found = []
         for name in names:
@@ -41,7 +41,7 @@ class FlightComparison:
 
     @cached_property
     def differences(self) -> dict[str, Any]:
-        """Each of `Measures` by its name: B's value minus A's; None if either is unknown."""
+        """B's value minus A's of each field of `Measures`; None if either value is unknown."""
         a, b = (asdict(flight.measures) for flight in self.flights)
         return {
             name: None if a[name] is None or b[name] is None else b[name] - a[name] for name in a
@@ -76,10 +76,8 @@ class FlightComparison:
             yield ""
             yield "time in each phase [s]"
         for each in self.phase_times:
-            a_s, b_s = each["a_s"], each["b_s"]
-            yield _row(
-                f"  {printable(each['phase'])}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}"
-            )
+            name, a_s, b_s = printable_text(each["phase"]), each["a_s"], each["b_s"]
+            yield _row(f"  {name}", f"{a_s:.2f}", f"{b_s:.2f}", f"{b_s - a_s:+.2f}")
         yield ""
         yield (
             "profile keys that differ, A and B"
@@ -88,7 +86,7 @@ class FlightComparison:
         )
         for key, values in self.changed_keys.items():
             a, b = ("none" if value is None else value for value in values)
-            yield from with_hanging_indent(f"  {printable(key):<{_NAME - 2}}  ", f"{a}  {b}")
+            yield from with_hanging_indent(f"  {printable_text(key):<{_NAME - 2}}  ", f"{a}  {b}")
 
     def _measure_rows(self) -> Iterator[str]:
         a, b = (flight.measures for flight in self.flights)
@@ -118,7 +116,7 @@ def _row(name: str, a: str, b: str, difference: str) -> str:
 
 def profile_differences(profile_a: Any, profile_b: Any) -> dict[str, tuple[Any, Any]]:
     """The dotted keys in which two profiles (nested dicts, as from JSON) differ, each with
-    the values of A and B."""
+    the values of A and B (``not there`` for a missing key)."""
     a, b = _flat(profile_a), _flat(profile_b)
     return {
         key: (a.get(key, _NOT_THERE), b.get(key, _NOT_THERE))
@@ -128,7 +126,6 @@ def profile_differences(profile_a: Any, profile_b: Any) -> dict[str, tuple[Any, 
 
 
 def _flat(values: Any, prefix: str = "") -> dict[str, Any]:
-    """Return nested keys as dotted paths; an empty mapping is a value."""
     if not isinstance(values, Mapping):
         return {}
     found: dict[str, Any] = {}

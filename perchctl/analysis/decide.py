@@ -27,7 +27,7 @@ class ReplayedDecision:
     """Result of replaying the planner on one turn.
 
     Attributes:
-        tick: number of flown turns before this one.
+        tick: number of flown turns before this turn.
         difference: first field that differs from the log, or None. The planner's exceptions are not
             compared for logs before version 4, which do not hold them.
         error: class name of the exception that the planner raised, or None.
@@ -40,8 +40,8 @@ class ReplayedDecision:
 
 
 def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
-    """The turns before the first one missing from the log, and a sentence that names the
-    missing turn (empty if none is). Errors: InvalidValue."""
+    """The turns before the first turn missing from the log, and a sentence that names the
+    missing turn (empty if none is missing). Errors: InvalidValue."""
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
         raise InvalidValue(
@@ -62,9 +62,9 @@ def replay_decisions(
     profile: Profile,
     observation_of: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[ReplayedDecision]:
-    """Replay the planner turn by turn, by default with the recorded observations. Only flown turns
-    advance the planner's state. The replay ends with the first turn on which the planner raises, as
-    a flight does."""
+    """Replay the planner turn by turn. `observation_of` returns a turn's observation (default: as
+    recorded), or None to skip the turn. Only flown turns advance the planner's state. The replay
+    ends with the first turn on which the planner raises, as a flight does."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
@@ -103,7 +103,7 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
 
 
 def field_difference(name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
-    """The first subfield of field `name` in which two values differ, or None. Values of
+    """The first subfield of field `name` in which its two values differ, or None. Values of
     different classes are returned whole, as text with their class."""
     if type(recorded) is not type(replayed):
         return name, _shown(recorded), _shown(replayed)

@@ -48,7 +48,7 @@ def write_film(
 
     Args:
         pictures: the recorded pictures, oldest first; None without a recording.
-        rate_hz: pictures a second of flight; their period is whole hundredths of a second.
+        rate_hz: pictures per second of flight; the period is rounded to 0.01 s.
         width_px: width of the film; its height is 9/16 of it.
 
     Errors: InvalidValue for a log without ticks, a recording that cannot be read, or a file that
@@ -145,7 +145,7 @@ class _Stage:
         }
 
     def _set_side_view(self, ax: Axes) -> None:
-        self._place_m, target_z_m = side_view(self._flight)
+        self._place_m, target_z_m = side_path_and_target_height(self._flight)
         profile = self._flight.log.flown_profile
         self._gear_m = profile.vehicle.gear_body_m[2]
         half_m = 0.5 * profile.target.large.side_m
@@ -181,7 +181,7 @@ class _Stage:
         self._cursor = self._add(thrust_ax.axvline(0.0, color=BLACK, linewidth=1.0))
 
 
-def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
+def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | None]:
     """The vehicle's centre in each tick, (n, 2) m: horizontal distance from the target and
     height above ground, in the vertical plane through the target and the take-off point; and the
     target's height, None if it was never seen. Errors: InvalidValue for a log without positions."""
@@ -212,7 +212,7 @@ def side_view(flight: FlightAnalysis) -> tuple[Array, float | None]:
 
 
 def _write_video(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
-    """Write the pictures one by one as H.264, which browsers play."""
+    """Write H.264, which browsers play."""
     import av
 
     with av.open(str(path), "w", options={"movflags": "faststart"}) as video:

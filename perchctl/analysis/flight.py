@@ -103,15 +103,15 @@ class FlightAnalysis:
 
     @cached_property
     def summary(self) -> FlightSummary:
-        """How it ended."""
+        """How the flight ended."""
         return FlightSummary.from_log(self.log)
 
     # --- holds and notes
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
-        """Stretches of turns of one phase held for one reason, which is the last turn's where only
-        numbers in the reason changed."""
+        """Stretches of turns held in one phase for one reason: the last turn's, as the numbers in a
+        reason may change."""
         found: list[Hold] = []
         before: tuple[str, str] | None = None
         phases, reasons = self.log.texts("phase"), self.log.texts("hold")
@@ -129,7 +129,7 @@ class FlightAnalysis:
 
     @property
     def notes(self) -> list[tuple[float, str]]:
-        """The log's notes, each after its time in s."""
+        """Time in s and text of each note in the log."""
         return [
             (self.log.to_flight_s(float(event["t_s"])), str(event.get("reason") or ""))
             for event in self.log.events
@@ -140,12 +140,12 @@ class FlightAnalysis:
 
     @cached_property
     def frames(self) -> Frames:
-        """The camera frames that the pipeline was given."""
+        """Timing of the camera frames that the pipeline processed."""
         return read_frames(self.log)
 
     @cached_property
     def target_losses(self) -> tuple[TargetLoss, ...]:
-        """Intervals in which the needed target was out of sight."""
+        """Intervals without the target in phases that need it."""
         return target_losses(self.log, self.frames)
 
     @cached_property
@@ -155,7 +155,7 @@ class FlightAnalysis:
 
     @cached_property
     def measures(self) -> Measures:
-        """The flight's key figures."""
+        """Key figures of the flight."""
         end, log, frames = self.summary, self.log, self.frames
         findings = end.findings
         volts, used_mah = log.column("battery_v"), log.column("battery_used_mah")
@@ -209,7 +209,7 @@ class FlightAnalysis:
         return np.where(remembered, np.nan, self.log.column(log_field))
 
     def value_at(self, t_s: float, log_field: str) -> float:
-        """A log field at `t_s`; NaN if it is missing or not a number."""
+        """A log field's value in the tick at `t_s`; NaN if it is missing or not a number."""
         records = self.log.records
         value = records[self.log.index_at(t_s)].get(log_field) if records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -218,7 +218,7 @@ class FlightAnalysis:
 
 
 def contact_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:
-    """The ascent that led to the last contact; None without a contact."""
+    """Of a flight's phases, the ascent that led to the last contact; None without a contact."""
     ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == ("ASCEND", "PERCH")]
     return ascents[-1] if ascents else None
 
@@ -238,7 +238,7 @@ _BETWEEN = re.compile(r"(?<=[a-z])(?=[A-Z])")
 @dataclass(frozen=True)
 class Takeover:
     """Series of commands that a sender (`by`) other than the flight loop sent. Times are since the
-    flight's first turn; `commands` counts them by kind, such as ``position setpoint``."""
+    flight's first turn; `commands`: their number by kind, as in ``position setpoint``."""
 
     by: str
     start_s: float
@@ -247,7 +247,7 @@ class Takeover:
 
     @property
     def text(self) -> str:
-        """``position setpoint (14), land (2)``"""
+        """Kinds and numbers of commands: ``position setpoint (14), land (2)``."""
         return ", ".join(f"{name} ({count})" for name, count in self.commands.items())
 
 

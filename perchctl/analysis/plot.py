@@ -151,7 +151,6 @@ def _draw_height(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def _draw_power(ax: Axes, flight: FlightAnalysis) -> None:
-    """The battery's voltage as it was read; thrust on an axis of its own."""
     volts = flight.log.column("battery_v")
     volts = np.where(volts > 0, volts, np.nan)
     ax.plot(flight.log.t_s, volts, color=BLACK, linewidth=1.2, label="battery")
@@ -209,7 +208,6 @@ def _mark_lost(ax: Axes, flight: FlightAnalysis) -> None:
 
 
 def _add_legend(ax: Axes, twin: Axes | None = None) -> None:
-    """One legend for the lines of both axes of a panel."""
     lines, words = ax.get_legend_handles_labels()
     if twin is not None:
         more_lines, more_words = twin.get_legend_handles_labels()
@@ -226,7 +224,6 @@ def _most(values: Array) -> float:
 
 
 def _shade_spans(ax: Axes, spans: Sequence[Span]) -> None:
-    """Alternate shades, and a line where a phase begins."""
     for i, (_, start_s, end_s) in enumerate(spans):
         ax.axvspan(start_s, end_s, facecolor=SHADES[i % 2], edgecolor="none", zorder=-2)
         if i:

@@ -46,7 +46,7 @@ class Difference:
 
     @property
     def text(self) -> str:
-        """``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``"""
+        """A line: ``tick 512 at 10.24 s: command.z_m was 1.25, the replay has 1.26``"""
         was, now = json.dumps(self.recorded), json.dumps(self.replayed)
         return f"tick {self.tick} at {self.t_s:.2f} s: {self.field} was {was}, the replay has {now}"
 
@@ -57,7 +57,7 @@ class PerceptionReplay:
 
     Attributes:
         turns: the replayed turns, up to the first missing picture.
-        differences: the first of each turn whose poses or observation differ.
+        differences: the first difference of each turn whose poses or observation differ.
         frames_flown: number of frames that the flight processed.
         missing: why the pictures ended the replay early, or None.
     """
@@ -90,7 +90,7 @@ class Replay:
 
     Attributes:
         decisions: the planner's replayed decisions, one for each turn.
-        differences: one for each decision that differs from the log.
+        differences: the first difference of each decision that differs from the log.
         seen: replay of perception; None without pictures.
         changed_keys: profile keys that differ from the flown profile.
         gap_text: sentence that names the first turn missing from the log, or empty.
@@ -162,7 +162,7 @@ class Replay:
         }
 
     def lines(self) -> list[str]:
-        """The replay's lines for people, without `notes`."""
+        """The replay as lines of text for a terminal, without `notes`."""
         lines = [f"changed:   {', '.join(self.changed_keys)}"] if self.changed_keys else []
         text = "all with the same commands"
         if self.differences:
@@ -195,9 +195,9 @@ def replay(
 ) -> Replay:
     """Replay the flight with its own profile or, if given, with `profile`.
 
-    With its own, the planner gets the recorded observations, and perception is compared separately.
-    With another, the planner gets what the replayed perception observes. `pipeline`: by default the
-    profile's, with the flown calibration and mask. Errors: InvalidValue, NotFound.
+    The planner gets the recorded observations; with another profile and `pictures`, those of the
+    replayed perception. Perception is compared separately. `pipeline`: by default the profile's,
+    with the flown calibration and mask. Errors: InvalidValue, NotFound.
     """
     flown = log.flown_profile
     turns, gap = turns_and_gap_text(log)
@@ -222,15 +222,15 @@ def replay(
     return Replay(log, decided, differences, seen, changed, gap)
 
 
-def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
+def changed_keys(flown: Profile, replayed: Profile) -> tuple[str, ...]:
     """The dotted keys in which two profiles differ, without name, description and date."""
-    found = profile_differences(one.model_dump(mode="json"), other.model_dump(mode="json"))
+    found = profile_differences(flown.model_dump(mode="json"), replayed.model_dump(mode="json"))
     return tuple(key for key in found if key not in ("name", "description", "date"))
 
 
 def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
-    """The pipeline with the flown calibration and mask, unless the changed keys name others.
-    Errors: InvalidValue, NotFound."""
+    """The pipeline of `profile` with the flown calibration and mask, unless their keys are among
+    the `changed` keys. Errors: InvalidValue, NotFound."""
     camera = log.flown_camera
     if camera is None or "camera.calibration" in changed:
         camera = profile_camera(profile.camera)

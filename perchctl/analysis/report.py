@@ -52,13 +52,13 @@ def write_report(log_paths: Sequence[Path], output: Path, with_film: bool = Fals
 
 @dataclass(frozen=True)
 class Report:
-    """The flights on a page, at least one."""
+    """The flights on a report's page, at least one."""
 
     flights: tuple[ReportedFlight, ...]
 
     @property
     def outcome_counts_text(self) -> str:
-        """``1 flight: 1 perched``, ``4 flights: 3 perched, 1 landed``."""
+        """Numbers of flights: ``1 flight: 1 perched``, ``4 flights: 3 perched, 1 landed``."""
         outcomes = [told.outcome for told in self.flights]
         each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))
         return f"{count_text(len(outcomes), 'flight')}: {each}"
@@ -80,7 +80,7 @@ class Report:
 @dataclass(frozen=True, eq=False)
 class ReportedFlight:
     """One flight of a report. `pictures` is None without a recording; `picture_problem` says why
-    some could not be read."""
+    pictures could not be read."""
 
     flight: FlightAnalysis
     pictures: tuple[DecisionPicture, ...] | None = None
@@ -88,7 +88,7 @@ class ReportedFlight:
 
     @cached_property
     def story(self) -> tuple[Sentence, ...]:
-        """The flight in sentences."""
+        """The flight's events as sentences, in order of time."""
         return tell_story(self.flight)
 
     @property
@@ -180,7 +180,6 @@ def _render(name: str, **values: Any) -> Markup:
 
 @cache
 def _templates() -> jinja2.Environment:
-    """The environment that escapes all text but that of the templates themselves."""
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("perchctl.analysis"),
         autoescape=True,

@@ -38,8 +38,8 @@ class _PictureIsAnother(PictureMissing):
 
 @dataclass(frozen=True, eq=False)
 class ReplayedInputs:
-    """Replayed inputs of a turn: the markers' `poses`, and the recorded observation with replayed
-    perception, None if the turn had none."""
+    """Replayed inputs of a turn: the markers' `poses` by name, and the recorded `observation` with
+    replayed perception, None for a turn without an observation."""
 
     turn: Turn
     poses: dict[str, UnfilteredPose]
@@ -108,7 +108,6 @@ class _Given:
         return image
 
     def _repeated_picture(self, seen: FrameRecord) -> NDArray[np.uint8]:
-        """A picture that the source repeated, which is not recorded."""
         if self._shown is None:
             raise PictureMissing(f"the picture that frame {seen.index} repeats was not recorded")
         checksum, image = self._shown

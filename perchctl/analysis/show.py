@@ -58,7 +58,7 @@ def show_text(flight: FlightAnalysis) -> str:
             lines += ["", f"  at [s]  for [s]  {head}"]
         for part, name, text in rows:
             span = f"{part.start_s + 0.0:8.2f} {part.end_s - part.start_s:8.2f}"
-            lines += with_hanging_indent(f"{span}  {printable(name):<9} ", text)
+            lines += with_hanging_indent(f"{span}  {printable_text(name):<9} ", text)
     if flight.notes:
         lines += ["", "  at [s]  note"]
     for at_s, note in flight.notes:
@@ -74,7 +74,7 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
     log = flight.log
     end = replace(flight.summary, battery_min_v=None)
     first, *others = end.text().splitlines()
-    yield from wrap(printable(first), COLUMNS, subsequent_indent="  ")
+    yield from wrap(printable_text(first), COLUMNS, subsequent_indent="  ")
     for line in others:
         name, _, text = line.partition(":")
         yield from _named(name, text.strip())
@@ -138,8 +138,8 @@ def _measure_lines(flight: FlightAnalysis) -> Iterator[str]:
             yield from _named(name, line.format_map(texts))
 
 
-def printable(text: str) -> str:
-    """The text with control characters, which a terminal would execute, as ``?``."""
+def printable_text(text: str) -> str:
+    """The text with ``?`` for each control character, which a terminal would execute."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
@@ -151,7 +151,7 @@ def with_hanging_indent(prefix: str, text: str) -> list[str]:
     """Wrap the text into lines: the first follows `prefix`, the others are indented by it."""
     room = " " * len(prefix)
     lines = wrap(
-        printable(text),
+        printable_text(text),
         COLUMNS,
         initial_indent=prefix,
         subsequent_indent=room,

@@ -20,7 +20,7 @@ GAP_PERIODS = 2.5
 
 
 def percentile(values: Array, percent: float) -> float:
-    """A percentile of the values that are not NaN; NaN if all are."""
+    """The percentile at `percent` (0 to 100) of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else math.nan
 
@@ -58,7 +58,7 @@ class Frames:
 
 
 def read_frames(log: FlightLog) -> Frames:
-    """The frame timing of a flight; gaps are found relative to the median period."""
+    """A flight's frame timing; a gap is longer than `GAP_PERIODS` median frame periods."""
     records = [record for record in log.records if record.get("frame_t_s") is not None]
     times_s = log.to_flight_s(np.array([r["frame_t_s"] for r in records], dtype=np.float64))
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
@@ -77,7 +77,7 @@ def read_frames(log: FlightLog) -> Frames:
 
 
 def shows_target(record: Mapping[str, Any]) -> bool:
-    """True if the target was detected in the frame of a tick, and its pose accepted."""
+    """True if, by the `record` of a tick, the target was detected and its pose accepted."""
     found = any(record.get(f"{source}x_m") is not None for source in "jls")
     return found and record.get("measured") is not False
 
@@ -102,8 +102,8 @@ AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
 @dataclass(frozen=True)
 class TargetLoss:
-    """Interval without the needed target: from the last frame that showed the target to the next
-    one that does (`is_regained`), or to the flight's end.
+    """Interval without the target in a phase that needs it: from the last frame that showed the
+    target to the next such frame (`is_regained`), or to the flight's end.
 
     Attributes:
         frames_without_target: 0 if no picture came at all.
@@ -120,7 +120,7 @@ class TargetLoss:
 
 
 def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
-    """All losses in order; none at the ceiling, where no pictures are evaluated."""
+    """All target losses, oldest first; none at the ceiling, where no pictures are evaluated."""
     stays = log.phases
     starts_s = [float(t_s) for t_s in frames.times_with_target_s]
     ends_s = [*starts_s[1:], log.end_s]
@@ -137,7 +137,7 @@ def target_losses(log: FlightLog, frames: Frames) -> tuple[TargetLoss, ...]:
 
 
 def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> float | None:
-    """When it ended; None where nothing was lost."""
+    """When the loss ended; None without a loss."""
     if end_s - start_s < LEAST_LOSS_S:
         return None
     at_s = start_s + LEAST_LOSS_S / 2  # the last sight may be just before the phase

@@ -117,7 +117,6 @@ def _taken_over(flight: FlightAnalysis) -> Iterator[Sentence]:
 
 
 def _motors(flight: FlightAnalysis) -> Iterator[Sentence]:
-    """Tell each kind of stop once, as it may be repeated."""
     commands = flight.log.texts("cmd")
     for command, text in MOTORS.items():
         if command in commands:
@@ -151,7 +150,7 @@ def _upper(sentence: str) -> str:
 
 
 def length_text(metres: float) -> str:
-    """``1.7 mm``, ``8.4 cm``, ``31 cm``, ``1.83 m``."""
+    """A length with its unit: ``1.7 mm``, ``8.4 cm``, ``31 cm``, ``1.83 m``."""
     size = abs(metres)
     if not math.isfinite(size):
         return "unknown"
@@ -165,5 +164,5 @@ def length_text(metres: float) -> str:
 
 
 def count_text(number: int, noun: str) -> str:
-    """``1 frame``, ``14 frames``."""
+    """A number with its noun: ``1 frame``, ``14 frames``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -113,7 +113,7 @@ class ClusterExecutor(Executor):
         self._executor, self._required = client.get_executor(pure=False), requirements
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Send a flight to the cluster, and return its future."""
+        """Send the flight ``fn(*args, **kwargs)`` to the cluster, and return its future."""
         order = pickle.dumps((fn, args, kwargs))
         future: Future[R] = self._executor.submit(fly_verified, order, self._required)
         return future

@@ -38,7 +38,7 @@ def fly_variants(
     executor: Executor | None = None,
     on_result: Callable[[FlightResult], None] = lambda result: None,
 ) -> list[FlightResult]:
-    """Fly each seed with all profiles, then the next seed; else as `fly_all`."""
+    """Fly each seed with all profiles, then the next seed; other parameters: see `fly_all`."""
     variants = itertools.product(seeds, range(len(profiles)))
     return fly_all(partial(_fly, tuple(profiles)), variants, executor, on_result)
 
@@ -51,7 +51,7 @@ def _fly(profiles: tuple[Profile, ...], variant: tuple[int, int]) -> FlightResul
 def results_by_seed(
     results: Iterable[FlightResult], profile_count: int
 ) -> list[tuple[FlightResult, ...]]:
-    """Return, in order of seed, the results of each seed that was flown with all profiles."""
+    """Return, in order of seed, the results (by profile) of seeds flown with all profiles."""
     by_seed: dict[int, dict[int, FlightResult]] = {}
     for each in results:
         by_seed.setdefault(each.seed, {})[each.variant] = each
@@ -100,8 +100,8 @@ def compare_variants(results: Iterable[FlightResult]) -> Comparison:
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """The comparison of two flights per seed. `comparisons`: number of comparisons that
-    share the 5 % significance level."""
+    """The comparison of two flights per seed by `figures` (keys of `FIGURES`). `comparisons`:
+    number of comparisons that share the 5 % significance level."""
     questions = comparisons * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {
@@ -142,7 +142,7 @@ def _difference(key: str, pairs: Sequence[Pair], level: float) -> dict[str, Any]
 
 
 def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
-    """Return Student's confidence interval of the mean."""
+    """Return Student's confidence interval (low, high) of the mean at `level`."""
     if np.ptp(values) <= _SAME * np.max(np.abs(values)):
         return float(values[0]), float(values[0])
     found = ttest_1samp(values, 0.0).confidence_interval(level)
@@ -150,7 +150,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, floa
 
 
 def comparison_text(names: tuple[str, str], found: Comparison) -> str:
-    """The comparison as a table, with the proven differences below."""
+    """The comparison `found` as a table with verdicts; `names`: how A and B are called."""
     flights, success = found["flights"], found["success"]
     rows: list[tuple[str, ...]] = [("", f"A: {names[0]}", f"B: {names[1]}", "B less A", "")]
     rates = (rate_text(success[which]["good"], flights) for which in "AB")
@@ -195,8 +195,8 @@ class Sweep:
     profiles: tuple[Profile, ...]
 
     def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
-        """The figures of each value (a cell) for JSON, over the seeds flown with all values.
-        `best`: the value with the most successes, then the smallest median miss;
+        """The sweep's results for JSON, over the seeds flown with all values. `cells`: each value's
+        figures; `best`: the value with the most successes, then the smallest median miss;
         `best_against_own`: `Comparison` of the original value (A) with `best` (B), None if these
         are the same."""
         seeds = results_by_seed(results, len(self.profiles))
@@ -214,7 +214,7 @@ class Sweep:
         return {"cells": cells, "best": cells[best]["value"], "best_against_own": against}
 
     def text(self, record: dict[str, Any]) -> str:
-        """A sweep's `record` as a table, with the comparison of the best value."""
+        """A sweep's `record` as a table, and the comparison of the best value with the original."""
         rows: list[tuple[str, ...]] = [(self.key, "success", "miss [mm]: median", "p95", "")]
         for cell in record["cells"]:
             misses = ("-" if m is None else f"{1e3 * m:.1f}" for m in cell["miss_m"].values())
@@ -229,7 +229,7 @@ class Sweep:
 
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
-    """The sweep of the text ``key=value,value``, values as in a profile file. Errors:
+    """The sweep of `profile` by the text ``key=value,value``, values as in its file. Errors:
     UsageError, InvalidValue."""
     key, equals, text = (part.strip() for part in sweep.partition("="))
     try:
@@ -247,7 +247,6 @@ def make_sweep(profile: Profile, sweep: str) -> Sweep:
 
 
 def _figures(results: Sequence[FlightResult]) -> dict[str, Any]:
-    """The figures of one value's flights."""
     good = sum(not r.is_bad for r in results)
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
     rate = rate_record(good, len(results))

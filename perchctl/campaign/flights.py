@@ -97,7 +97,7 @@ def seed_log_path(seed: int, log_dir: Path) -> Path:
 
 
 def fly_in_folder(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
-    """Fly a seed as `fly_seed` does, with its log in a folder if one is given."""
+    """Fly a seed as `fly_seed` does, with its log in the folder `log_dir` unless None."""
     log_path = None if log_dir is None else seed_log_path(seed, log_dir)
     return fly_seed(profile, seed, log_path, record)
 
@@ -109,7 +109,7 @@ def fly_all(
     on_result: Callable[[R], None] = lambda result: None,
 ) -> list[R]:
     """Call `fly` on each seed; return the results in the order of the seeds. `on_result` is called
-    with each result as it comes.
+    with each result once its flight ends.
 
     `executor`: as in `concurrent.futures`, or None for this process; its optional attribute `lost`
     lists the exceptions of a future whose flight was lost with its process. Errors: PerchError, as

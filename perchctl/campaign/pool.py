@@ -27,7 +27,7 @@ class FlightProcesses(ProcessPoolExecutor):
         resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
 
     def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Queue a flight for the next free process, and return its future."""
+        """Queue the flight ``fn(*args, **kwargs)`` for the next free process; return its future."""
         with defer_interrupts():  # threads and processes inherit the mask of who starts them
             return super().submit(fn, *args, **kwargs)
 
@@ -49,7 +49,7 @@ def flight_processes(jobs: int) -> Iterator[Executor]:
 @contextlib.contextmanager
 def defer_interrupts() -> Iterator[None]:
     """Hold back Ctrl-C and SIGTERM until the end of the block; threads and processes started in it
-    never get them. Python's handlers are replaced, too, as a thread of a library may take the
+    never get these signals. Python's handlers are replaced, too, as a library's thread may take a
     signal."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     came: list[int] = []

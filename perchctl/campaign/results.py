@@ -49,9 +49,9 @@ class FlightResult(CampaignFlight):
     """One simulated flight.
 
     Attributes:
-        outcome: the terminal phase, in small letters, or refused: it never took off.
+        outcome: the terminal phase, in small letters, or refused: the vehicle never took off.
         miss_m: horizontal distance of the gear from the target's centre in the
-            simulation's truth; None when it did not perch.
+            simulation's truth; None if the vehicle did not perch.
         time_s: duration of the flight in the loop's time.
         attempts: perching attempts, the successful one included.
         locked: the supervisor had locked the vehicle at the end.
@@ -77,8 +77,8 @@ class FlightResult(CampaignFlight):
 def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
     """A campaign's figures, ready for JSON.
 
-    `rates` are shares with intervals. `miss_m` is over perched flights (None without; p95 by linear
-    interpolation). `worst_seeds` names at most `WORST` bad flights.
+    `rates` are shares with intervals. `miss_m`: median, p95 (interpolated) and max over perched
+    flights, None without any. `worst_seeds` names at most `WORST` bad flights.
     """
     ends: dict[str, int] = {end: sum(r.outcome == end for r in results) for end in ENDS}
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
@@ -94,7 +94,7 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
 
 
 def miss_percentiles(misses_m: Sequence[float]) -> dict[str, float | None]:
-    """The median and the 95th percentile of misses for JSON; None without any."""
+    """The `median` and the 95th percentile `p95` of misses for JSON; None without any."""
     if not misses_m:
         return {"median": None, "p95": None}
     median_m, p95_m = np.percentile(misses_m, (50, 95)).round(6).tolist()
@@ -109,7 +109,7 @@ def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
 
 def all_refused_error(results: Sequence[FlightResult]) -> SafetyAbort | None:
     """The error of a campaign whose flights were all refused (so the seeds are not the
-    cause); None for any other."""
+    cause); None for any other campaign."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
     first = min(results, key=lambda r: r.seed)
@@ -147,7 +147,6 @@ def _cells(r: FlightResult) -> tuple[str, ...]:
 
 
 def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[tuple[str, str]]:
-    """The name and the text of each figure of `campaign_summary`."""
     rows = [("flights", str(figures["flights"]))]
     rows += [
         (end, rate_text(figures[end], figures["flights"]))
@@ -173,28 +172,30 @@ def _rows(figures: Mapping[str, Any], results: Sequence[FlightResult]) -> list[t
 LEVEL = 0.95
 
 
-def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
-    """The exact two-sided confidence interval of a rate after `k` of `n` (Clopper and
+def rate_interval(count: int, total: int, level: float = LEVEL) -> tuple[float, float]:
+    """The exact two-sided confidence interval of the rate `count` / `total` (Clopper and
     Pearson, 1934): it contains the true rate in at least `level` of all campaigns."""
-    found = binomtest(k, n).proportion_ci(level, method="exact")
+    found = binomtest(count, total).proportion_ci(level, method="exact")
     return float(found.low), float(found.high)
 
 
-def rate_text(k: int, n: int) -> str:
+def rate_text(count: int, total: int) -> str:
     """A rate with its interval: ``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4
     %)``."""
-    if n == 0:
-        return "0 of 0"
-    low, high = (100.0 * bound for bound in rate_interval(k, n))
-    if k == n:
-        return f"{k} of {n} (>= {low:.1f} %)"
-    if k == 0:
-        return f"{k} of {n} (<= {high:.1f} %)"
-    return f"{k} of {n} ({low:.1f} to {high:.1f} %)"
+    text = f"{count} of {total}"
+    if total == 0:
+        return text
+    low, high = (100.0 * bound for bound in rate_interval(count, total))
+    if count == total:
+        return f"{text} (>= {low:.1f} %)"
+    if count == 0:
+        return f"{text} (<= {high:.1f} %)"
+    return f"{text} ({low:.1f} to {high:.1f} %)"
 
 
-def rate_record(k: int, n: int) -> dict[str, float | list[float]]:
-    """A rate and its interval for JSON; empty if `n` is 0."""
-    if n == 0:
+def rate_record(count: int, total: int) -> dict[str, float | list[float]]:
+    """A rate and its interval for JSON; empty if `total` is 0."""
+    if total == 0:
         return {}
-    return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n)]}
+    interval = [round(bound, 6) for bound in rate_interval(count, total)]
+    return {"rate": round(count / total, 6), "interval": interval}

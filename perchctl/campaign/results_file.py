@@ -61,7 +61,7 @@ def campaign_results(
     force: bool = False,
     log_dir: Path | None = None,
 ) -> Iterator[CampaignResults[R]]:
-    """Yield the results of a campaign, which are appended to the file `out`.
+    """Yield the results (of class `result_type`) of a campaign, appended to the file `out`.
 
     An existing file is refused, replaced with `force`, or continued with `resume`: then program,
     profile and faults must be the same. Errors: InvalidValue, also for a `log_dir` that is not

@@ -154,8 +154,7 @@ def _live_sources(
 
 
 def _free_place(name: str) -> Path:
-    """Return where a live recording goes: the next name that is free, so that nothing is measured
-    in vain."""
+    """Return the next free path for a live recording, and check that it can be written."""
     stems = (f"mounting_{name}{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
     place = next(p for stem in stems if not (p := FOLDER / f"{stem}.jsonl").exists())
     check_writable(place, force=False)
@@ -269,8 +268,7 @@ def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
 
 
 def _keep(recordings: Sequence[MountingRecording], log: Path) -> None:
-    """Write the recording. Never raises: if it cannot be kept, it is measured from all the
-    same."""
+    """Write the recording. Never raises, as its numbers are wanted all the same."""
     held = [recording for recording in recordings if recording.attitudes or recording.poses]
     if not held:
         return

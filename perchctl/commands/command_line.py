@@ -73,7 +73,7 @@ _SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
 
 
 class Group(TyperGroup):
-    """A group of subcommands; the first one is the main one, which runs if none is named."""
+    """A group of subcommands; the first is the main subcommand, which runs if none is named."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         named = (*self.commands, *_SETTINGS["help_option_names"])
@@ -101,7 +101,7 @@ class Group(TyperGroup):
 
 
 class _Unloaded(TyperCommand):
-    """A subcommand whose file is loaded once it is used."""
+    """A subcommand whose file is loaded on use."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         module = importlib.import_module(f"perchctl.commands.{(self.name or '').replace('-', '_')}")

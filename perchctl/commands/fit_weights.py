@@ -83,7 +83,7 @@ def fit(
     problem: PerchError | None = None
     if output is None:
         say("no file written: name one with -o")
-    elif any(result.proven) or anyway:
+    elif any(result.is_proven_better) or anyway:
         date = datetime.now(UTC).isoformat(timespec="seconds")
         write_weights(output, result, date, anyway=anyway)
         say(f"weights: {output}; they fly with merge.method: weights and merge.weights_file")

@@ -156,7 +156,7 @@ def resolve_options(
 
 
 def with_positioning(profile: Profile, method: str | None) -> Profile:
-    """Return the profile with the method of `--positioning`; unchanged for None. Errors:
+    """Return the profile with the `--positioning` method; unchanged for None. Errors:
     InvalidValue."""
     by = method
     if by is None:
@@ -254,7 +254,7 @@ def flight_record(
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
-    """Return the exit code of the flight or, if the flight was good, of its log."""
+    """Return the exit code of the flight or, if only the log is incomplete, that of the log."""
     code = EXIT_CODE_OF[outcome]
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 

@@ -53,11 +53,8 @@ app = new_app(Group)
 
 
 def _log_file(place: Path | None) -> Path:
-    """Return the log that is named; else the newest of the folder, which is then printed; by
-    default of where `fly` puts the logs unless a profile says otherwise.
-
-    Errors: NotFound.
-    """
+    """Return the named log, else the newest of the folder (by default that of `fly`), which is
+    then printed. Errors: NotFound."""
     if place is not None and not place.is_dir():
         return place
     folder = Path(Profile().log.directory) if place is None else place
@@ -76,12 +73,8 @@ def _place(log: Path, output: Path | None, kind: tuple[tuple[str, ...], str], fo
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[FlightLog]:
-    """Yield the log; within the block a value that no flight writes is an error of the file. So
-    what reads values stands in the block, and what decides and draws behind it, where a fault is
-    the program's.
-
-    Errors: NotFound, InvalidValue.
-    """
+    """Yield the log. In the block, which must only read values, an error is the file's.
+    Errors: NotFound, InvalidValue."""
     log = read_log(path)
     with wrap_log_errors(path):
         yield log

@@ -72,7 +72,6 @@ def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
 
 
 def _say_doubts(profile: Profile) -> None:
-    """Print what of the profile was hardly meant."""
     for row in profile_rows(profile):
         if row.verdict in (Verdict.WARN, Verdict.FAIL):
             say(f"{row.name}: {row.found}; {row.advice}")
@@ -211,7 +210,7 @@ def new(
 
 
 def default_answer(name: str, answers: Answers) -> str:
-    """Return the default answer to a question, given the answers to the ones before it."""
+    """Return the default answer to a question, given the answers to earlier questions."""
     uri, source = answers.get("link.uri", ""), answers.get("camera.source", "")
     if name == "camera.source" and uri.startswith(SIMULATED):
         return "sim:"
@@ -230,7 +229,7 @@ def default_answer(name: str, answers: Answers) -> str:
 
 def ask_questions(given: Answers) -> Answers:
     """Ask the questions not answered in `given`, each until its answer is valid, and have all
-    confirmed at the end; return all answers. Raises UsageError at the end of the input."""
+    answers confirmed at the end; return them. Raises UsageError at the end of the input."""
     names = [name for name in QUESTIONS if name not in given]
     before: list[Answers] = [given]
     while True:

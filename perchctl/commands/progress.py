@@ -40,7 +40,8 @@ class FinishedFlight(Protocol):
 def progress_bar(
     total: int, earlier: Iterable[FinishedFlight] = (), stream: TextIO | None = None
 ) -> Iterator[Callable[[FinishedFlight], None]]:
-    """Show a bar that counts flights; yield the function to call with each result."""
+    """Show a bar that counts flights; yield the function to call with each result; `earlier`
+    results are counted from the start."""
     ends = Counter(result.outcome for result in earlier)
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
     with _bar("flights", *columns, total=total, stream=stream, width=8) as update:

@@ -273,7 +273,6 @@ def _fly_by_each(
 
 
 def _require_simulator() -> None:
-    """Raise UsageError if the extra ``sim`` is not installed."""
     if find_spec("mujoco") is None:
         raise no_simulator()
 
@@ -359,8 +358,8 @@ def run_campaign(
 def stop_handler(
     clock: Callable[[], float] = time.monotonic, exit_process: Callable[[int], object] = os._exit
 ) -> Callable[[int, FrameType | None], None]:
-    """Return a signal handler: the first signal raises KeyboardInterrupt, a later one exits at
-    once."""
+    """Return a signal handler: the first signal raises KeyboardInterrupt; a signal at least
+    `AGAIN_S` later exits at once."""
     first_s: list[float] = []
 
     def press(_number: int, _frame: FrameType | None) -> None:

@@ -173,7 +173,8 @@ def poll_until_stopped(
 
 @dataclass(frozen=True, eq=False)
 class TargetInCamera:
-    """The target's pose in the camera frame; `sigma_m` (3,) is along the camera's axes."""
+    """The target's pose in the camera frame; `yaw_rad` is the heading in the picture's plane,
+    `sigma_m` (3,) is along the camera's axes."""
 
     rvec_rad: Array
     tvec_m: Array
@@ -244,17 +245,17 @@ class Tracker:
 
 
 def target_in_camera(
-    output: PipelineOutput, before: TargetInCamera | None
+    output: PipelineOutput, previous: TargetInCamera | None
 ) -> TargetInCamera | None:
     """Return the target's pose in the camera frame, from a pipeline whose body, gear and camera
-    frames coincide; None without a target. `before`: the last pose, whose tilt is kept while the
+    frames coincide; None without a target. `previous`: the last pose, whose tilt is kept while the
     filter predicts."""
     target, poses = output.target, output.poses
     if target is None:
         return None
     stage = target.stage.value
     known: MarkerPose | TargetInCamera | None = poses.get(
-        "joint" if stage == "both" else stage, before
+        "joint" if stage == "both" else stage, previous
     )
     if stage == "both" and "joint" not in poses:
         known = min(poses.values(), key=lambda pose: float(np.linalg.norm(pose.sigma_m)))
@@ -271,7 +272,7 @@ def target_in_camera(
 
 
 def track_record(tracked: TrackResult) -> dict[str, Any]:
-    """Return a line of `track --json`; None for values that are not finite."""
+    """Return a result for a line of `track --json`; values that are not finite are None."""
     target, output = tracked.target, tracked.output
     return {
         "frame": tracked.name,
@@ -304,7 +305,7 @@ def _finite(value: Any) -> Any:
 
 
 def text_line(tracked: TrackResult) -> str:
-    """Return one line for a terminal, at most 100 columns but for long file names."""
+    """Return a result as one line for a terminal, at most 100 columns but for long file names."""
     head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
     return f"{head}  {_target_text(tracked.target)}"
 
@@ -317,7 +318,7 @@ def _target_text(target: TargetInCamera | None) -> str:
 
 
 def track_state(tracked: TrackResult) -> dict[str, Any]:
-    """Return the state of the live page for a frame, for JSON."""
+    """Return the live page's state for a result: `rows` of name and text, and `note`."""
     rows = [
         ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
         ["markers", tracked.stage],
@@ -348,7 +349,7 @@ class TrackSummary:
             self._noted[kind] += 1
 
     def text(self, took_s: float) -> str:
-        """Return the summary of all frames."""
+        """Return the counts of all frames as a sentence; `took_s` is the time they took."""
         frames, took_s = self.frames, max(took_s, 1e-6)
         large, small = (100.0 * self._found[name] / max(frames, 1) for name in ("large", "small"))
         counted = "".join(f"; {note} in {n}" for note, n in self._noted.items())

@@ -39,7 +39,7 @@ class LivePage:
     """Serves one page on localhost until closed.
 
     Args:
-        camera: for drawing the axes.
+        camera: projects the axes to draw.
         title: heading of the page.
         on_stop: called by the STOP button, from a thread of the page; None: no button.
 
@@ -84,7 +84,7 @@ class LivePage:
     # --- for the loop: neither waits nor raises ---
 
     def show(self, sketch: Sketch) -> None:
-        """Show this picture until the next call."""
+        """Show `sketch` until the next call."""
         with self._changed:
             self._picture_s, self._sketch = self._clock(), sketch
             self._number += 1
@@ -97,8 +97,8 @@ class LivePage:
         self._state_s = self._clock() if live else None
 
     def end(self, card: dict[str, Any]) -> None:
-        """Show a card with the outcome over the last picture and values. Waits up to a second for a
-        browser that is polling, so that it gets the card."""
+        """Show a card (outcome, good, reason, rows) over the last picture and values. Waits up
+        to a second for a polling browser to get the card."""
         with self._changed:
             self._card, self._state_s = card, None
             read_s = self._read_s
@@ -108,7 +108,7 @@ class LivePage:
     # --- for the server's threads ---
 
     def state(self) -> dict[str, Any]:
-        """The JSON that the page polls: the keys of `describe` (rows of name, text and
+        """The values that the page polls: the keys of `describe` (rows of name, text and
         optional bar length 0..1; note, phase, battery, over), title, fresh (whether pictures come),
         stop (``none``, ``ready``, ``requested``, ``over``), age_s of the values (None if no update
         is due), and the card of `end`, or None."""
@@ -180,13 +180,13 @@ class LivePage:
 def live_page(
     camera: CameraModel,
     title: str,
-    wanted: bool,
+    enabled: bool,
     report: Callable[[str], None],
     on_stop: Callable[[], None] | None = None,
 ) -> Iterator[LivePage | None]:
-    """Serve a page during the block; yield None unless `wanted`. `report` prints the address, and
+    """Serve a page during the block; yield None unless `enabled`. `report` prints the address, and
     at the end the page's problem if any. `on_stop`: as in `LivePage`."""
-    if not wanted:
+    if not enabled:
         yield None
         return
     page = LivePage(camera, title, on_stop)
@@ -352,7 +352,8 @@ class Sketch:
     Attributes:
         image: grey (h, w) uint8; not changed by drawing.
         outlines: name and corners (4, 2) px of each marker.
-        pose: rvec (3,), tvec (3,) and length in m of the axes to draw.
+        pose: the target's rvec (3,) and tvec (3,) in the camera frame, and the length of its axes
+            in m; None: no axes.
     """
 
     image: NDArray[np.uint8]

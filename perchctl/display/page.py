@@ -87,7 +87,7 @@ class FlightPage:
 def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
     """The page's state for a tick: phase, battery, the rows of the terminal's panel, whether
     the flight is over, and for the page's drawings the height, the target's offset and distance
-    above in m (None: no target), and `drawing_sizes`."""
+    above in m (None: no target), and `drawing_sizes` (`large_m`, `gear_m`)."""
     state, volts, target = tick.state, tick.telemetry.battery_v, tick.target
     off_m, below_m = (
         (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])

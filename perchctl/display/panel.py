@@ -49,7 +49,6 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
 
 
 def _battery_text(tick: Tick) -> str:
-    """Return its voltage under load and, before contact, what it is enough for."""
     battery_v, battery = tick.telemetry.battery_v, tick.state.battery
     if not battery_v >= NO_BATTERY_READING_V:
         return "unknown"

@@ -96,7 +96,7 @@ def _vector(pose: MarkerPose | None) -> Array | None:
 
 
 def position_fault(readings: list[MarkerReading]) -> str | None:
-    """Why a position must be taken again, in one sentence; None when it is good."""
+    """Why a position must be taken again, in one sentence; None if the position is good."""
     count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames came"
@@ -118,7 +118,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
 
 
 def session_rows(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
-    """The CSV lines of a position."""
+    """The CSV lines of place number `position`, with the actual pose (4,) in each."""
     return "".join(csv_row(position, r.t_s, [r.large, r.small, actual]) for r in readings)
 
 
@@ -126,7 +126,7 @@ class SessionFile:
     """The CSV file of a session. Raises InvalidValue for any other file.
 
     Attributes:
-        note: a sentence, if an unfinished end was taken off.
+        note: a sentence if an unfinished end was taken off, else empty.
         done: number of complete positions.
         next_position: number of the next position, above all numbers in the file.
     """
@@ -213,6 +213,7 @@ class MocapPoses:
     Args:
         config: names the capture and the vehicle's rigid body, and gives that body's mounting.
         target: rigid body of the target; its x axis is the heading.
+        gear_body_m: the gear's tip in body axes, (3,).
     """
 
     def __init__(
@@ -273,7 +274,8 @@ def _median(
 class Experiment:
     """Collects poses at positions to which a person moves the camera.
 
-    `say` prints a sentence; `bar` shows progress; `now` and `wait` are the clock.
+    `truth` gives actual poses, `say` prints a sentence, `bar` shows progress; `now` and
+    `wait` are the clock.
     """
 
     session: SessionFile
@@ -288,8 +290,9 @@ class Experiment:
     wait: Callable[[float], None]
 
     def run(self, positions: int, frames: int) -> None:
-        """Collect positions until the session holds `positions`. Raises Interrupted when the person
-        stops (complete positions are kept), and the errors of the source and the truth."""
+        """Collect positions of `frames` frames each until the session holds `positions`. Raises
+        Interrupted when the person stops (complete positions are kept), and the errors of the
+        source and the truth."""
         while self.session.done < positions:
             number = self.session.next_position
             self.say(
@@ -352,7 +355,6 @@ class Experiment:
 
 
 def _mismatch(actual: Array, readings: list[MarkerReading]) -> str | None:
-    """A sentence if the camera measures another pose."""
     poses = np.array([r.large for r in readings if r.large is not None])
     poses[:, 3] = np.unwrap(poses[:, 3])
     seen = np.median(poses, axis=0)

@@ -58,7 +58,7 @@ class Measurements:
         return len(self.position)
 
     @property
-    def has_both(self) -> NDArray[np.bool_]:
+    def has_both_markers(self) -> NDArray[np.bool_]:
         """True for rows in which both markers were seen, (n,)."""
         return ~(np.isnan(self.large[:, 0]) | np.isnan(self.small[:, 0]))
 
@@ -69,7 +69,7 @@ def wrap_angles(angle_rad: Any) -> Any:
 
 
 def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
-    """The CSV line of a frame: the large, small and actual pose, each (4,) or None."""
+    """The CSV line of a frame at `position`; `poses`: large, small, actual, each (4,) or None."""
     cells = [str(position), f"{t_s:.6f}"]
     for pose in poses:
         cells += [""] * 4 if pose is None else [f"{float(value):.8f}" for value in pose]
@@ -77,7 +77,7 @@ def csv_row(position: int, t_s: float, poses: Sequence[Array | None]) -> str:
 
 
 def read_data(path: Path) -> Measurements:
-    """A file's rows for the fit. Raises NotFound, InvalidValue with line or position."""
+    """Read a CSV file for the fit. Raises NotFound, InvalidValue with line or position."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
             lines, table = _read_table(path, csv.reader(text, skipinitialspace=True))
@@ -147,18 +147,17 @@ def _check_cells(
 
 
 def _check_positions(data: Measurements) -> None:
-    """Raises InvalidValue for a never seen marker, a single position, or wrong units."""
     for source in ("large", "small"):
         if np.isnan(getattr(data, source)).all():
             raise InvalidValue(f"{data.name}: the {source} marker is never seen")
-    places = np.unique(data.position[data.has_both])
+    places = np.unique(data.position[data.has_both_markers])
     if len(places) < 2:
         raise InvalidValue(
             f"{data.name}: {len(places)} positions show both markers; frames of one position are "
             f"not independent, so at least 2 are needed (10 are usual)"
         )
     for place in places:
-        rows = data.has_both & (data.position == place)
+        rows = data.has_both_markers & (data.position == place)
         for source in ("large", "small"):
             apart = getattr(data, source)[rows] - data.actual[rows]
             apart[:, YAW] = wrap_angles(apart[:, YAW])

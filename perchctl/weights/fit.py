@@ -55,7 +55,7 @@ class MarkerErrors:
         name: the data file, for messages.
         positions: numbers of the g positions, (g,); starts: the first row of each position, (g,).
         large, small: each marker's errors in x, y, z (m) and yaw (rad), (n, 4).
-        use: False where the row is an outlier on the axis, (n, 4).
+        is_inlier: False where the row is an outlier on the axis, (n, 4).
     """
 
     name: str
@@ -63,7 +63,7 @@ class MarkerErrors:
     starts: NDArray[np.int64]
     large: Array
     small: Array
-    use: NDArray[np.bool_]
+    is_inlier: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.large)
@@ -71,15 +71,15 @@ class MarkerErrors:
     @cached_property
     def sums(self) -> Array:
         """Each position's sums of 1, a, b, a^2, b^2, a b, (6, g, 4); a is `large`, b `small`."""
-        use = self.use.astype(np.float64)
+        use = self.is_inlier.astype(np.float64)
         a, b = self.large * use, self.small * use
         parts = np.stack([use, a, b, a * a, b * b, a * b])
         return np.asarray(np.add.reduceat(parts, self.starts, axis=1))
 
 
 def marker_errors(data: Measurements) -> MarkerErrors:
-    """The errors of the rows with both markers."""
-    rows = np.flatnonzero(data.has_both)
+    """The pose errors of the rows with both markers."""
+    rows = np.flatnonzero(data.has_both_markers)
     rows = rows[np.argsort(data.position[rows], kind="stable")]
     positions, starts = np.unique(data.position[rows], return_index=True)
     actual = data.actual[rows]
@@ -94,7 +94,7 @@ def marker_errors(data: Measurements) -> MarkerErrors:
         starts=starts,
         large=large,
         small=small,
-        use=_inliers(large, starts) & _inliers(small, starts),
+        is_inlier=_inliers(large, starts) & _inliers(small, starts),
     )
 
 
@@ -113,9 +113,9 @@ def _inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
     return use
 
 
-def t_quantile(degrees: int) -> float:
-    """Return Student's two-sided 95 % quantile at `degrees` of freedom; inf for none."""
-    return float(stdtrit(degrees, 0.975)) if degrees >= 1 else math.inf
+def t_quantile(freedom: int) -> float:
+    """Return Student's two-sided 95 % quantile at `freedom` degrees of freedom; inf at 0."""
+    return float(stdtrit(freedom, 0.975)) if freedom >= 1 else math.inf
 
 
 def closed_form_weights(sums: Array) -> Array:
@@ -168,7 +168,7 @@ def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]
 
 def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
     """Return p of mean 1 and q, (n, 4), of ``w <- w - mu (p w + q)``; an outlier's row is zero."""
-    use = errors.use
+    use = errors.is_inlier
     n = np.maximum(use.sum(axis=0), 1)
     a, b = np.where(use, errors.large, 0.0), np.where(use, errors.small, 0.0)
     a -= np.where(use, a.sum(axis=0) / n, 0.0)
@@ -186,20 +186,20 @@ class FittedWeights:
     """The large marker's weights by one method for x, y, z and yaw, (4,) each; g positions.
 
     Attributes:
-        raw: weights as fitted.
-        weights: `raw`, clipped to [0, 1].
-        half_width: half the width of the 95 % interval of `raw` (jackknife over positions).
+        raw_weights: weights as fitted.
+        weights: `raw_weights`, clipped to [0, 1].
+        half_width: half the width of the 95 % interval of `raw_weights` (jackknife over positions).
         fold_weights: clipped weights, each row fitted without one position, (g, 4).
     """
 
-    raw: Array
+    raw_weights: Array
     weights: Array
     half_width: Array
     fold_weights: Array
 
 
-def fit_all(errors: MarkerErrors) -> dict[str, FittedWeights]:
-    """Both methods' weights by name. Raises InvalidValue where all weights fit alike."""
+def fit_by_each_method(errors: MarkerErrors) -> dict[str, FittedWeights]:
+    """The weights by each method of `FITTED`. Raises InvalidValue where all weights fit alike."""
     total = errors.sums.sum(axis=1)
     closed = closed_form_weights(total)
     if np.isnan(closed).any():
@@ -233,18 +233,18 @@ class Evidence:
     squares: dict[str, Array]
 
     @property
-    def better(self) -> NDArray[np.int64]:
+    def better_marker(self) -> NDArray[np.int64]:
         """The better single marker by axis: index into `SINGLE`, (4,)."""
         means = [self.squares[name].mean(axis=0) for name in SINGLE]
         return np.asarray(np.argmin(means, axis=0))
 
     @property
-    def better_squares(self) -> Array:
+    def better_marker_squares(self) -> Array:
         """The mean square errors of the better single marker, (g, 4)."""
-        return np.where(self.better == 0, self.squares["large"], self.squares["small"])
+        return np.where(self.better_marker == 0, self.squares["large"], self.squares["small"])
 
     def rms(self, name: str) -> tuple[Array, Array]:
-        """The RMS error of `name` (m, rad) and its 95 % interval's half width, (4,) each."""
+        """RMS error (m, rad) of weights `name` and its 95 % interval's half width, (4,) each."""
         rms, influence = _root(self.squares[name])
         return rms, _half_width(influence)
 
@@ -254,16 +254,16 @@ class Evidence:
         (rms, influence), (reference, of_reference) = _root(self.squares[name]), _root(other)
         return reference - rms, _half_width(of_reference - influence)
 
-    def proven(self, name: str) -> NDArray[np.bool_]:
-        """True where the whole interval of the gain over the better single marker is above
-        zero, (4,)."""
-        gain, half = self.rms_gain(name, self.better_squares)
+    def is_proven_better(self, name: str) -> NDArray[np.bool_]:
+        """True where the whole interval of the gain of the weights `name` over the better single
+        marker is above zero, (4,)."""
+        gain, half = self.rms_gain(name, self.better_marker_squares)
         return np.asarray(gain - half > 0.0)
 
 
 def evaluate_weights(errors: MarkerErrors, weights: Mapping[str, Array]) -> Evidence:
     """The errors of the fitted weights, the paper's, and each marker alone. `weights` by
-    method: (4,), or one row per position, (g, 4)."""
+    method: (4,), or a row for each position, (g, 4)."""
     n, _, _, aa, bb, ab = errors.sums
     known = {"large": np.ones(4), "small": np.zeros(4), "paper": np.array(PAPER_WEIGHTS)}
     return Evidence(
@@ -282,7 +282,6 @@ def _root(square: Array) -> tuple[Array, Array]:
 
 
 def _half_width(influence: Array) -> Array:
-    """Return half the width of the 95 % interval, (4,)."""
     g = len(influence)
     spread = np.sqrt((influence**2).sum(axis=0) / (g - 1) / g)
     return np.asarray(t_quantile(g - 1) * spread)

@@ -26,7 +26,7 @@ from perchctl.weights.fit import (
     FittedWeights,
     MarkerErrors,
     evaluate_weights,
-    fit_all,
+    fit_by_each_method,
     marker_errors,
 )
 
@@ -39,46 +39,46 @@ _HEAD = """\
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """Result of a fit. `method` is the one whose weights are recommended; `test` is the
+    """Result of a fit. `method` is the one whose weights are recommended; `test_evidence` is the
     evidence on the test data `test_name`, or None."""
 
     errors: MarkerErrors
     fits: dict[str, FittedWeights]
     evidence: Evidence
-    test: Evidence | None
+    test_evidence: Evidence | None
     test_name: str
     method: str
 
     @property
-    def proven(self) -> list[bool]:
-        """True by axis where the weight of `method` beats the better single marker."""
-        return [bool(p) for p in self.evidence.proven(self.method)]
+    def is_proven_better(self) -> list[bool]:
+        """True for each axis on which the weight of `method` beats the better single marker."""
+        return [bool(p) for p in self.evidence.is_proven_better(self.method)]
 
     @property
-    def better(self) -> list[str]:
-        """The better single marker, by axis."""
-        return [SINGLE[int(k)] for k in self.evidence.better]
+    def better_markers(self) -> list[str]:
+        """The better single marker (large or small) on each axis."""
+        return [SINGLE[int(k)] for k in self.evidence.better_marker]
 
     @property
-    def recommended(self) -> Array:
+    def recommended_weights(self) -> Array:
         """The fitted weights where proven, else 1 or 0: the better single marker alone, (4,)."""
-        alone = np.where(self.evidence.better == 0, 1.0, 0.0)
-        return np.where(self.proven, self.fits[self.method].weights, alone)
+        alone = np.where(self.evidence.better_marker == 0, 1.0, 0.0)
+        return np.where(self.is_proven_better, self.fits[self.method].weights, alone)
 
 
 def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
-    """Read the data, fit the weights by each method, and judge them by held-out positions.
+    """Read the data file `path`, fit the weights by each method, judge them by held-out positions.
 
     Args:
         method: the method to recommend, one of `FITTED`.
-        test: other data to judge the weights by.
+        test: other data file to judge the weights by.
 
     Errors: NotFound, InvalidValue.
     """
     if test is not None and same_file(path, test):
         raise InvalidValue(f"{test} is the data itself, and no test of what is fitted to it")
     errors = marker_errors(read_data(path))
-    fits = fit_all(errors)
+    fits = fit_by_each_method(errors)
     other = None
     if test is not None:
         weights = {name: fit.weights for name, fit in fits.items()}
@@ -87,7 +87,7 @@ def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
         errors=errors,
         fits=fits,
         evidence=evaluate_weights(errors, {name: fit.fold_weights for name, fit in fits.items()}),
-        test=other,
+        test_evidence=other,
         test_name="" if test is None else str(test),
         method=method,
     )
@@ -97,7 +97,6 @@ def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
 
 
 def _by_axis(values: Iterable[float]) -> dict[str, float | None]:
-    """The values by axis, to six figures."""
     return {
         axis: float(f"{value:.6g}") if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
@@ -110,9 +109,11 @@ def weights_record(result: FitResult) -> dict[str, Any]:
     record |= {
         "paper": _by_axis(PAPER_WEIGHTS),
         "method": result.method,
-        "recommended": _by_axis(result.recommended) if any(result.proven) else None,
-        "proven": dict(zip(AXES, result.proven, strict=True)),
-        "better_single": dict(zip(AXES, result.better, strict=True)),
+        "recommended": _by_axis(result.recommended_weights)
+        if any(result.is_proven_better)
+        else None,
+        "proven": dict(zip(AXES, result.is_proven_better, strict=True)),
+        "better_single": dict(zip(AXES, result.better_markers, strict=True)),
         "half_width": {name: _by_axis(fit.half_width) for name, fit in result.fits.items()},
         "errors": _errors_record(result.evidence),
         "data": {
@@ -121,13 +122,12 @@ def weights_record(result: FitResult) -> dict[str, Any]:
             "positions": len(result.errors.positions),
         },
     }
-    if result.test is not None:
-        record["test"] = {"file": result.test_name, "errors": _errors_record(result.test)}
+    if result.test_evidence is not None:
+        record["test"] = {"file": result.test_name, "errors": _errors_record(result.test_evidence)}
     return record
 
 
 def _errors_record(found: Evidence) -> dict[str, Any]:
-    """Each set of weights' RMS error (x, y, z, yaw) and its interval's half width."""
     record = {}
     for name in found.squares:
         rms, half = found.rms(name)
@@ -141,7 +141,7 @@ def write_weights(path: Path, result: FitResult, date: str, *, anyway: bool) -> 
 
     Errors: InvalidValue if the file cannot be written; an old file then stays.
     """
-    flown = result.fits[result.method].weights if anyway else result.recommended
+    flown = result.fits[result.method].weights if anyway else result.recommended_weights
     content = {"format": FORMAT, "date": date, "weights": _by_axis(flown)} | weights_record(result)
     write_files({path: (_HEAD + yaml.safe_dump(content, sort_keys=False)).encode("utf-8")})
 
@@ -158,15 +158,15 @@ _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 def report_text(result: FitResult) -> str:
     """The report: verdict, errors, gains and weights."""
     errors = result.errors
-    left_out = int((~errors.use).any(axis=1).sum())
+    left_out = int((~errors.is_inlier).any(axis=1).sum())
     data = (
         f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions show both "
         f"markers; {left_out} of them are outliers"
     )
     parts = [_wrapped(data), _verdict(result)]
     judged = [(result.evidence, "on positions left out of the fit")]
-    if result.test is not None:
-        judged.append((result.test, f"on {result.test_name}"))
+    if result.test_evidence is not None:
+        judged.append((result.test_evidence, f"on {result.test_name}"))
     for found, where in judged:
         rms = {LABELS[name]: _scaled(*found.rms(name)) for name in found.squares}
         gains = {
@@ -189,15 +189,18 @@ def report_text(result: FitResult) -> str:
 
 
 def _verdict(result: FitResult) -> str:
-    """The weights to fly with, and why, in a line for each axis."""
-    if not any(result.proven):
+    if not any(result.is_proven_better):
         return _wrapped(
             "not recommended: on no axis do these weights beat the better single marker beyond "
             "the 95 % interval; take more positions, or fly merge.method: joint"
         )
     lines = [f"recommended weights of the large marker ({LABELS[result.method]})"]
     for axis, name, proven, weight in zip(
-        AXES, result.better, result.proven, result.recommended, strict=True
+        AXES,
+        result.better_markers,
+        result.is_proven_better,
+        result.recommended_weights,
+        strict=True,
     ):
         why = (
             f"beats the {name} marker alone beyond the 95 % interval"

@@ -29,7 +29,7 @@ _STREAM = 611
 
 @dataclass(frozen=True, eq=False)
 class CameraPlace:
-    """A camera place; `actual` (4,): the target relative to the gear in the level frame."""
+    """A camera place; `actual` (x, y, z, yaw): target relative to the gear in the level frame."""
 
     T_world_cam: Array
     actual: Array
@@ -52,7 +52,8 @@ class SimulatedStand:
         self._corners = square_corners(profile.target.large.side_m)
 
     def fill_session(self, session: SessionFile, frames: int, advance: Callable[[], None]) -> None:
-        """Add the missing positions; call `advance` on each frame. Raises InvalidValue."""
+        """Add the missing positions, each of `frames` frames; call `advance` on each frame. Raises
+        InvalidValue."""
         while session.done < self._positions:
             position = session.next_position
             place, readings = self.place(position), []
@@ -89,7 +90,7 @@ class SimulatedStand:
         )
 
     def frames(self, position: int, place: CameraPlace, count: int) -> Iterator[Frame]:
-        """Yield the pictures of a place."""
+        """Yield `count` pictures of a place; `position` is its number."""
         for k in range(count):
             index = position * 100_000 + k
             image = self._renderer.render([place.T_world_cam], frame_index=index)

@@ -14,7 +14,7 @@ from PIL import Image
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import FlightAnalysis, write_film
-from perchctl.analysis.film import LAST_S, side_view
+from perchctl.analysis.film import LAST_S, side_path_and_target_height
 from perchctl.errors import InvalidValue
 from perchctl.flight import fly_lockstep
 from perchctl.record import LogWatcher, read_log, recorded_pictures
@@ -64,7 +64,7 @@ def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
 
 def test_the_gear_of_a_vehicle_that_hangs_is_at_the_target(flown: Path) -> None:
     log = read_log(flown)
-    place_m, target_z_m = side_view(FlightAnalysis(log))
+    place_m, target_z_m = side_path_and_target_height(FlightAnalysis(log))
     gear_m = log.flown_profile.vehicle.gear_body_m[2]
     assert place_m[-1] == pytest.approx((0.0, target_z_m - gear_m), abs=0.03)
     assert place_m[0, 1] == pytest.approx(0.0, abs=0.05)

@@ -75,8 +75,8 @@ def test_data_astride_the_seam_give_the_weights_of_data_turned_by_90_degrees() -
 def test_outliers_are_left_out_and_counted() -> None:
     clean, spoilt = independent(7), independent(7)
     spoilt.large[::97, 2] += 0.05
-    assert fit.marker_errors(clean).use.all()
-    out = ~fit.marker_errors(spoilt).use
+    assert fit.marker_errors(clean).is_inlier.all()
+    out = ~fit.marker_errors(spoilt).is_inlier
     assert out.sum(axis=0).tolist() == [0, 0, len(spoilt.large[::97]), 0]
     assert abs(fitted(spoilt)[2] - fitted(clean)[2]) < 0.01
 
@@ -88,7 +88,7 @@ def test_a_constant_offset_moves_no_weight() -> None:
 
 
 def judged(errors: fit.MarkerErrors) -> tuple[dict[str, fit.FittedWeights], fit.Evidence]:
-    fits = fit.fit_all(errors)
+    fits = fit.fit_by_each_method(errors)
     return fits, fit.evaluate_weights(
         errors, {name: each.fold_weights for name, each in fits.items()}
     )
@@ -102,16 +102,16 @@ def test_evidence_holds_whole_positions_out() -> None:
     apart = (data.large - data.actual)[rest], (data.small - data.actual)[rest]
     others = measured(data.position[rest], data.actual[rest], *apart)
     assert np.abs(fits["closed_form"].fold_weights[0] - fitted(others)).max() < 1e-9
-    assert found.better.tolist()[0] == 0  # x: the large marker is twice as good
-    assert found.better.tolist()[2:] == [1, 1]
-    assert all(found.proven(name).all() for name in fit.FITTED)
+    assert found.better_marker.tolist()[0] == 0  # x: the large marker is twice as good
+    assert found.better_marker.tolist()[2:] == [1, 1]
+    assert all(found.is_proven_better(name).all() for name in fit.FITTED)
     gain, half = found.rms_gain("closed_form", found.squares["paper"])
     assert (np.abs(gain) + half > 0.0).all()
 
 
 def test_a_useless_marker_leaves_nothing_to_prove() -> None:
     _, found = judged(fit.marker_errors(independent(11, small=(0.5, 0.5, 0.5, 0.5))))
-    assert not found.proven("closed_form").any()
+    assert not found.is_proven_better("closed_form").any()
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
@@ -121,7 +121,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         errors = fit.marker_errors(independent(seed, per=30))
         fits, found = judged(errors)
         closed = fits["closed_form"]
-        inside += (np.abs(closed.raw - [0.8, 0.5, 0.2, 0.2]) < closed.half_width).tolist()
+        inside += (np.abs(closed.raw_weights - [0.8, 0.5, 0.2, 0.2]) < closed.half_width).tolist()
         rms, half = found.rms("large")
         inside += (np.abs(rms - [1e-3, 1e-3, 2e-3, 0.02]) < half).tolist()
     assert 0.88 < np.mean(inside) < 0.995
