@@ -42,7 +42,7 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
 def is_combed(image: Grey) -> bool:
-    """True if a picture (h, w) is woven of two fields: adjacent rows differ more than a field's."""
+    """True if a picture (h, w) is woven: adjacent rows differ more than one field's rows."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False
@@ -65,14 +65,14 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """A combed picture's top and bottom field, each (h, w), or else just the picture."""
+    """The top and bottom field, each (h, w), of a combed picture; of others the picture alone."""
     if not is_combed(image):
         return (image,)
     return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
 def interpolate_field(image: Grey, first_row: int) -> Grey:
-    """The field that begins at `first_row`, with its missing rows interpolated."""
+    """The field whose first row is `first_row` (0 or 1), at full height by interpolation."""
     own = image[first_row::2]
     # Row k of the result lies between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
@@ -86,19 +86,19 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """An edge's standard deviation along an interpolated field's rows, given its blur."""
+    """Standard deviation, px, of an edge along interpolated rows, given the edge's blur."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
 def classify_fields(frame: Frame) -> Frame:
-    """The frame with `fields` set to ``woven`` or ``whole``, unless it is set."""
+    """The frame with `fields` set to ``woven`` or ``whole``, if it was None."""
     if frame.fields is not None:
         return frame
     return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
 def field_frames(frame: Frame) -> tuple[Frame, Frame]:
-    """The top and the bottom field, both at the frame's time."""
+    """The top and the bottom field of a woven frame, both with the frame's time."""
     return (
         replace(frame, image=interpolate_field(frame.image, 0), fields="top", encoded=None),
         replace(frame, image=interpolate_field(frame.image, 1), fields="bottom", encoded=None),
@@ -106,8 +106,8 @@ def field_frames(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """The new state, and the pictures of a stream's frame in time order: one, or two fields
-    half a period apart around the frame's time.
+    """The new state, and the pictures of a stream's frame in time order: the frame, or its two
+    fields half a period apart around the frame's time.
 
     In a stream without fields so far, only every third frame is examined.
     """
@@ -144,7 +144,6 @@ def _period_s(periods_s: tuple[float, ...]) -> float:
 
 
 def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
-    """The frames' periods, with the time since the last frame."""
     if state.last_s is not None:
         gap_s = frame.t_s - state.last_s
         if _ANY_PERIOD_S[0] < gap_s < _ANY_PERIOD_S[1]:

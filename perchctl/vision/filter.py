@@ -51,7 +51,7 @@ _HEADING_RADPS2 = 0.1  # of the state estimate's heading
 @dataclass(frozen=True)
 class ProcessNoise:
     """Standard deviations of accelerations: of a tracked target along each axis, of its heading,
-    of the frame's rotation about level axes. `is_drifting`: the frame is the drifting world."""
+    of the level frame's rotation (`turn_radps2`). `is_drifting`: the tracks' frame is the world."""
 
     acceleration_mps2: float
     heading_radps2: float
@@ -60,7 +60,7 @@ class ProcessNoise:
 
     @cached_property
     def rate_variance(self) -> Array:
-        """Variance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
+        """Covariance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
         push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
         return np.diag(push * push) * _PUSH_S
 
@@ -68,8 +68,8 @@ class ProcessNoise:
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
     """R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2) in SI;
-    P0 (8, 8) is the covariance after the first measurement. If `process` is not None, it replaces
-    Q, and each pose's own covariance replaces R.
+    P0 (8, 8) is the covariance after the first measurement; `alpha`, `n_max`: as in the profile.
+    If `process` is not None, it replaces Q, and each pose's own covariance replaces R.
     """
 
     R: Array
@@ -84,8 +84,8 @@ class FilterSetup:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """z = (yaw, x, y, z) of a target, (4,); R (4, 4), None for the setup's; and `bias` (4, 4),
-    by how much one standard deviation of each constant error moves z."""
+    """z = (yaw, x, y, z) of a target, (4,); R (4, 4), its covariance, None: the setup's R; and
+    `bias` (4, 4), the shift of z by one standard deviation of each constant error, or None."""
 
     z: Array
     R: Array | None = None
@@ -93,7 +93,7 @@ class Measurement:
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
-    """The filter's constants. The velocity's first sigma is 5 cm/s in the world, and in the
+    """The filter's constants. The velocity's initial sigma is 5 cm/s in the world, and in the
     level frame 30 cm/s, or 1 m/s with measured noise."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
@@ -119,9 +119,9 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     )
 
 
-def tilt_jacobian(way_m: Array) -> Array:
-    """The Jacobian (3, 2), m/rad, of a vector `way_m` (3,) rotated about level x and y."""
-    x, y, z = way_m
+def tilt_jacobian(vector_m: Array) -> Array:
+    """Derivative (3, 2), m/rad, of `vector_m` (3,) by rotations about level x and y."""
+    x, y, z = vector_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
@@ -131,7 +131,7 @@ def transition_matrix(dt_s: float) -> Array:
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """The process noise Q (8, 8) over `dt_s` of a target at `position_m` (3,)."""
+    """The process noise Q (8, 8) over `dt_s` for a target at `position_m` (3,) in its frame."""
     noise = setup.process
     if noise is None:
         return setup.Q
@@ -158,7 +158,7 @@ def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
 
 
 def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """A track at its first measurement."""
+    """A track that begins with the measurement, at `t_s`."""
     x = np.zeros(8)
     x[MEASURED] = measured.z
     x[YAW] = wrap_rad(float(measured.z[0]))
@@ -230,13 +230,13 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 
 
 def predict_track(
-    track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
+    track: MarkerTrack, t_s: float, setup: FilterSetup, with_cov: bool = True
 ) -> MarkerTrack:
-    """The track predicted to `t_s`; its covariance is predicted only with `spread`."""
+    """The track predicted to `t_s`; without `with_cov` the covariance stays as it is."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
-    if spread:
+    if with_cov:
         return _moved(track, track.x, dt_s, t_s, track.unseen, setup)
     x = transition_matrix(dt_s).dot(_drifting(track.x, setup))
     x[YAW] = wrap_rad(float(x[YAW]))

@@ -20,8 +20,8 @@ _ZERO = np.zeros(3)
 def undistort(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
 
-    A point that the lens model cannot have imaged comes back as NaN or far out, never as an
-    exception.
+    A point that the lens model cannot have imaged becomes NaN or lies far outside; no exception
+    is raised.
     """
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
     if len(points) == 0:
@@ -54,14 +54,13 @@ def distort(normalised: Array, camera: CameraModel) -> Array:
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """The pixels (n, 2) of points (n, 3) in a frame of pose rvec, tvec in the camera."""
+    """The pixels (n, 2) of points (n, 3) in a frame whose pose in the camera is (rvec, tvec)."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _projected(points, rvec, tvec, camera)
 
 
 def _projected(points: Array, rvec: Array, tvec: Array, camera: CameraModel) -> Array:
-    """Project points (n, 1, 3), as `project` does."""
     if len(points) == 0:
         return np.empty((0, 2))
     call = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints

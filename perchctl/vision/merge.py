@@ -35,7 +35,7 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
     """The target in the tracks' frame: `vector` (x, y, z, yaw), velocity (3,), covariance (3, 3) of
-    the position and variance of the yaw.
+    the position, variance of the yaw, frames `unseen` and the newest frame's stage.
 
     `bias_m` (3, 4): shift of the position by one standard deviation of each constant error."""
 
@@ -152,7 +152,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
     """The markers with their corners moved to the frame's time.
 
     If `setup.readout_s` is None, the corners stay, and `common_px` is their shift by a likely
-    read-out time; otherwise `common_px` and the spread hold the shift's error."""
+    read-out time; otherwise `common_px`, `sigma_px` and `cov_px2` hold the shift's error."""
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
@@ -189,14 +189,14 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
 
 
 def detected_stage(large: bool, small: bool) -> Stage:
-    """The stage in which just these markers are detected."""
+    """The stage of a frame, by whether its large and its small marker were detected."""
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
 
 
 def weight_matrix(weights: WeightsConfig) -> Array:
-    """Return W of equation 9, (4, 8), for the vector of equation 7."""
+    """Return the weights W (4, 8) of equation 9; columns: x, y, z, yaw, each of large, small."""
     W = np.zeros((4, 8))
     for row, w in enumerate((weights.x, weights.y, weights.z, weights.yaw)):
         W[row, 2 * row : 2 * row + 2] = w, 1.0 - w
@@ -212,7 +212,7 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 
 def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
-    """True if the markers are farther apart than the limit and than four standard
+    """True if the markers are farther apart than `limit_m` and than four standard
     deviations, in any axis. The print's errors move both alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
@@ -221,6 +221,6 @@ def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bo
 
 
 def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """The pose whose position has the smaller spread."""
+    """The pose whose position has the smaller standard deviation."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

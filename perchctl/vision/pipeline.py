@@ -123,8 +123,8 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
-    """The new state, and the pictures of a frame, each for its own `step`: one, or the two
-    fields of an interlaced camera in time order."""
+    """The new state, and the frames to give to `step` one by one: the frame itself, or its two
+    fields in time order if the camera is interlaced."""
     fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
@@ -157,8 +157,8 @@ def step_detections(
     near: PoseCandidate | None = None,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` after detection; `near` is the target's expected pose, `fields` the
-    picture's kind."""
+    """Run the part of `step` after detection; `near` is the target's expected pose, `fields`
+    the picture's kind."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
     measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
@@ -215,7 +215,7 @@ def estimate(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> TargetEstimate | None:
-    """The target at a moment after the newest frame, for the vehicle's attitude of then.
+    """The target at `t_s`, after the newest frame, for the vehicle's attitude at `t_s`.
 
     A tracked target is predicted by its filter and carried on by the vehicle's motion. A target no
     longer tracked stays at its last place in the world. None before the first measurement. Without
@@ -257,7 +257,6 @@ def _at_frame(
     in_world: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    """The target at the newest frame's time; None without a track."""
     fed, tracks = followed.measured.fed, followed.tracks
     merged = merge_tracks(tracks, fed, pipeline.merge.weights)
     if merged is None:
@@ -284,7 +283,6 @@ def _placed(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> dict[str, Any]:
-    """The fields of a `TargetEstimate` for merged tracks, the vehicle at `attitude`."""
     place_m, yaw_rad = merged.vector[:3], float(merged.vector[3])
     cov_m2, bias_m = merged.cov_m2, merged.bias_m
     seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}

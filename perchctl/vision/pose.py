@@ -33,7 +33,7 @@ _Source = Literal["large", "small", "joint"]
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
     """The constants of pose estimation: `T_body_cam` (4, 4), the camera's mounting, `gear_body_m`
-    (3,), the gear's tip, and `readout_s`, from a picture's first row to its last (None:
+    (3,), the gear's tip, and `readout_s`, the time from a picture's first row to its last (None:
     unknown)."""
 
     config: PoseConfig
@@ -45,19 +45,19 @@ class PoseSetup:
 
     @cached_property
     def corners_m(self) -> dict[_Source, Array]:
-        """Corners (4, 3) of each marker in its own axes; ``joint`` (8, 3): both, large first."""
+        """Corners (4, 3) of each marker in its own axes; ``joint`` (8, 3): large, then small."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
     def curl_lift_m(self) -> dict[_Source, Array]:
-        """Distances, m, of the corners of `corners_m` from the plane of a curled sheet."""
+        """Distances of `curl_lift`, (8, 2), ``joint`` (16, 2), for each entry of `corners_m`."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
 
 def square_corners(side_m: float) -> Array:
-    """The corners TL TR BR BL of a marker in its own axes, (4, 3)."""
+    """The corners TL TR BR BL of a marker in its own axes, (4, 3) m; z is 0."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
@@ -78,8 +78,9 @@ def estimate_pose(
     """The pose from one marker's corners, or from both markers' corners at once.
 
     `start`, the same frame's joint pose, is refined on these corners instead of solving anew, as
-    its tilt is already decided. None if the corners give no pose: no finite solution in front of
-    the camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
+    its tilt is already decided. Without an attitude `previous_normal_cam` (3,) decides the tilt.
+    None if the corners give no pose: no finite solution in front of the camera, or a reprojection
+    error (RMS over the corners) above `pose.max_reprojection_px`.
     """
     source: _Source = "joint" if len(detections) > 1 else detections[0].marker
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
@@ -129,7 +130,6 @@ def _level_pose(
     R_level_body: Array,
     setup: PoseSetup,
 ) -> MarkerPose:
-    """The solution relative to the gear in the level frame."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
@@ -200,7 +200,7 @@ _SMALL_MOVE_PX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidate:
-    """rvec (3,) rad and tvec (3,) m of the marker in the camera."""
+    """A possible pose of the marker in the camera: rvec (3,) rad and tvec (3,) m."""
 
     rvec: Array
     tvec: Array
@@ -208,27 +208,27 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose(PoseCandidate):
-    """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6)."""
+    """A candidate, its reprojection errors (n, 2) and their Jacobian (2n, 6) by rvec, tvec."""
 
     error_px: Array
     jacobian: Array
 
     @property
     def rms_px(self) -> float:
-        """The root of the mean square of the corners' errors."""
+        """The root mean square distance of projected from measured corners."""
         flat = self.error_px.ravel()
         return math.sqrt(float(flat.dot(flat)) / len(self.error_px))
 
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """Expected normal (3,) of the marker, camera axes, None if unknown, and its tolerance."""
+    """Expected normal (3,) of the marker, camera axes, None if unknown, and its angle's sigma."""
 
     normal_cam: Array | None
     spread_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
-        """True if the known normal and the candidate's differ by more than the spread."""
+        """True if the candidate's normal and a known `normal_cam` differ by over `spread_rad`."""
         return (
             self.normal_cam is not None
             and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
@@ -249,8 +249,8 @@ def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
 
 
 def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine a nearby pose by Gauss-Newton, each corner weighted by its spread; None if that
-    fails."""
+    """Refine a nearby pose by Gauss-Newton, each corner weighted by its spread; None if the
+    steps do not converge."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -326,7 +326,7 @@ def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
 
 
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
-    """The angle between the marker's normal and the expected one."""
+    """The angle between a marker's normal, at rotation `rvec`, and the normal `expected_cam`."""
     normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
@@ -399,15 +399,15 @@ def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPri
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
     """The distances of corners (n, 3) from the sheet's plane, at one standard deviation of
-    each kind of curl: the whole rim to one side, or two corners to either.
-    (2n, 2) m, for x and y of each corner."""
+    each kind of curl: the whole rim to one side, or two corners to each
+    side: (2n, 2) m, a corner's row given twice, for its x and y."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def curl_weight(curl: Array) -> Array:
-    """Return ``(I + curl curl^T)^-1`` (2n, 2n), the weights of corner errors; curl (2n, k)."""
+    """Return ``(I + curl curl^T)^-1`` (2n, 2n), weights of errors; curl (2n, k): curls' errors."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
@@ -437,7 +437,7 @@ class WeightedCorners:
     sigma_px (n,). whitening (2n, 2n) makes errors independent and of unit spread; shift (2n, k)
     holds one whitened standard deviation of each common error: the shift of all edges, the
     detections' `common_px`, and the shake of a detection's rows. `curl_lift_m` (2n, 2) is
-    `curl_lift`'s result, and `curled` tells if the curl changes the corners' weights."""
+    `curl_lift`'s result, and `curled` is True if the curl changes the corners' weights."""
 
     object_m: Array
     image_px: Array
@@ -456,7 +456,7 @@ def weigh_corners(
     K: Array,
     lift: Array,
 ) -> WeightedCorners:
-    """The corners of one or both detections with their weights."""
+    """Weigh the detections' corners: `image_px` as of a pinhole K, `lift` as of `curl_lift`."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)

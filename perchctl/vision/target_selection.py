@@ -23,8 +23,8 @@ _SIGMA_PX = 1.0  # of corners as a search finds them
 
 @dataclass(frozen=True)
 class OwnTargetPlace:
-    """Place of the vehicle's own target in the world of the state estimate, None if unknown. A
-    target farther than `within_m` from there is another vehicle's."""
+    """Place (x, y) of the vehicle's own target in the world of the state estimate, None if unknown.
+    A target farther than `within_m` from this place is another vehicle's."""
 
     xy_m: tuple[float, float] | None = None
     within_m: float = math.inf
@@ -46,7 +46,7 @@ def marker_offset_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """A marker's distance from the own target's place (an `OwnOffset`), m."""
+    """`target_offset_m` of a marker by its corners (4, 2) px; infinite beyond `place.within_m`."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
@@ -57,7 +57,7 @@ def marker_offset_m(
 def target_offset_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """The distance of a target from the own target's place."""
+    """A target's horizontal distance from the own target's place, from the gear if unknown."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -67,7 +67,7 @@ def target_offset_m(
 def refusal_text(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Why a pose is another vehicle's target; None for the own target."""
+    """Message that a pose is another vehicle's target; None if it may be the own target."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = target_offset_m(pose, attitude, place, setup)
@@ -114,7 +114,7 @@ def track_measurement(
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """A pose as a measurement for the filter."""
+    """A pose as a measurement for the filter, in the world or the level frame."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:

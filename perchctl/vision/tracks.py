@@ -39,8 +39,8 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in the level and the world frame, whether a gate judges poses, and the
-    place of the vehicle's own target."""
+    """The constants of the filters in the level and the world frame and of the pose estimation,
+    whether a gate judges poses, and the place of the vehicle's own target."""
 
     level: FilterSetup
     world: FilterSetup
@@ -55,7 +55,8 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks after a frame; `measured.fed` is empty if the verdict rejects the pose."""
+    """The tracks, lock and rival after a frame, and the gate's verdict; `measured.fed` is empty if
+    the verdict rejects the frame's pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -151,14 +152,14 @@ class FramePose:
     pose: MarkerPose
     measured: Measurement
     in_world: bool
-    has_both: bool
+    has_both_markers: bool
     lock_in_view: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
-    restart at it, and if so for the same target.
+    restart at the pose, and whether they restart for the same target.
 
     `rival` is the rival track after this frame; `text` explains a rejection or a restart."""
 
@@ -173,7 +174,7 @@ class GateVerdict:
 def judge_pose(
     lock: Lock | None, rival: RivalTrack | None, sight: FramePose, constants: FilterSetup
 ) -> GateVerdict:
-    """The gate's verdict on a frame's pose."""
+    """The gate's verdict on a frame's pose `sight`, given the lock and the rival, if any."""
     lock, rival = drop_expired(lock, rival, sight.t_s)
     if rival is not None and rival.in_world != sight.in_world:
         rival = None
@@ -217,7 +218,7 @@ def drop_expired(
 def update_lock(
     lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
 ) -> Lock:
-    """The lock after an accepted pose, with the track that the pose updated."""
+    """The lock after the accepted pose `sight`, with the track that the pose updated."""
     anew = verdict.restarts and not verdict.same_target
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
@@ -225,7 +226,7 @@ def update_lock(
         pose=sight.pose,
         in_world=sight.in_world,
         frames=1 if before is None else before.frames + 1,
-        has_both=sight.has_both or (before is not None and before.has_both),
+        has_both_markers=sight.has_both_markers or (before is not None and before.has_both_markers),
     )
 
 
@@ -241,7 +242,6 @@ class _Fit:
 
     @cached_property
     def squared(self) -> float:
-        """The square of what is off, in units of its spread."""
         return float(self.off @ np.linalg.solve(self.S, self.off))
 
     @property
@@ -269,7 +269,7 @@ def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fi
 
 def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
     """True if what no pose claims explains all, as in most frames: a quick look."""
-    wanted = predict_track(track, sight.t_s, constants, spread=False)
+    wanted = predict_track(track, sight.t_s, constants, with_cov=False)
     off = sight.measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
     off /= _unclaimed(_range_m(sight))
@@ -308,11 +308,10 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
 def _watched(
     before: RivalTrack | None, sight: FramePose, fit: _Fit, constants: FilterSetup
 ) -> RivalTrack:
-    """The rival with one more pose, or a new one."""
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
         assert track is not None
-        whole = before.whole_frames + int(sight.has_both)
+        whole = before.whole_frames + int(sight.has_both_markers)
         return replace(before, track=track, frames=before.frames + 1, whole_frames=whole)
     turned_rad, farther_m = abs(float(fit.off[0])), float(fit.off[3])
     range_differs = farther_m**2 > _SAME_RANGE**2 * float(fit.S[3, 3])
@@ -327,19 +326,18 @@ def _watched(
         in_world=sight.in_world,
         since_s=sight.t_s,
         frames=1,
-        whole_frames=int(sight.has_both),
+        whole_frames=int(sight.has_both_markers),
         range_differs=range_differs,
         text=where,
     )
 
 
 def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
-    """True if the target is where the rival is now."""
     if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
         return True
-    if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both:
+    if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both_markers:
         return False
-    if not lock.has_both:
+    if not lock.has_both_markers:
         return True
     unseen_s = sight.t_s - max(rival.since_s, lock.track.t_s)
     # What is not looked at is not empty.
@@ -362,8 +360,8 @@ _FORGOTTEN = 0.1  # of what was learned, with each picture
 def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Both markers' expected corners, (4, 2) px, and their pose: the last sighting, moved by
-    the vehicle's motion.
+    """Both markers' expected corners, (4, 2) px, and the target's expected pose: the last
+    sighting, moved by the vehicle's motion.
 
     Without both attitudes: None and the unmoved pose; without a recent sighting: both None."""
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
@@ -412,7 +410,7 @@ def update_sighting(
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
-    """True if a place (3,) in the world lies in the picture."""
+    """True if a place (3,) in the world lies in the picture at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
     # Farther off the axis a lens model may fold back into the picture.

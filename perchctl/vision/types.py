@@ -56,7 +56,7 @@ class Frame:
 
     `image` is grey, uint8, shape (height, width).
 
-    `fields` says whether it is a picture of one moment: ``whole``; ``woven`` of two fields; a woven
+    `fields` is the picture's kind: ``whole``, of one moment; ``woven`` of two fields; a woven
     picture's ``top`` or ``bottom`` field at full height; None: not classified yet
     (`perchctl.vision.fields`). `repeated`: the source gave the previous picture again, which is no
     measurement. `encoded`: the source's JPEG, from which `cv2.imdecode(..., IMREAD_GRAYSCALE)`
@@ -120,7 +120,7 @@ class Detections:
     edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
-        """Return that marker's detection, None without one."""
+        """Return the marker's detection, None if it was not detected."""
         return self.large if marker == "large" else self.small
 
     @property
@@ -146,17 +146,17 @@ class Attitude:
 
     @cached_property
     def R_level_body(self) -> Array:
-        """The rotation by roll and pitch, (3, 3)."""
+        """The rotation (3, 3) from body to level axes, by roll and pitch."""
         return rotation_from_rpy(self.roll_rad, self.pitch_rad, 0.0)
 
     @cached_property
     def R_world_level(self) -> Array:
-        """The rotation by the heading, (3, 3)."""
+        """The rotation (3, 3) from level to world axes, by the heading."""
         return rot_z(self.yaw_rad)
 
     @cached_property
     def R_world_body(self) -> Array:
-        """The whole rotation, (3, 3)."""
+        """The rotation (3, 3) from body to world axes."""
         return self.R_world_level @ self.R_level_body
 
 
@@ -211,7 +211,7 @@ class MarkerTrack:
 
     @property
     def cov(self) -> Array:
-        """Covariance of the state with the constant errors, (8, 8)."""
+        """Covariance (8, 8) of the state, the constant errors included."""
         return self.P + self.bias @ self.bias.T
 
 
@@ -271,20 +271,20 @@ class Sighting:
 @dataclass(frozen=True, eq=False)
 class Lock:
     """The target that the pipeline is locked on: its last track and pose, in the world or the level
-    frame, the number of `frames` with a pose, and whether one had both markers."""
+    frame, the number of `frames` with a pose, and whether any pose rested on both markers."""
 
     track: MarkerTrack
     pose: MarkerPose
     in_world: bool
     frames: int
-    has_both: bool
+    has_both_markers: bool
 
 
 @dataclass(frozen=True, eq=False)
 class RivalTrack:
     """A track of something that looks like the target, but at a place where the target cannot be
-    (`text`): its first time, numbers of its frames and of those with both markers, and whether its
-    range differs from the target's."""
+    (`text`): its first time, numbers of its frames and of frames with both markers, and whether
+    its range differs from the target's."""
 
     track: MarkerTrack
     in_world: bool
@@ -298,7 +298,7 @@ class RivalTrack:
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
     """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order; `fed`, by
-    the track's name, those that update a track; and whether the two markers contradict."""
+    the track's name, the poses that update a track; and whether the two markers contradict."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     fed: dict[str, MarkerPose] = field(default_factory=dict)

@@ -125,7 +125,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     )
     constants = make_filter(KalmanConfig(), in_world=True)
     rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
-    lock = Lock(track=track, pose=pose, in_world=True, frames=9, has_both=True)
+    lock = Lock(track=track, pose=pose, in_world=True, frames=9, has_both_markers=True)
     if _is_clear(track, sight, constants):
         assert judge_pose(lock, rival, sight, constants).accepted
 

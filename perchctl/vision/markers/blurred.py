@@ -43,7 +43,7 @@ _SHEET = 1.3  # half sides of a marker that are surely paper
 def find_expected_blurred(
     picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
-    """The first marker found near its `expected` corners (4, 2) px; empty if none.
+    """The first marker found near its `expected` corners (4, 2) px; empty if none is found.
 
     An even or odd `turn` chooses fits that start with little or with much blur; None: both."""
     image, patterns = picture.image, picture.setup.patterns
@@ -170,8 +170,8 @@ def align_marker(
     """The marker fitted by its drawing; None unless the picture looks like the drawing.
 
     `reach` is the allowed distance of the corners from `start_px`, and `max_sigma` their
-    largest spread, both in sides. If `alone`, the codeword must be distinctive; otherwise the
-    other marker identifies it.
+    largest spread, both in side lengths; `blur_px` is a first guess. If `alone`, the codeword
+    must be distinctive; otherwise the other marker identifies it.
     """
     side_px = mean_side_px(start_px)
     if not side_px >= LEAST_SIDE_PX:
@@ -204,7 +204,7 @@ def align_marker(
 
 def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
     """True if the picture looks like the drawing. Without the marker the pattern's
-    correlation stays below 0.72 at the right strength; on it, it is above 0.95."""
+    correlation stays below 0.72 at the right strength; with the marker it is above 0.95."""
     return (
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS

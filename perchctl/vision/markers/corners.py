@@ -32,13 +32,13 @@ _INCREMENTS: Array = np.array(
 
 
 def homography_from_unit(corners: Array) -> Array:
-    """The homography (3, 3) of the unit square to corners (4, 2)."""
+    """The homography (3, 3) from the square of -1 to 1 to corners (4, 2)."""
     H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def homography_to_unit(corners: Array) -> Array:
-    """The homography (3, 3) of corners (4, 2) to the unit square."""
+    """The homography (3, 3) from corners (4, 2) to the square of -1 to 1."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
     return np.asarray(H, dtype=np.float64)
 
@@ -66,7 +66,7 @@ def increment_homography(H: Array, p: Array) -> Array:
 
 
 def side_lengths_px(corners_px: Array) -> Array:
-    """The lengths of the four sides, (..., 4)."""
+    """The lengths (..., 4) of the sides of squares with corners (..., 4, 2)."""
     d = corners_px.take(NEXT, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
@@ -83,12 +83,12 @@ def doubled_area(corners: Array) -> Array:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
-    """True if all corners (4, 2) are at least `room_px` inside the picture's edges."""
+def within(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
+    """True if all corners (4, 2) are at least `margin_px` inside the edges of a picture (h, w)."""
     h, w = shape[:2]
-    right, low = w - 1 - room_px, h - 1 - room_px
+    right, low = w - 1 - margin_px, h - 1 - margin_px
     # False for NaN.
-    return all(room_px <= x <= right and room_px <= y <= low for x, y in corners_px.tolist())
+    return all(margin_px <= x <= right and margin_px <= y <= low for x, y in corners_px.tolist())
 
 
 def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
@@ -102,7 +102,7 @@ def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = N
 def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Both markers' corners; a missing marker is derived from the other one."""
+    """Both markers' corners; a missing marker is derived from the other marker by their `ratio`."""
     both = dict(expected)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], ratio, camera)
@@ -122,8 +122,8 @@ NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothi
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """A marker's corners as they were refined; spreads and covariance as of a `Detection`, blurs in
-    px. `edge_shift` is the correction that was applied."""
+    """A marker's corners as they were refined; spreads and covariance as of a `Detection`; largest
+    and least blur of a side, px; `edge_shift` is the correction that was applied."""
 
     corners_px: Array
     sigma_px: float
@@ -137,7 +137,7 @@ class RefinedCorners:
 
 
 def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """The corners (4, 2) by `cv2.cornerSubPix`, or the raw ones."""
+    """Corners (4, 2) by `cv2.cornerSubPix`, or raw if that diverges; `cells`: a side's cells."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)

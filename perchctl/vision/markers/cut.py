@@ -158,7 +158,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
 
 
 def _trusted(found: PoseFit) -> bool:
-    """True if nearly all edges are there, and tell enough of the place."""
+    """True if nearly all edges are there and fix the place."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.points_shown >= _MIN_SHOWN * found.points_in_view
@@ -267,7 +267,7 @@ def make_lattice(camera: CameraModel) -> Lattice:
 def make_overview(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """The reduced picture at the lattice's nodes, seen where `mask` (image shape) is 0."""
+    """The reduced picture at the lattice's nodes; nodes where `mask` (h, w) is set are not seen."""
     lattice = make_lattice(camera)
     seen = lattice.inside
     if mask is not None:
@@ -288,7 +288,7 @@ def _coarse(fine: Grey) -> Grey:
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """The whiteness of the drawing projected by H (3, 3), at nodes and `margin` around."""
+    """Whiteness of the drawing projected by H (3, 3), at the nodes and `margin` nodes around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -310,7 +310,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
 
 
 def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """The correlation with the drawing projected by H, and its gain in grey levels."""
+    """The view's correlation with the drawing projected by H (3, 3), and contrast in greys."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -355,7 +355,7 @@ Texture = tuple[NDArray[np.float32], Array]
 
 @lru_cache(maxsize=8)
 def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
-    """The edges of both markers; tolerances are in cells."""
+    """The edges of both markers; tolerances are print errors of an edge's position, in cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -382,7 +382,7 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
 
 @lru_cache(maxsize=8)
 def make_texture(drawing: Drawing) -> Texture:
-    """A picture of the drawing up to `PAPER`, and the map (3, 3) to its columns and rows."""
+    """A picture of the drawing up to `PAPER`, and the homography (3, 3) to its pixels."""
     axis = make_grid(_TEXELS, PAPER).axis
     wide = render_cells(drawing, axis, PAPER / _TEXELS)
     more = (len(wide) - _TEXELS) // 2
@@ -433,7 +433,7 @@ _PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT
 
 @dataclass(frozen=True, eq=False)
 class RigidPose:
-    """R (3, 3) and t (3,) of the drawing in the camera."""
+    """Rotation R (3, 3) and translation t (3,), large half sides, of the drawing in the camera."""
 
     R: Array
     t: Array
@@ -509,7 +509,7 @@ def fit_pose(
 
 
 def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """The result that `fit_pose` would have for a perfect picture at that pose."""
+    """The result of `fit_pose` for a perfect picture at that pose; None if too little is seen."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -526,7 +526,6 @@ def _in_view(
     camera: CameraModel,
     mask: NDArray[np.uint8] | None,
 ) -> _Places:
-    """The places at which a whole profile is in view."""
     h, w = shape[:2]
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05

@@ -165,7 +165,6 @@ def _followed(
 
 
 def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array]) -> bool:
-    """True if a marker that should be found was not verified."""
     return any(
         name not in seen
         and within(corners, picture.image.shape)
@@ -231,7 +230,7 @@ _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """The last corners (4, 2) px, extrapolated to `t_s` by their flow."""
+    """The corners (4, 2) px in `previous`, extrapolated to `t_s` by their flow; may be empty."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -244,7 +243,7 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
 
 
 def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
-    """Return `now` with the velocity of its markers, px/s, since `previous`."""
+    """Return `now` with the image velocity, px/s, of its markers' corners since `previous`."""
     if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
         return now
     flow: dict[MarkerName, Array] = {}
@@ -273,14 +272,14 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """True if the line fits are accurate enough without a photometric fit."""
+    """True if a marker's line fits are accurate enough without a photometric fit."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
-    """The `seen` markers with better corners, and any other visible marker. A marker found
-    by a search alone is dropped unless its lines suffice or the drawing confirms it."""
+    """The `seen` markers with better corners, and any other visible marker. If
+    `searched`, a lone marker is dropped unless its lines suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = large_around(picture, better["small"])
@@ -311,7 +310,6 @@ def _blur_px(seen: RefinedCorners | None) -> float:
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
-    """The corners (4, 2) px from which to align the drawing, if any."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
@@ -335,7 +333,7 @@ _ANCHOR = 0.12  # of the small marker's side
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """Return those markers near the corners `places` (4, 2) px whose sides are straight edges."""
+    """Return the markers near corners `places` (4, 2) px whose sides are straight edges."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -391,14 +389,13 @@ def add_partly_visible(
 
 def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
     """The large marker around a detected small one; the large one may be partly covered or
-    cut off."""
+    cut off. None if the picture does not confirm it."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.other_corners(small.corners_px, "large")
     if not np.isfinite(start).all():
         return None
 
     def is_centred(large: RefinedCorners) -> bool:
-        """True if the small marker is where the large one has it."""
         centre = picture.other_corners(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
@@ -423,21 +420,21 @@ def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | No
 _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
-def mean_of_fields(a: Detections, b: Detections) -> Detections:
+def mean_of_fields(first: Detections, second: Detections) -> Detections:
     """The mean of both fields' corners, valid for either order of the fields. If one marker
     is in both fields, a marker in only one field is left out."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
-        one, other = a.get(name), b.get(name)
+        one, other = first.get(name), second.get(name)
         if one is None or other is None:
             continue
         way_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
         if float(np.linalg.norm(way_px)) < _MOST_SIDES * mean_side_px(one.corners_px):
             both[name] = _middle(one, other)
     if not both:
-        alone = a if a.markers else b
-        return replace(alone, mirrored=alone.mirrored or b.mirrored)
-    return replace(a, large=both.get("large"), small=both.get("small"), mirrored=False)
+        alone = first if first.markers else second
+        return replace(alone, mirrored=alone.mirrored or second.mirrored)
+    return replace(first, large=both.get("large"), small=both.get("small"), mirrored=False)
 
 
 def _middle(a: Detection, b: Detection) -> Detection:

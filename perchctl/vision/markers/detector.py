@@ -39,7 +39,7 @@ class DetectorSetup:
     """Constants of `detect_markers`, made by `make_aruco_detector`.
 
     `dictionaries` are the large and the small marker's; `ratio` is the small side over the large
-    one, `mask` the pixels covered by the vehicle. Without `fits_lines` markers are neither fitted
+    side, `mask` the pixels covered by the vehicle. Without `fits_lines` markers are neither fitted
     nor tracked by fits."""
 
     dictionaries: tuple[Any, Any]
@@ -79,7 +79,7 @@ def make_aruco_detector(
 def make_marker_decoder(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
-    """Return OpenCV's marker detector for pictures of that size."""
+    """Return OpenCV's marker detector for pictures of that size, (width, height)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
     parameters.minDistanceToBorder = 0
@@ -109,7 +109,6 @@ def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
 
 
 def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
-    """A dictionary of the marker and perhaps its mirror image."""
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
     distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
     if distance > 2 * correction_bits + 1:

@@ -63,18 +63,17 @@ def profile_places(lengths_px: Array) -> Array:
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
 
-def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Where the profiles cross the sides, in the picture, and the unit normals there, to the
+def side_profiles(
+    starts: Array, ends: Array, shares: Array, camera: CameraModel
+) -> tuple[Array, Array]:
+    """The points where profiles cross the sides, px, and the unit normals there, to the
     left of the way from start to end as the picture is seen (outwards for a marker whose corners
     run clockwise): each (rows, n, 2).
 
+    `starts`, `ends` (rows, 2): the sides' ends, normalised; `shares` (rows, n): `profile_places`.
     A side's image through the lens is smooth: a few nodes define all of it.
-
-    Args:
-        starts, ends: of the sides in normalised coordinates, (rows, 2).
-        s: places of the profiles along them, (rows, n), as of `profile_places`.
     """
-    first, last = s[:, :1], s[:, -1:]
+    first, last = shares[:, :1], shares[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODES)[..., None]
     points = starts[:, None] + at * (ends - starts)[:, None]
     nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
@@ -335,7 +334,6 @@ def _outwards(markers: Sides, lines: Array) -> Array:
 def _accepted(
     markers: Sides, sides: EdgeData, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
-    """Which of the m markers have lines for sides, as expected."""
     inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
@@ -413,7 +411,7 @@ class EdgeData:
 
 
 def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Sides | None:
-    """The sides of markers for measuring; None if one is not a quadrilateral."""
+    """The sides of markers with corners (m, 4, 2); None if any marker is not a quadrilateral."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -479,27 +477,29 @@ def measure_edges(
 
 
 def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """The half lengths of the windows around the edges and of the profiles, px."""
+    """The half lengths, px, of the windows around edges and of the profiles, for a cell's size."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
-def neighbour_edges(s: Array, rims: Sequence[Rim], inner: Rim, depth_px: Array) -> NeighbourEdges:
-    """The neighbours of edges at places `s` (rows, n): four rows a rim, then four of the
-    inner edges of the border of rim `inner` if `s` has them."""
-    inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
-    possible = np.ones(s.shape, np.bool_)
+def neighbour_edges(
+    shares: Array, rims: Sequence[Rim], inner_rim: Rim, cell_depth_px: Array
+) -> NeighbourEdges:
+    """Neighbours of the edges at `shares` (rows, n) of sides: four rows a rim, then, if given, four
+    of the inner edges of `inner_rim`'s border. `cell_depth_px` (rows,): cells' sizes across."""
+    inside, outside = np.zeros(shares.shape, np.float32), np.zeros(shares.shape, np.float32)
+    possible = np.ones(shares.shape, np.bool_)
     for i, rim in enumerate(rims):
         four = slice(4 * i, 4 * i + 4)
-        inside[four] = rim.white[_SIDES, (s[four] * rim.cells).astype(np.intp)]
-    if len(s) > 4 * len(rims):
-        at = 1.0 + s[-4:] * (inner.cells - 2)  # in cells from the border's corner
+        inside[four] = rim.white[_SIDES, (shares[four] * rim.cells).astype(np.intp)]
+    if len(shares) > 4 * len(rims):
+        at = 1.0 + shares[-4:] * (inner_rim.cells - 2)  # in cells from the border's corner
         # Near a black cell of the rim, or with one behind, blur bends the edge.
-        free = inner.open[_SIDES, (at - 0.3).astype(np.intp)]
-        free = free * inner.open[_SIDES, (at + 0.3).astype(np.intp)]
+        free = inner_rim.white_behind[_SIDES, (at - 0.3).astype(np.intp)]
+        free = free * inner_rim.white_behind[_SIDES, (at + 0.3).astype(np.intp)]
         possible[-4:] = free > 0.0
         outside[-4:] = 1.0
-    return NeighbourEdges(depth_px, inside, outside, possible)
+    return NeighbourEdges(cell_depth_px, inside, outside, possible)
 
 
 # --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
@@ -544,16 +544,16 @@ class NeighbourEdges:
 
 
 def locate_edges(
-    grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
+    grey: Floats, half_px: Array, near_px: Array, neighbours: NeighbourEdges
 ) -> tuple[Array, Array, Array]:
     """Return, for the dark-to-bright edge on each profile, its offset from the profile's middle, px
     (rows, n), its weight, 0 for outliers (rows, n), and each row's blur, sigma in px (rows,).
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
-        half_px, near_px: reach of the profiles and of the windows, (rows,).
+        half_px, near_px: half length of the profiles and of the windows, (rows,).
     """
-    profiles = _Profiles(grey, half_px, near_px, around)
+    profiles = _Profiles(grey, half_px, near_px, neighbours)
     edge, usable = profiles.wide()
     blur2 = np.ones(len(near_px), dtype=np.float32)
     line = weight = _halves_line(edge, usable)

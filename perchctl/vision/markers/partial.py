@@ -70,8 +70,9 @@ def fit_partly_seen(
 ) -> RefinedCorners | None:
     """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
 
-    `known` is the shift of all edges, if measured before. None if the visible part does not
-    determine the corners, or its cells are not the marker's.
+    `known_by` says what identifies the marker; `known` is the shift of all edges, if measured
+    before. None if the visible part does not determine the corners, or its cells are not the
+    marker's.
     """
     pattern, camera = picture.setup.patterns[name], picture.camera
     if not mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX:
@@ -200,7 +201,7 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
     if hidden is not None:
         seen &= ~hidden[near[:, 1], near[:, 0]]
     grey = image[near[:, 1], near[:, 0]].astype(np.float64)
-    white_spots = pattern.white[pattern.spot_cells]
+    white_spots = pattern.is_white[pattern.spot_cells]
     if not ((seen & white_spots).any() and (seen & ~white_spots).any()):
         return False
     high = float(np.median(grey[seen & white_spots]))
@@ -214,11 +215,11 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
     count = np.bincount(pattern.spot_cells, weights=seen)
     means = np.bincount(pattern.spot_cells, weights=grey * seen) / np.maximum(count, 1.0)
     known = _known(seen, pattern)
-    share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.white, 1.0, -1.0)
+    share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_white, 1.0, -1.0)
     wrong = np.count_nonzero(known & (share < CELL_MARGIN))
     most_wrong = 0
     if known_by == "other":
-        most_wrong = math.floor((1.0 - MOST_CELLS) * np.count_nonzero(known & pattern.inner))
+        most_wrong = math.floor((1.0 - MOST_CELLS) * np.count_nonzero(known & pattern.is_inner))
     return bool(wrong <= most_wrong) and _enough(known, pattern, known_by)
 
 
@@ -250,10 +251,9 @@ def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
 
 
 def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bool:
-    """True if the known cells (cells,) tell which marker it is."""
     most_unknown = len(known) if known_by == "other" else _UNKNOWN_BITS[known_by]
     return bool(
-        np.count_nonzero(pattern.inner & ~known) <= most_unknown
+        np.count_nonzero(pattern.is_inner & ~known) <= most_unknown
         and np.count_nonzero(known) >= _LEAST_KNOWN * len(known)
     )
 
@@ -277,9 +277,9 @@ class SeenEdges:
     """Edges measured in one round of the fit.
 
     Per profile (rows, n): point in the marker's coordinates (rows, n, 2), outward offset from the
-    square's edge, weight. Per row (rows,): number of the side, its distance from the centre in half
-    sides, pixels per half side across it, blur in units of the window. And white paper's grey
-    level."""
+    square's edge, weight. Per row (rows,): number of the side, the edge's distance from the centre
+    in half sides, pixels per half side across it, blur in units of the window. And white paper's
+    grey level."""
 
     points: Array
     offset_px: Array
@@ -292,7 +292,7 @@ class SeenEdges:
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """The edges near the square projected by H (3, 3); None if too few are visible."""
+    """The edges near the square projected by H (3, 3) to pixels; None if too few are visible."""
     camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -351,7 +351,6 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
 
 
 def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> NDArray[np.bool_]:
-    """Which profiles (rows, n) are in the picture, and not hidden."""
     hidden, (h, w) = picture.hidden, picture.image.shape
     # A profile is as far in the picture as both its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)

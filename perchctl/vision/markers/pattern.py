@@ -27,12 +27,12 @@ _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0
 @dataclass(frozen=True, eq=False)
 class Rim:
     """The cells next to a marker's border, along its four sides in the order of the corners. white:
-    (4, n), 1 for a white cell; the first and last are the border's. open: (4, n), 1 if the cell
-    behind it is white too. tolerance: print error of an edge's position, in cells.
+    (4, n), 1 for a white cell; the first and last are the border's. white_behind: (4, n), 1 if the
+    cell behind it is white too. tolerance: print error of an edge's position, in cells.
     """
 
     white: Array
-    open: Array
+    white_behind: Array
     tolerance: float = 0.0
 
     @property
@@ -47,8 +47,8 @@ class Pattern:
     rim: cells inside the border. drawing: all cells. spots (n, 2): points in the marker's
     coordinates (see `perchctl.vision.markers.corners`) at which cells are read; spot_cells (n,):
     each spot's cell; spots_per_cell (cells,); blurred_spots (4, n): expected grey at the spots with
-    a blur of half a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; white (cells,):
-    whether a cell is white; inner (cells,): whether it is within the border.
+    a blur of half a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; is_white,
+    is_inner (cells,): True for a white cell, for a cell within the border.
     """
 
     rim: Rim
@@ -57,8 +57,8 @@ class Pattern:
     spot_cells: NDArray[np.intp]
     spots_per_cell: Array
     blurred_spots: Array
-    white: NDArray[np.bool_]
-    inner: NDArray[np.bool_]
+    is_white: NDArray[np.bool_]
+    is_inner: NDArray[np.bool_]
 
 
 def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
@@ -103,8 +103,8 @@ def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
         spot_cells=own,
         spots_per_cell=np.bincount(own).astype(np.float64),
         blurred_spots=np.stack(turns),
-        white=drawing.cells.ravel()[kept] > 0.5,
-        inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
+        is_white=drawing.cells.ravel()[kept] > 0.5,
+        is_inner=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
 
 
@@ -113,7 +113,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
-    white, black = means[pattern.white], means[~pattern.white]
+    white, black = means[pattern.is_white], means[~pattern.is_white]
     # The light may differ across the marker: white and black are the medians.
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
@@ -129,13 +129,13 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
-    high, low = np.median(means[pattern.white]), np.median(means[~pattern.white])
-    right = (means > 0.5 * (high + low)) == pattern.white
+    high, low = np.median(means[pattern.is_white]), np.median(means[~pattern.is_white])
+    right = (means > 0.5 * (high + low)) == pattern.is_white
     return bool(high - low >= MIN_CONTRAST and right.mean() > MOST_CELLS)
 
 
 def fits_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if the grey values in the cells correlate with the pattern."""
+    """True if the grey values in the cells correlate clearly with the pattern."""
     return float(correlations(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
 
 
@@ -154,7 +154,6 @@ def correlations(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) 
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """The mean grey value of each cell; None outside of the picture."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return None
@@ -209,7 +208,7 @@ class Drawing:
 def make_drawing(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
-    """A marker's drawing by its inner bits, 1 = white; `centre`: the small marker's."""
+    """A marker's drawing by its inner bits, 1 = white; `centre`, `ratio`: of a marker inside."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -232,7 +231,7 @@ def _wide(axis: Array, half_node: float) -> Array:
 
 @lru_cache(maxsize=64)
 def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """The whiteness at n by n nodes, and if the sheet ends, each node's share beyond."""
+    """The whiteness at n by n nodes, and if the sheet ends, each node's share beyond its end."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = render_cells(drawing, axis, half_node)
@@ -260,7 +259,7 @@ def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """The blurred share of each row of cells in each node (n, cells)."""
+    """The share (n, cells) of each row of cells in each node, blurred by `sigma` nodes."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE

@@ -112,7 +112,7 @@ def align_drawing(
     camera: CameraModel,
     blur_px: float = 1.0,
 ) -> Alignment | None:
-    """Fit the drawing to the picture, starting with corners `start_px` (4, 2) and a blur. None if
+    """Fit the drawing to the picture, starting at `start_px` (4, 2) and `blur_px`. None if
     the marker leaves the picture, looks different, or the fit diverges."""
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all():
@@ -216,7 +216,7 @@ def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations |
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """The correlation of `grey` with its fit, whose residual is `error`."""
+    """The correlation of grey values (k,) with their fit, whose residual is `error` (k,)."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -315,7 +315,7 @@ class Grid:
 
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """The nodes in the middle of n by n parts of a square."""
+    """The nodes in the middle of n by n parts of a square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
@@ -410,7 +410,7 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """The drawing's sheets, blurred by `sigma` nodes."""
+    """A drawing at a grid's nodes, blurred by `sigma` nodes."""
 
     drawing: Drawing
     grid: Grid
@@ -459,7 +459,6 @@ def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
 def _blurred_with_slope(
     sharp: NDArray[np.float32], sigma: float, axis: Array
 ) -> tuple[Array, Array]:
-    """A sheet blurred by sigma nodes, and its changes."""
     soft = blur_nodes(sharp, sigma)
     step = float(axis[1] - axis[0])
     e, n = EDGE, len(axis)

@@ -96,7 +96,7 @@ def search_halved(
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """The part of the picture to search, None if a window would not pay. The window holds
+    """The part of the picture to search, None if a window would save little time. The window holds
     the whole large marker if that can be in the picture."""
     h, w = shape[:2]
     if "large" in expected:
@@ -158,7 +158,7 @@ def choose_markers(
     """Return at most one large and one small marker, corners (4, 2) px.
 
     A small marker in the centre of a large one, of the right size and turn, verifies both. Markers
-    at their expected places win over a pair elsewhere; among single ones, the nearest by `own`."""
+    at expected places win over a pair elsewhere; among single markers, the nearest by `own`."""
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
@@ -221,7 +221,7 @@ def _wholes(
 
 
 def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
-    """The small marker's distance from its place in the large one, over the tolerance."""
+    """The small marker's distance from its place in the large one, in units of the tolerance."""
     mapped = scale_square(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
@@ -231,7 +231,6 @@ def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
 def _nearest(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
-    """The candidate that continues the last detections, if any."""
     if not expected or not quads:
         return None
     if name in expected:

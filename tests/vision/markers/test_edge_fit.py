@@ -115,7 +115,7 @@ def spoilt(image: Array, light: str) -> Array:
 def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
     """White that grows over black: the border's width shows by how much."""
     biases, raw_biases = [], []
-    closed = {n: replace(rim, open=np.zeros_like(rim.open)) for n, rim in RIMS.items()}
+    closed = {n: replace(r, white_behind=np.zeros_like(r.white_behind)) for n, r in RIMS.items()}
     for values in POSES:
         rvec, tvec = pose_of(*values)
         image = spoilt(render(rvec, tvec, blur_px=0.9), light)
