@@ -29,7 +29,7 @@ LONGEST_S, EVER_SHARE = 30.0, 0.25
 
 
 class DrawInputs(NamedTuple):
-    """Inputs of a random draw: the generator, and the scenario of the flight."""
+    """Inputs of a random draw: the random generator, and the flight's scenario."""
 
     rng: np.random.Generator
     scenario: Scenario
@@ -50,9 +50,9 @@ def log_uniform(low: float, high: float) -> Draw:
     return lambda source: round(float(math.exp(source.rng.uniform(*logs))), 4)
 
 
-def chance(source: DrawInputs, share: float) -> bool:
-    """Draw True with the probability `share`, else False."""
-    return bool(source.rng.uniform() < share)
+def draw_bool(source: DrawInputs, probability: float) -> bool:
+    """Draw True with the given probability, else False."""
+    return bool(source.rng.uniform() < probability)
 
 
 def duration_s(low: float = 0.1) -> Draw:
@@ -60,19 +60,19 @@ def duration_s(low: float = 0.1) -> Draw:
 
     def draw(source: DrawInputs) -> float:
         for_s: float = log_uniform(low, LONGEST_S)(source)
-        return e.FOR_EVER if chance(source, EVER_SHARE) else for_s
+        return e.FOR_EVER if draw_bool(source, EVER_SHARE) else for_s
 
     return draw
 
 
-def either(share: float, one: Any, other: Any) -> Draw:
-    """Draw `one` with the probability `share`, else `other`."""
-    return lambda source: _value(one if chance(source, share) else other, source)
+def either(probability: float, first: Any, second: Any) -> Draw:
+    """Draw `first` with the given probability, else `second`; each a value or a Draw."""
+    return lambda source: _value(first if draw_bool(source, probability) else second, source)
 
 
 def random_sign(size: Draw) -> Draw:
-    """Draw a number with `size`, and give it a random sign."""
-    return lambda source: (1.0 if chance(source, 0.5) else -1.0) * size(source)
+    """Draw a number with `size`, and make it negative in half of the draws."""
+    return lambda source: (1.0 if draw_bool(source, 0.5) else -1.0) * size(source)
 
 
 def one_of(*choices: Any) -> Draw:
@@ -87,7 +87,7 @@ def draw_direction(source: DrawInputs) -> tuple[float, float]:
 
 
 def key_press_times(period: float | Draw, duration: Draw) -> Draw:
-    """Draw the times, s, of a key pressed every `period` for `duration`."""
+    """Draw the times, s, at which a key is pressed every `period` s for `duration` s."""
 
     def draw(source: DrawInputs) -> tuple[float, ...]:
         period_s, for_s = _value(period, source), duration(source)
@@ -97,7 +97,6 @@ def key_press_times(period: float | Draw, duration: Draw) -> Draw:
 
 
 def _value(value: Any, source: DrawInputs) -> Any:
-    """A value that is given, or drawn; of a tuple each of its parts."""
     if isinstance(value, tuple):
         return tuple(_value(part, source) for part in value)
     return value(source) if callable(value) else value
@@ -121,7 +120,7 @@ def _drift(source: DrawInputs) -> e.Axes:
 
 
 def _blow(source: DrawInputs) -> e.Axes:
-    """Draw the force of a blow of 40 ms that changes the speed by up to 1 m/s, mostly sideways."""
+    """Draw the force of a blow of 40 ms that changes the speed by up to 1 m/s."""
     x, y = draw_direction(source)
     z = uniform(-0.5, 0.5)(source)
     force_n = source.scenario.mass_kg * uniform(0.2, 1.0)(source) / 0.04
@@ -129,7 +128,6 @@ def _blow(source: DrawInputs) -> e.Axes:
 
 
 def _gust(source: DrawInputs) -> e.Axes:
-    """Draw a force of up to a fifth of the weight, mostly sideways."""
     x, y = draw_direction(source)
     z = uniform(-0.3, 0.3)(source)
     force_n = source.scenario.mass_kg * GRAVITY_MPS2 * uniform(0.05, 0.2)(source)
@@ -193,7 +191,7 @@ def radio_effect(**values: Any) -> Draw:
 
 
 def frozen_logs(*names: str) -> Draw:
-    """Draw a freeze of log variables: their packets still arrive, their values do not change."""
+    """Draw a freeze of the log variables `names`: their packets still arrive, unchanged."""
     return effect(e.log_reads, names=names, value=None, for_s=duration_s())
 
 
@@ -246,7 +244,7 @@ LANDED_FROM = (P.SEARCH, P.ALIGN, P.ASCEND, P.PERCH, P.COMPLETE)
 
 @dataclass(frozen=True)
 class Fault:
-    """One entry of the catalogue. `draw` draws one effect, or a tuple of several."""
+    """A fault of the catalogue: `draw` gives its effects; it may begin in any of `phases`."""
 
     name: str
     description: str
@@ -330,7 +328,9 @@ FAULTS: tuple[Fault, ...] = (
         "heading-jumps",
         "turns by 10 to 180 deg",
         effect(
-            e.estimate_error, turn_deg=random_sign(log_uniform(10.0, 180.0)), for_s=duration_s()
+            e.estimate_error,
+            turn_deg=random_sign(log_uniform(10.0, 180.0)),
+            for_s=duration_s(),
         ),
     ),
     Fault(
@@ -507,7 +507,7 @@ class Case:
     """One fault of one flight: `effects` begin `moment_s` into `phase`.
 
     To reach LANDING, the operator lands `landed_after_s` into the phase `landed_from`. To reach
-    RECOVER, the magnet holds only the part `first_hold` of the weight at the first contact.
+    RECOVER, the magnet holds only `first_hold_ratio` of the weight at the first contact.
     """
 
     fault: Fault
@@ -516,11 +516,11 @@ class Case:
     effects: tuple[e.Effect, ...]
     landed_from: Phase | None = None
     landed_after_s: float = 0.0
-    first_hold: float | None = None
+    first_hold_ratio: float | None = None
 
 
 def select_faults(names: str) -> tuple[Fault, ...]:
-    """The faults named by `all` or by names between commas. Errors: UsageError."""
+    """The faults whose names stand in `names` between commas, or `all`. Errors: UsageError."""
     if names == "all":
         return FAULTS
     found = []
@@ -534,7 +534,7 @@ def select_faults(names: str) -> tuple[Fault, ...]:
 
 
 def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -> Case:
-    """The case of a seed, drawn from a selection; equal arguments give equal cases."""
+    """The case of a seed, with one of `faults`; equal arguments give equal cases."""
     rng = np.random.default_rng([seed, STREAM])
     fault = faults[int(rng.integers(len(faults)))]
     phase = fault.phases[int(rng.integers(len(fault.phases)))]
@@ -544,15 +544,15 @@ def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -
 def draw_fault_case(
     fault: Fault, phase: Phase, rng: np.random.Generator, scenario: Scenario
 ) -> Case:
-    """A case of the given fault and phase with everything else drawn."""
+    """A case of the given fault and phase; its moment and its effects are drawn."""
     source = DrawInputs(rng, scenario)
     moment_s = uniform(0.0, USUAL_S[phase])(source)
     effects = _value(fault.draw, source)
-    landed_from, after_s, first_hold = None, 0.0, None
+    landed_from, after_s, first_hold_ratio = None, 0.0, None
     if phase is Phase.LANDING:
         landed_from = one_of(*LANDED_FROM)(source)
         after_s = uniform(0.0, USUAL_S[landed_from])(source)
     if phase is Phase.RECOVER:
-        first_hold = uniform(0.0, 0.6)(source)
+        first_hold_ratio = uniform(0.0, 0.6)(source)
     several = effects if isinstance(effects, tuple) else (effects,)
-    return Case(fault, phase, moment_s, several, landed_from, after_s, first_hold)
+    return Case(fault, phase, moment_s, several, landed_from, after_s, first_hold_ratio)

@@ -24,7 +24,7 @@ from perchctl.vision import Frame
 
 
 def packet_kind(packet: Packet) -> str:
-    """The kind of a packet, by which a fault names it, or the empty string."""
+    """The kind of a command packet, such as "land" or "stop"; "" for any other packet."""
     kind = packet.data[0] if packet.data else None
     match packet.port, packet.channel, kind:
         case Port.COMMANDER, 0, _:
@@ -43,10 +43,10 @@ def packet_kind(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """A radio that loses the packets that the radio `air` loses, and those of a fault.
+    """A radio that loses the packets that the radio `air` loses, and a fault's packets.
 
     Attributes:
-        cut: the uplink has ended for good.
+        cut: True once the uplink has ended for good.
         lost: number of packets still to lose, by `packet_kind`; `twice`: the kinds whose next
             packet arrives twice.
         receive: called with the second copy of a packet.
@@ -102,8 +102,8 @@ LOST = 0.2
 
 @dataclass(frozen=True)
 class CameraFault:
-    """How pictures are spoilt: `kind` is silent, frozen, snow, dark, covered, lossy, out-of-order,
-    mirrored, late, or sooner than the profile expects (both by `late_s`)."""
+    """A camera fault that lasts `for_s`; `kind`: silent, frozen, snow, dark, covered, lossy,
+    out-of-order, mirrored, late (by `late_s`), sooner (by `late_s`, than the profile expects)."""
 
     kind: str
     for_s: float
@@ -123,7 +123,7 @@ class FaultyCamera(WrappedSource):
         self._overtaken: Frame | None = None
         self.late_s = 0.0  # until a fault begins, and known to the profile
 
-    def begin(self, fault: CameraFault, now_s: float) -> None:
+    def begin_fault(self, fault: CameraFault, now_s: float) -> None:
         self._fault, self._begin_s = fault, now_s
         self.late_s = 0.0
         self._queue.clear()
@@ -176,7 +176,7 @@ class FaultyCamera(WrappedSource):
         return replace(old, t_s=old.t_s + late_s, t_arrival_s=old.t_arrival_s + late_s)
 
     def _swapped(self, frame: Frame | None) -> Frame | None:
-        """The frames in pairs, the newer one of each first."""
+        """The frames in pairs, of each pair the newer first."""
         if self._overtaken is not None:
             older, self._overtaken = self._overtaken, None
             if frame is not None:
@@ -211,9 +211,9 @@ class FaultyClock:
     nothing through `radio`. A flight longer than `stop_s` is ended.
 
     Attributes:
-        pending: called once, where the loop waits next.
+        pending: function to call once, when the loop waits next.
         tick_s, slow_until_s: until `slow_until_s` each tick takes at least `tick_s`.
-        killed_s: when the program was killed, or None; `endless`: it was killed at `stop_s`.
+        killed_s: when the program was killed, or None; `endless`: killed because of `stop_s`.
     """
 
     def __init__(self, link: MockLink, radio: FaultyRadio, stop_s: float) -> None:
@@ -249,11 +249,11 @@ class FaultyClock:
             self._radio.cut = True
 
     def suspend(self, for_s: float) -> None:
-        """Let time pass without the link: none of the program's threads runs."""
+        """Let `for_s` pass while none of the program's threads runs."""
         self._link.vehicle.advance_to(self._link.now_s + for_s)
 
     def hang(self, for_s: float) -> None:
-        """Let time pass with the link: the loop's thread is stuck, the others live."""
+        """Let `for_s` pass while the loop's thread is stuck; the link's threads run on."""
         self._link.advance_to(self._link.now_s + min(for_s, LONGEST_S))
         if for_s > LONGEST_S:
             self.kill()
@@ -265,8 +265,8 @@ class FaultyClock:
 @dataclass
 class FaultRig:
     """The parts of a flight that faults act on: `press` is the operator's Ctrl-C, `hang_up` closes
-    the terminal, and `disk.problem` is that of the log's disk. Each of `on_sample` is called every
-    `SAMPLE_S`."""
+    the terminal, `disk.problem` is the error of the log's disk, and while `deck_silent` the deck
+    gives no positions. Each of `on_sample` is called every `SAMPLE_S` with the time."""
 
     vehicle: SimulatedVehicle
     radio: FaultyRadio
@@ -280,17 +280,17 @@ class FaultRig:
     _later: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
 
     def call_at(self, t_s: float, act: Callable[[], None]) -> None:
-        """Call a function at that time."""
+        """Call `act` at the simulated time `t_s`."""
         self._later.append((t_s, act))
         self._later.sort(key=lambda entry: entry[0])
 
-    def set_until(self, end_s: float, owner: Any, name: str, value: Any, after: Any) -> None:
-        """Set an attribute now, and set it to `after` at `end_s`."""
+    def set_until(self, end_s: float, owner: Any, name: str, value: Any, later: Any) -> None:
+        """Set the attribute `name` of `owner` to `value` now, and to `later` at `end_s`."""
         setattr(owner, name, value)
-        self.call_at(end_s, partial(setattr, owner, name, after))
+        self.call_at(end_s, partial(setattr, owner, name, later))
 
     def call_due(self, t_s: float) -> None:
-        """Call what is due by `t_s`, and each of `on_sample`; to be called every `SAMPLE_S`."""
+        """Call each function of `call_at` that is due by `t_s`, and each of `on_sample`."""
         while self._later and self._later[0][0] <= t_s:
             self._later.pop(0)[1]()
         for act in self.on_sample:

@@ -47,8 +47,8 @@ def radio_loss(
     down: str = "",
     delay_s: float = math.inf,
 ) -> None:
-    """Lose all commands if `up`, and the packets of the log block `down` ("all": of every block); a
-    finite `delay_s` delays the log packets instead."""
+    """For `for_s` lose all commands if `up`, and the packets of the log block `down` ("all": of
+    every block); a finite `delay_s` delays the log packets instead."""
     rig.radio.lose(t_s + for_s, up, down, delay_s)
 
 
@@ -74,21 +74,21 @@ def reboots(rig: FaultRig, t_s: float, boots_s: float) -> None:
 
 
 def camera_fault(rig: FaultRig, t_s: float, kind: str, for_s: float, late_s: float = 0.0) -> None:
-    """Spoil the camera's pictures (`CameraFault`)."""
-    rig.camera.begin(CameraFault(kind, for_s, late_s), t_s)
+    """Begin the `CameraFault` of these values: spoil the pictures for `for_s`."""
+    rig.camera.begin_fault(CameraFault(kind, for_s, late_s), t_s)
 
 
 def external_positions(
     rig: FaultRig, t_s: float, how: str, for_s: float, late_s: float = 0.0
 ) -> None:
-    """Make the motion capture of a vehicle without a deck fail as `CAPTURE_FAULTS[how]`, or be late
-    by `late_s`."""
+    """Make the motion capture of a vehicle without a deck fail for `for_s` as
+    `CAPTURE_FAULTS[how]`, or be late by `late_s`."""
     assert rig.vehicle.capture is not None
     rig.vehicle.capture.begin_fault(replace(CAPTURE_FAULTS[how], late_s=late_s), for_s)
 
 
 def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the absolute positions of the vehicle's deck. Until then they corrected an
+    """Stop the absolute positions of the vehicle's deck, which until then corrected an
     accelerometer that reads `acc_z_mps2` too much along z, because the motors shake it."""
     rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
@@ -104,7 +104,7 @@ def estimate_error(
     drift_mps: Axes = (0.0, 0.0, 0.0),
     for_s: float = FOR_EVER,
 ) -> None:
-    """Add a step and a drift to the vehicle's state estimate."""
+    """Add a step, a turn in heading, and a drift, world axes, to the state estimate."""
 
     def spoil(now: Any) -> None:
         after_s = rig.vehicle.t_s - t_s
@@ -124,7 +124,7 @@ def estimate_error(
 def log_reads(
     rig: FaultRig, t_s: float, names: tuple[str, ...], value: float | None, for_s: float
 ) -> None:
-    """Let log variables report `value` (None: their present value), whatever the true one is."""
+    """Let the log variables `names` report `value` for `for_s`; None: their present values."""
     firmware = rig.vehicle.firmware
     for name in names:
         firmware.log_overrides[name] = firmware.log_value(name) if value is None else value
@@ -152,13 +152,13 @@ def thrust_changed(rig: FaultRig, t_s: float, to: tuple[float, float, float, flo
 
 
 def push(rig: FaultRig, t_s: float, force_n: Axes, for_s: float) -> None:
-    """Let a force act on the vehicle."""
+    """Let a force, world axes, act on the vehicle for `for_s`."""
     still_n = (0.0, 0.0, 0.0)
     rig.set_until(t_s + for_s, rig.vehicle.world, "external_force_n", force_n, still_n)
 
 
 def magnet_lets_go(rig: FaultRig, t_s: float, after_s: float) -> None:
-    """Release the magnet for good `after_s` after the contact."""
+    """Release the magnet for good `after_s` after the gear has touched it."""
     world, contact_s = rig.vehicle.world, math.inf
 
     def watch(now_s: float) -> None:
@@ -172,7 +172,7 @@ def magnet_lets_go(rig: FaultRig, t_s: float, after_s: float) -> None:
 
 
 def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
-    """Move the target with its magnet."""
+    """Move the target and its magnet by (x, y), world axes."""
     x, y = rig.vehicle.world.magnet.target_xy_m
     rig.vehicle.move_target((x + by_m[0], y + by_m[1]))
 
@@ -183,18 +183,18 @@ def target_moves(rig: FaultRig, t_s: float, by_m: tuple[float, float]) -> None:
 def operator(
     rig: FaultRig, t_s: float, presses_s: tuple[float, ...], hang_up: bool = False
 ) -> None:
-    """Let the operator press Ctrl-C at these times, or close the terminal (`hang_up`)."""
+    """At each of `presses_s` after `t_s` press Ctrl-C, or if `hang_up` close the terminal."""
     for press_s in presses_s:
         rig.call_at(t_s + press_s, rig.hang_up if hang_up else rig.press)
 
 
 def killed(rig: FaultRig, t_s: float) -> None:
-    """Kill the program, which sends nothing more."""
+    """Kill the program when its loop waits next."""
     rig.clock.pending = rig.clock.kill
 
 
 def suspended(rig: FaultRig, t_s: float, for_s: float) -> None:
-    """Suspend the whole program."""
+    """Suspend all threads of the program for `for_s`."""
     rig.clock.pending = partial(rig.clock.suspend, for_s)
 
 
@@ -204,7 +204,7 @@ def hung(rig: FaultRig, t_s: float, for_s: float) -> None:
 
 
 def slow(rig: FaultRig, t_s: float, tick_s: float, for_s: float) -> None:
-    """Let each tick of the loop take `tick_s`."""
+    """Let each tick of the loop take at least `tick_s`, for `for_s`."""
     rig.clock.tick_s, rig.clock.slow_until_s = tick_s, t_s + for_s
 
 
@@ -218,7 +218,7 @@ def raises(rig: FaultRig, t_s: float) -> None:
 
 
 def disk_full(rig: FaultRig, t_s: float, for_s: float) -> None:
-    """Fill the log's disk."""
+    """Let the log's disk be full for `for_s`."""
     rig.set_until(t_s + for_s, rig.disk, "problem", "No space left on device", None)
 
 
@@ -239,8 +239,8 @@ def room(scenario: Scenario, **fields: Any) -> Scenario:
 OF_THE_SCENARIO = (magnet_holds, room)
 
 
-def scenario_for(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
-    """The scenario with the effects that hold from the start."""
+def apply_to_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
+    """The scenario with those of `effects` applied that hold from the flight's start."""
     for effect in effects:
         if effect.func in OF_THE_SCENARIO:
             scenario = effect(scenario)
@@ -251,7 +251,7 @@ def scenario_for(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
     return scenario
 
 
-def profile_for(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
+def apply_to_profile(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
     """The profile with the positioning and the camera latency that the effects need."""
     for effect in effects:
         if effect.func in (external_positions, deck_silent):
@@ -266,7 +266,7 @@ def profile_for(profile: Profile, effects: tuple[Effect, ...]) -> Profile:
 
 
 def latency_drop_s(effect: Effect) -> float:
-    """The seconds by which the fault shortens the latency that the profile expects."""
+    """The seconds by which an effect shortens the latency that the profile expects."""
     sooner = effect.func is camera_fault and effect.keywords["kind"] == "sooner"
     return float(effect.keywords["late_s"]) if sooner else 0.0
 
@@ -320,7 +320,7 @@ class Injector:
 
 
 def _measure(rig: FaultRig, noise: random.Random, _now_s: float) -> None:
-    """Give the estimator a position measured by the vehicle's own deck."""
+    """Give the estimator a position of the deck."""
     if rig.deck_silent:
         return
     world, firmware = rig.vehicle.world, rig.vehicle.firmware

@@ -26,8 +26,8 @@ CUT_DOWN: tuple[Flag, ...] = (*FALL, "strayed", "locked_needlessly")
 
 @dataclass(frozen=True)
 class ExpectedOutcome:
-    """An outcome that no program could avoid: `flags` raised from the time of `cause` (None: it
-    never came) until `within_s` later do not count. `reason` fits into a line of the table."""
+    """An outcome that no program could avoid: `flags` raised within `within_s` after the time that
+    `cause` gives (None: no such time) do not count. `reason` fits into a line of the table."""
 
     name: str
     reason: str
@@ -36,17 +36,17 @@ class ExpectedOutcome:
     within_s: float = 4.0
 
     def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
-        """True if a flag raised at `t_s` is a consequence of the cause."""
+        """True if this outcome excuses `flag`, raised at `t_s`."""
         cause_s = self.cause(facts)
         return cause_s is not None and flag in self.flags and 0.0 <= t_s - cause_s <= self.within_s
 
 
 def _killed_in_landing(facts: Facts) -> float | None:
-    return facts.killed_s if facts.has_effect(killed) and facts.own_landing else None
+    return facts.killed_s if facts.has_effect(killed) and facts.onboard_landing else None
 
 
 def _let_go_later(facts: Facts) -> float | None:
-    return facts.magnet_failed_s if facts.was_watched else None
+    return facts.magnet_failed_s if facts.hung_through_watch else None
 
 
 def _too_low(facts: Facts) -> float | None:

@@ -65,13 +65,13 @@ PROBE = Packet(Port.LINK, 0, b"")
 
 
 class FaultyFlight:
-    """One flight with a fault and its judge, ready for a single call of `fly`. It also watches
-    the loop; its `problem` is that of the log's disk."""
+    """One flight with a fault and its judge, ready for a single call of `fly`. It is also a
+    `Watcher` of the loop; `problem` is the error of the log's disk, or None."""
 
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None
     ) -> None:
-        profile = e.profile_for(profile, case.effects)
+        profile = e.apply_to_profile(profile, case.effects)
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
         self.problem: str | None = None
@@ -132,7 +132,7 @@ class FaultyFlight:
             end, reason, report = "gone", "", None
         self._vehicle.camera = None
         end_s = self._link.now_s
-        self._oracle.note_end(end_s, crashed=self._crashed, endless=self._clock.endless)
+        self._oracle.note_program_end(end_s, crashed=self._crashed, endless=self._clock.endless)
         self._vehicle.advance_to(end_s + AFTER_S)
         if self._oracle.is_airborne:
             self._vehicle.advance_to(end_s + AFTER_IN_THE_AIR_S)
@@ -143,7 +143,7 @@ class FaultyFlight:
             injector.tick(tick)
 
     def event(self, event: Event) -> None:
-        """Give the claims of an event `of_rescue` to the oracle."""
+        """Give the claims of a rescue's event to the oracle."""
         self._oracle.add_claims(rescue_claims(event), event.t_s)
 
     def _mission(self) -> tuple[str, str, FlightReport | None]:
@@ -162,7 +162,7 @@ class FaultyFlight:
         return END_OF[report.phase], report.reason, report
 
     def _press(self) -> None:
-        self._oracle.note_press(self._link.now_s)
+        self._oracle.note_ctrl_c(self._link.now_s)
         self._switch.press()
 
     def _each(self, t_s: float) -> None:
@@ -187,7 +187,7 @@ class FaultyFlight:
         astray_m = self._place_bound.astray_m(place)
         if begin_s is not None:
             self._descent_bound.begin(begin_s, phase)
-            astray_m -= self._drift.update_m(t_s - begin_s, phase)
+            astray_m -= self._drift.update_drift_m(t_s - begin_s, phase)
             self._touched = self._touched or sample.hanging or world.push_n_and_on_floor()[0] > 0.0
         uplink = not self._is_suspended(t_s) and self._radio.uplink_arrives(PROBE, t_s)
         overdue = self._descent_bound.is_overdue(
@@ -200,7 +200,9 @@ class FaultyFlight:
         )
         wrong = begin_s is not None and self._facts.has_effect(e.log_reads)
         heard = not wrong and all(self._is_heard(block, t_s) for block in MockLink.FAST_BLOCKS)
-        return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
+        return sample._replace(
+            astray_m=astray_m, descent_overdue=overdue, uplink=uplink, telemetry_ok=heard
+        )
 
     def _is_suspended(self, t_s: float) -> bool:
         begin_s = self._injector.begin_s
@@ -256,9 +258,9 @@ def fly_with_fault(
     log: Path | None = None,
     record: bool = False,
 ) -> FaultResult:
-    """Fly a case to its end and judge it by the truth. Errors: NotFound, InvalidValue
-    (calibration, log)."""
-    flown_by = e.profile_for(profile, case.effects)
+    """Fly a case to its end and judge the flight by the true state; `log`: file for the flight
+    log, if any. Errors: NotFound, InvalidValue (calibration, log)."""
+    flown_by = e.apply_to_profile(profile, case.effects)
     watcher = None if log is None else LogWatcher.lockstep(log, flown_by, scenario.seed, record)
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
@@ -266,8 +268,8 @@ def fly_with_fault(
 def fly_fault_in_folder(
     profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
-    """Fly the seed's scenario with the seed's fault, drawn from those named, with its log in a
-    folder if one is given."""
+    """Fly the scenario of `seed` with a fault that the seed draws from the names `faults`; the log
+    goes to `log_dir`, if any."""
     log = None if log_dir is None else seed_log_path(seed, log_dir)
 
     def fly_drawn(scenario: Scenario) -> FaultResult:
@@ -278,10 +280,10 @@ def fly_fault_in_folder(
 
 
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
-    if case.first_hold is not None:
-        hold_n = case.first_hold * scenario.mass_kg * GRAVITY_MPS2
+    if case.first_hold_ratio is not None:
+        hold_n = case.first_hold_ratio * scenario.mass_kg * GRAVITY_MPS2
         scenario = replace(scenario, first_contact_force_n=hold_n)
-    return e.scenario_for(scenario, case.effects)
+    return e.apply_to_scenario(scenario, case.effects)
 
 
 def _parameters(case: Case) -> dict[str, Any]:
@@ -289,6 +291,6 @@ def _parameters(case: Case) -> dict[str, Any]:
     if case.landed_from is not None:
         found["landed_from"] = case.landed_from.value
         found["landed_after_s"] = case.landed_after_s
-    if case.first_hold is not None:
-        found["first_hold"] = case.first_hold
+    if case.first_hold_ratio is not None:
+        found["first_hold"] = case.first_hold_ratio
     return found

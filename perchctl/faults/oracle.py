@@ -62,7 +62,7 @@ this long without any, or when faster presses have gone on for the third time.""
 
 
 class Sample(NamedTuple):
-    """The true state of the vehicle at one moment in SI units; a standing vehicle has height 0."""
+    """The vehicle's true state at one moment, SI units; a standing vehicle has height 0."""
 
     t_s: float
     x_m: float
@@ -77,18 +77,18 @@ class Sample(NamedTuple):
     hanging: bool  # the magnet holds the gear
     hold_ratio: float  # of the magnet's hold to the weight
     locked: bool
-    ended_by_vehicle: bool  # crashed or tumbled, as the supervisor saw it
-    aside_mps: float = 0.0  # horizontal speed
+    supervisor_ended: bool  # crashed or tumbled, as the supervisor saw it
+    horizontal_mps: float = 0.0
     uplink: bool = True  # what the program sends would arrive
-    astray_m: float = 0.0  # from where it should be, less what the fault has made it drift by
+    astray_m: float = 0.0  # from where it should be, less the drift by the fault
     miss_m: float = 0.0  # of the gear from the target's centre, horizontally
     below_m: float = 0.0  # the gear below the printed target's plane
-    overdue: bool = False  # it should have been on its way down for some time
-    heard: bool = True  # its telemetry arrives in time, and tells what is true
+    descent_overdue: bool = False
+    telemetry_ok: bool = True  # arrives in time, and tells what is true
 
 
 def drop_limit_m(hold_ratio: float) -> float:
-    """How deep a slip may be, m; `hold_ratio`: the magnet's hold over the weight."""
+    """The depth, m, that a slip off the magnet may have; `hold_ratio`: hold over weight."""
     if hold_ratio <= 0.3:
         return 0.15
     return 0.6 if hold_ratio <= 0.75 else 1.0
@@ -108,8 +108,6 @@ def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
 
 
 class _Lasting:
-    """Tells whether a condition has held for a time without a break."""
-
     def __init__(self, for_s: float) -> None:
         self._for_s, self._since_s = for_s, math.inf
 
@@ -123,8 +121,7 @@ class _Lasting:
 
 @dataclass
 class _Fall:
-    """A fall in progress. `slip_ratio`: the magnet's hold over the weight, None if it is no
-    slip."""
+    """`slip_ratio`: the magnet's hold over the weight, None if the fall is no slip."""
 
     top_m: float
     slip_ratio: float | None = None
@@ -132,14 +129,14 @@ class _Fall:
 
 
 class Oracle:
-    """Judges a flight by a profile's limits and samples at most 20 ms apart. Within
-    `magnet_radius_m` a contact is on the target.
+    """Judges a flight by a profile's limits and true samples at most 20 ms apart. A gear within
+    `magnet_radius_m` of the target's centre is on the target.
 
     Attributes:
         flags: each raised flag with the time at which it was first raised, in order.
-        drop_m: depth of the deepest fall, until it was caught.
+        drop_m: depth of the deepest fall, from its top to the catch or the floor.
         astray_m: the largest `Sample.astray_m` in the air.
-        newest: the last sample.
+        newest: the newest sample, or None.
     """
 
     def __init__(
@@ -160,7 +157,7 @@ class Oracle:
         self._weak_s = -math.inf  # when it was last without the thrust to slow down
         self._before: Sample | None = None
         self._least_up_z = 1.0
-        self._ended_by_vehicle = False
+        self._supervisor_ended = False
         self._may_lock = False
         self._claims: dict[Claim, float] = {}  # those that are not found true yet
         self._seen_down = _Lasting(SEEN_S)  # at rest with still motors, and heard
@@ -173,11 +170,11 @@ class Oracle:
         """Note claims that the program made at `t_s`."""
         self._claims |= dict.fromkeys(claims, t_s)
 
-    def note_press(self, t_s: float) -> None:
+    def note_ctrl_c(self, t_s: float) -> None:
         self._presses_s.append(t_s)
 
-    def note_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
-        """Note the end: `crashed` by an exception not planted, `endless`: ended from outside."""
+    def note_program_end(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
+        """Note when the program ended; `crashed`: by an unplanted exception, `endless`: killed."""
         self._end_s = t_s
         if crashed:
             self._raise("crashed", t_s)
@@ -186,25 +183,25 @@ class Oracle:
 
     @property
     def stop_s(self) -> float | None:
-        """The time at which the operator asked for the emergency stop, or None."""
+        """The time of the Ctrl-C that orders the emergency stop, or None."""
         return emergency_stop_s(self._presses_s)
 
-    def update(self, s: Sample) -> None:
-        self.newest = s
-        if s.hanging:
-            self._hung = s
-        self._least_up_z = min(self._least_up_z, s.body_up_z)
-        self._ended_by_vehicle = self._ended_by_vehicle or s.ended_by_vehicle
-        self._watch_unpowered(s)
-        self._watch_fall(s)
-        self._watch_touchdown(s)
-        self._watch_pressing(s)
-        self._watch_place(s)
-        self._watch_end(s)
-        self._watch_claims(s)
-        self._watch_stop(s)
-        self._watch_lock(s)
-        self._before = s
+    def update(self, sample: Sample) -> None:
+        self.newest = sample
+        if sample.hanging:
+            self._hung = sample
+        self._least_up_z = min(self._least_up_z, sample.body_up_z)
+        self._supervisor_ended = self._supervisor_ended or sample.supervisor_ended
+        self._watch_unpowered(sample)
+        self._watch_fall(sample)
+        self._watch_touchdown(sample)
+        self._watch_pressing(sample)
+        self._watch_place(sample)
+        self._watch_end(sample)
+        self._watch_claims(sample)
+        self._watch_stop(sample)
+        self._watch_lock(sample)
+        self._before = sample
 
     @property
     def is_airborne(self) -> bool:
@@ -216,7 +213,7 @@ class Oracle:
         self.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
-        """True if it hung a moment ago, so that it may still be caught."""
+        """True if the vehicle hung at most `FROM_HANGING_S` ago."""
         return self._hung is not None and s.t_s - self._hung.t_s <= FROM_HANGING_S
 
     def _watch_unpowered(self, s: Sample) -> None:
@@ -257,7 +254,7 @@ class Oracle:
             return
         if -before.vz_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)
-        if before.aside_mps > TOUCHDOWN_ASIDE_MPS:
+        if before.horizontal_mps > TOUCHDOWN_ASIDE_MPS:
             self._raise("slid", s.t_s)
 
     def _watch_pressing(self, s: Sample) -> None:
@@ -275,16 +272,15 @@ class Oracle:
 
     def _watch_end(self, s: Sample) -> None:
         left_alone = s.t_s >= self._end_s + ALONE_S
-        if (left_alone or s.overdue) and s.motors_on and _airborne(s):
+        if (left_alone or s.descent_overdue) and s.motors_on and _airborne(s):
             self._raise("flies_on", s.t_s)
 
     def _watch_claims(self, s: Sample) -> None:
-        """Hold open claims against the truth. Motors that were claimed off must not turn again:
-        somebody reaches for them."""
+        """Judge open claims; motors that were claimed off must not turn again."""
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
         at_rest = not s.motors_on and (s.hanging or not _airborne(s))
-        self._seen_down.update(at_rest and s.heard, s.t_s)
+        self._seen_down.update(at_rest and s.telemetry_ok, s.t_s)
         for claim, claimed_s in list(self._claims.items()):
             if self._is_true(claim, s):
                 del self._claims[claim]
@@ -306,15 +302,14 @@ class Oracle:
             "hangs or stands": hangs or stands,
             "motors off": not s.motors_on,
             "locked": s.locked,
-            "ended by the supervisor": self._ended_by_vehicle,
+            "ended by the supervisor": self._supervisor_ended,
             "tilted": self._least_up_z < self._tilt_up_z,
             "not seen down": not self._seen_down.holds(s.t_s),
         }
         return truths[claim]
 
     def _watch_stop(self, s: Sample) -> None:
-        """Judge obedience to the emergency stop, but only while packets arrive. Motors that are
-        off by then must stay off."""
+        """Judge obedience to the emergency stop, but only while packets arrive."""
         if not s.uplink:
             self._muted_s = s.t_s
         stop_s = self.stop_s
@@ -324,9 +319,8 @@ class Oracle:
             self._raise("stop_not_obeyed", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:
-        """Judge a lock by what came before it; a tumble after the motors were cut is no reason
-        for it."""
-        if s.ended_by_vehicle or s.body_up_z < self._tilted_up_z:
+        """Judge a lock by what came before it; a later tumble is no reason."""
+        if s.supervisor_ended or s.body_up_z < self._tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:
             self._raise("locked_needlessly", s.t_s)
@@ -381,7 +375,7 @@ REFUSAL_CLAIMS: Claims = {"stands"}
 
 
 def last_transition(report: FlightReport) -> str:
-    """The name of the transition that ended the flight; empty without one."""
+    """The name of the transition that ended the flight; empty without a transition."""
     return report.history[-1].row if report.history else ""
 
 
@@ -393,7 +387,7 @@ def report_claims(report: FlightReport) -> Claims:
 
 
 def rescue_claims(event: Event) -> Claims:
-    """The claims of a rescue's note; none for any other event."""
+    """The claims of a rescue's event; an empty set for any other event."""
     if not event.is_rescue:
         return set()
     found = next(found for found in RestState if found.value in event.reason)

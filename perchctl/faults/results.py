@@ -30,12 +30,14 @@ class FaultResult(CampaignFlight):
 
     Attributes:
         outcome: one of `ENDS`.
-        flags: what went wrong, each with its first time.
+        flags: what went wrong, each flag with its first time.
         counted: the flags that no expected outcome covers.
         expected: the names of the expected outcomes whose cause came, whether or not a flag was
             raised.
-        begin_s: when the fault began; None when the flight was over before.
-        row: name of the mission's transition that ended the flight; empty without one.
+        begin_s: when the fault began, `moment_s` into `phase`; None if the flight ended before.
+        miss_m: distance from the target's centre; None if not perched.
+        way: the phases of the flight in order.
+        row: name of the transition that ended the flight; empty without a transition.
         drop_m: depth of the deepest fall until it was caught, as simulated.
         astray_m: largest distance in the air from where the vehicle should have been.
     """
@@ -63,7 +65,7 @@ class FaultResult(CampaignFlight):
 
     @property
     def is_excused(self) -> bool:
-        """True if it has a flag that an expected outcome covers."""
+        """True if an expected outcome covers one of the flags."""
         return len(self.counted) < len(self.flags)
 
 
@@ -83,8 +85,8 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """A campaign's figures as a record for JSON.
 
     The count of a flag leaves out flights in which an expected outcome covers it. `unavoidable` is
-    the number of flights with a covered flag, `expected_outcomes` that of flights with each cause;
-    the figures of `SHARES` are shares of all flights.
+    the number of flights with a covered flag, `expected_outcomes` the number with each cause; the
+    figures of `SHARES` are shares of all flights.
     """
     return {
         "flights": len(results),
@@ -98,7 +100,6 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
 
 
 def _counts(results: Sequence[FaultResult]) -> dict[str, int]:
-    """The numbers of the flights of `SHARES`."""
     return {
         "wrong": sum(r.is_bad for r in results),
         "not_known": sum(r.row == NOT_KNOWN for r in results),

@@ -31,7 +31,7 @@ PRESSING_RATIO = 1.02
 
 
 class WatchedVehicle(SimulatedVehicle):
-    """A simulated vehicle that calls `on_sample` every `e.SAMPLE_S` of its time."""
+    """A simulated vehicle that calls `on_sample` with the time, every `e.SAMPLE_S`."""
 
     def __init__(
         self,
@@ -109,28 +109,28 @@ class Facts:
 
     Attributes:
         effects: the fault's effects, which began at `begin_s`.
-        silence_lock_s: when the firmware locked the vehicle, which had received nothing.
-        own_landing: the onboard landing was under way when the silence before that lock began.
+        silence_lock_s: when the firmware locked the vehicle because no packet had arrived.
+        onboard_landing: the onboard landing was under way when that silence began.
         killed_s: when the program was killed.
-        rebooted_s: when the vehicle started again on turning motors, off the floor.
+        rebooted_s: when the vehicle rebooted in the air while its motors turned.
         stop_s: when the operator pressed Ctrl-C for the second time.
-        magnet_failed_s: when the magnet let go for good; `was_watched`: by then the whole weight
-            had hung on it, motors off, for as long as the program has to watch it.
+        magnet_failed_s: when the magnet let go for good; `hung_through_watch`: by then the whole
+            weight had hung on the magnet, motors off, for the whole time of the program's watch.
         slipped_s: when the vehicle first came off the magnet with its motors still, `slip_height_m`
             high; `toppled`: it turned over within `TOPPLES_S`.
         weak_s: when battery and motors could first not lift the weight any more.
-        battery_low_s, battery_low_m: when the battery was first low under load, at which height.
+        battery_low_s, battery_low_m: time and height at which the loaded battery was first low.
     """
 
     effects: tuple[e.Effect, ...] = ()
     begin_s: float | None = None
     silence_lock_s: float | None = None
-    own_landing: bool = False
+    onboard_landing: bool = False
     killed_s: float | None = None
     rebooted_s: float | None = None
     stop_s: float | None = None
     magnet_failed_s: float | None = None
-    was_watched: bool = False
+    hung_through_watch: bool = False
     slipped_s: float | None = None
     slip_height_m: float = 0.0
     toppled: bool = False
@@ -143,7 +143,7 @@ class Facts:
 
 
 class FactsRecorder(Facts):
-    """The facts of a flight, noted as it follows the true vehicle sample by sample."""
+    """The facts of a flight, collected from samples of the true state."""
 
     def __init__(
         self, vehicle: SimulatedVehicle, profile: Profile, effects: tuple[e.Effect, ...] = ()
@@ -159,22 +159,22 @@ class FactsRecorder(Facts):
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
 
-    def update(self, s: Sample) -> None:
-        """Note the next sample; `begin_s` is set by then if the fault has begun."""
+    def update(self, sample: Sample) -> None:
+        """Note the next sample; the caller sets `begin_s` before, once the fault has begun."""
         before = self._before
-        self._note_silence(s)
-        self._note_hanging(s)
+        self._note_silence(sample)
+        self._note_hanging(sample)
         if self.begin_s is not None:
             flew = before is not None and before.motors_on and not before.on_floor
             if not self._begun and flew and self.has_effect(e.reboots):
                 self.rebooted_s = self.begin_s
             self._begun = True
-            self._note_power(s)
-        self._before = s
+            self._note_power(sample)
+        self._before = sample
 
     def _note_silence(self, s: Sample) -> None:
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
-        self.own_landing = self.own_landing or (long and self._landed_alone)
+        self.onboard_landing = self.onboard_landing or (long and self._landed_alone)
         locks = s.locked and not (self._before and self._before.locked)
         ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
         late = s.t_s - self._heard_s <= LOCKS_S and not ordered
@@ -191,7 +191,9 @@ class FactsRecorder(Facts):
         before = self._before
         if self.magnet_failed_s is None and self._vehicle.world.magnet.let_go:
             self.magnet_failed_s = s.t_s
-            self.was_watched = self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
+            self.hung_through_watch = (
+                self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
+            )
         came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
         if came_off and self.slipped_s is None:
             self.slipped_s, self.slip_height_m = s.t_s, s.height_m
@@ -203,8 +205,7 @@ class FactsRecorder(Facts):
             self._hangs_s = s.t_s
 
     def _note_power(self, s: Sample) -> None:
-        """Note when the vehicle can no longer lift its weight: at most four times what the
-        weakest motor gives."""
+        """Note when four times what the weakest motor gives no longer lifts the weight."""
         vehicle, world = self._vehicle, self._vehicle.world
         weakest = min(world.powertrain.strength or (1.0,))
         lift_n = min(4.0 * MOTOR_FORCE_N, weakest * max_thrust_n(world.battery_rest_v))
@@ -244,9 +245,9 @@ LOW_M = 0.3
 
 class PositionBound:
     """The horizontal places where the vehicle may be, by phase: at its start (or
-    `planner.approach_xy_m`) in take-off; between there and a target in search, estimate, alignment
-    and recovery; under a target in ascent, press and completion; from the landing on where it
-    should have been when the landing began.
+    `planner.approach_xy_m`) in take-off; between start and target in search, estimate, alignment
+    and recovery; under a target in ascent, press and completion; from the landing on where the
+    vehicle should have been when the landing began.
 
     A target that looks like the vehicle's own counts, too.
     """
@@ -263,7 +264,7 @@ class PositionBound:
             self._targets.append(place)
 
     def note_phase(self, phase: Phase | None, place: Place) -> None:
-        """Note the program's phase and the vehicle's true place; the first one is its start."""
+        """Note the program's phase and the vehicle's true place; the first place is the start."""
         if self._phase is None:
             self._starts.insert(0, place)
         if phase in TERMINALS and self._down_at is None:
@@ -271,7 +272,7 @@ class PositionBound:
         self._phase = phase or Phase.APPROACH
 
     def astray_m(self, place: Place) -> float:
-        """The distance of `place` from the nearest place where the vehicle may be."""
+        """The distance from `place` to the nearest place where the vehicle may be."""
         return min(math.dist(spot, place) for spot in self._nearest(place))
 
     def _nearest(self, place: Place) -> list[Place]:
@@ -299,7 +300,7 @@ def _nearest_between(a: Place, b: Place, place: Place) -> Place:
 
 
 def target_places(scenario: Scenario) -> list[Place]:
-    """The places of the vehicle's target and of those that look like it, if any."""
+    """The places of the vehicle's target and of identical neighbours; none without a target."""
     if scenario.no_target:
         return []
     x_m, y_m = scenario.target_xy_m
@@ -334,8 +335,8 @@ class UndetectedDrift:
         ]
         self._slid_m = self._fault_s = 0.0
 
-    def update_m(self, fault_s: float, phase: Phase | None) -> float:
-        """The distance, m, `fault_s` after the fault began; times must rise."""
+    def update_drift_m(self, fault_s: float, phase: Phase | None) -> float:
+        """The possible drift, m, `fault_s` after the fault began; calls are in time order."""
         before_s, self._fault_s = self._fault_s, fault_s
         if phase in UNDER_TARGET:
             self._slid_m = 0.0
@@ -375,9 +376,9 @@ class DescentBound:
     ) -> bool:
         """True if the vehicle should have come down by now and has not.
 
-        A vehicle that was at the ceiling in time may hang there; without `uplink` the time to obey
-        starts anew. `lands`: its onboard landing is active, which counts as coming down unless it
-        climbs.
+        A vehicle that has been `touching` the ceiling in time may hang there; without `uplink` the
+        time to obey starts anew. `lands`: the onboard landing is active, which counts as coming
+        down unless the vehicle climbs.
         """
         if self._due_s is None:
             return False
@@ -401,7 +402,7 @@ def _for_s(effect: e.Effect) -> float:
 
 def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
     """The seconds from an effect's beginning in `phase` until the program has to land;
-    infinite if it need not."""
+    infinite if no landing is due."""
     safety, values, limit_s = profile.safety, effect.keywords, math.inf
     if effect.func is e.operator:
         limit_s = min(values["presses_s"])

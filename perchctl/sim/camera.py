@@ -71,7 +71,7 @@ class SimCamera:
         """Take all exposures that end at or before `t_s`.
 
         `pose_at`, the body's pose, is called with times within the exposures that ended since the
-        last call. If that was a control period ago, these are at most an exposure and a period old.
+        last call.
         """
         self._t_s = t_s
         while True:
@@ -173,7 +173,7 @@ class Shutter:
         self._flicker = scenario.camera_flicker * swing
 
     def shots(self, middle_s: float, T_world_cam_at: PoseAt, height: int) -> list[Exposure]:
-        """The frame's exposures in time order: two fields, or one whole frame."""
+        """The exposures of a frame `height` px high, in time order: two fields, or one frame."""
         half_s = self._apart_s / 2.0
         moments = (middle_s - half_s, middle_s + half_s) if half_s else (middle_s,)
         return [self._shot(moment_s, T_world_cam_at, height) for moment_s in moments]

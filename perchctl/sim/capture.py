@@ -64,9 +64,9 @@ class CaptureSettings:
     """A simulated motion-capture system and its faults; SI units.
 
     Attributes:
-        body: the vehicle's rigid body, `body_*` its axes and origin in the vehicle's axes.
-        others: rigid bodies that stand still, by name and place.
-        rate_hz: of its cameras.
+        body: name of the vehicle's rigid body; `body_*`: its pose in the vehicle's axes.
+        others: (name, position m) of each rigid body that stands still.
+        rate_hz: frame rate of the system's cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival, mean and one sigma.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
         heading_rad, origin_m: pose of the simulator's world in the capture's.
@@ -94,7 +94,7 @@ class CaptureSettings:
 
 
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
-    """The motion capture of that seed's flight; None if the profile uses none."""
+    """The motion capture of the seed's flight; None if the profile uses no motion capture."""
     config, sim = profile.positioning, profile.simulation
     if config.by != "mocap":
         return None
@@ -141,11 +141,10 @@ class SimCapture:
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
     def end_faults(self) -> None:
-        """End all faults."""
         self._faults.clear()
 
     def advance(self, world: World) -> None:
-        """Expose if it is time to. Called each control period."""
+        """Take a frame of `world` if an exposure is due; called each control period."""
         self._t_s = t_s = world.t_s
         if t_s < self._due_s - 1e-9:
             return
@@ -173,16 +172,16 @@ class SimCapture:
         return arrived
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame that has arrived since the last call."""
+        """The newest frame that has arrived since the last call, or None."""
         arrived = self.take()
         return arrived[-1] if arrived else None
 
     def problem(self, now_s: float) -> str | None:
-        """Return None, since nothing is ever wrong with this connection."""
+        """Return None: this connection has no problems."""
         return None
 
     def close(self) -> None:
-        """Do nothing: there is nothing to close."""
+        """Do nothing."""
 
     def _bodies(
         self, world: World, noise: Array, faults: list[CaptureFault]
@@ -244,12 +243,12 @@ class MotionCaptureServer:
         self._count = 0
         threading.Thread(target=self._answer, name="capture-server", daemon=True).start()
 
-    def publish(self, seen: CaptureFrame) -> None:
-        """Send a frame to the client, if there is one; it may be lost, as on any network."""
+    def publish(self, frame: CaptureFrame) -> None:
+        """Send a frame to the client, if any has asked; UDP may lose the frame."""
         self._count += 1
         if self._client is not None:
             with contextlib.suppress(OSError):
-                self._socket.sendto(frame_message(self._count, self._names, seen), self._client)
+                self._socket.sendto(frame_message(self._count, self._names, frame), self._client)
 
     def _answer(self) -> None:
         while True:
@@ -289,16 +288,16 @@ def _models(names: Sequence[str]) -> bytes:
     return _message(MODELS, *parts)
 
 
-def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
-    """A frame's message; bodies of `names` missing in it are marked as not tracked."""
+def frame_message(number: int, names: Sequence[str], frame: CaptureFrame) -> bytes:
+    """The NatNet message of a frame; each of `names` that it lacks is marked untracked."""
     parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
     parts.append(struct.pack("<i", len(names)))
     for index, name in enumerate(names, 1):
-        pose = seen.bodies.get(name, _UNSEEN)
+        pose = frame.bodies.get(name, _UNSEEN)
         w, x, y, z = pose.quaternion
-        tracked = name in seen.bodies
+        tracked = name in frame.bodies
         parts.append(struct.pack("<i3f4ffh", index, *pose.position_m, x, y, z, w, 0.0, tracked))
     parts += [_EMPTY] * 4  # skeletons, labelled markers, force plates, devices
-    ticks = round(seen.t_s * _TICKS_HZ)
-    parts.append(struct.pack("<IId3Qh", 0, 0, seen.t_s, ticks, ticks, ticks, 0) + _EMPTY)
+    ticks = round(frame.t_s * _TICKS_HZ)
+    parts.append(struct.pack("<IId3Qh", 0, 0, frame.t_s, ticks, ticks, ticks, 0) + _EMPTY)
     return _message(FRAME, *parts)

@@ -52,7 +52,7 @@ _SETPOINTS = {
 def execute_packet(firmware: Firmware, packet: Packet) -> bytes | None:
     """Let the firmware execute a packet; return the answer's data, None for no answer.
 
-    Raises struct.error for one that is too short for its command.
+    Raises struct.error for a packet that is too short for its command.
     """
     data = packet.data
     match packet.port, packet.channel, data[0] if data else None:
@@ -157,7 +157,7 @@ class CNumber:
         return (whole & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
 
     def unpack(self, data: bytes) -> float:
-        """Raises struct.error when `data` has another length."""
+        """The number in `data`. Raises struct.error when the length is not `size`."""
         return float(struct.unpack("<" + self.letter, data)[0])
 
 
@@ -192,12 +192,12 @@ class Toc:
         self._info = struct.pack("<BHI", self._INFO, len(codes), crc) + info_tail
 
     def name(self, ident: bytes) -> str | None:
-        """The name with a number, given as two bytes; None for an unknown number."""
+        """The name with the number `ident`, two bytes; None for an unknown number."""
         number = int.from_bytes(ident, "little")
         return self._names[number] if len(ident) == 2 and number < len(self._names) else None
 
     def answer(self, data: bytes) -> bytes | None:
-        """The answer to a request on channel 0."""
+        """The answer to a request on channel 0, None for an unknown request."""
         if data[0] == self._INFO:
             return self._info
         if data[0] != self._ITEM or len(data) < 3:
@@ -239,7 +239,7 @@ class _Block:
 
 
 class CrtpServer:
-    """Serves one firmware to one peer; before protocol 12 it has no supervisor port."""
+    """Serves one firmware to one peer; before protocol 12 the server has no supervisor port."""
 
     def __init__(
         self,
@@ -291,7 +291,7 @@ class CrtpServer:
         self._blocks.clear()
 
     def replace_firmware(self, firmware: Firmware) -> None:
-        """Serve another firmware, same log blocks (a test's short cut for a new vehicle)."""
+        """Serve another firmware with the same log blocks."""
         self._firmware = firmware
         for block in self._blocks.values():
             if block.due_s is not None:
@@ -402,7 +402,7 @@ class CrtpServer:
         return data[:2] + bytes((OK,)) + self._value(name)
 
     def _write(self, data: bytes) -> bytes | None:
-        """Answers with the value that is kept; a read-only one is passed over in silence."""
+        """Answers with the kept value; read-only parameters do not change."""
         name = self._param_toc.name(data[:2])
         if name is None:
             return data[:2] + bytes((ENOENT,))

@@ -83,11 +83,11 @@ class VehicleHost:
 
     @property
     def elapsed_s(self) -> float:
-        """Simulated time since the start; unlike the firmware's, no reboot resets it."""
+        """Simulated time since the start; no reboot resets it."""
         return self._steps * CONTROL_PERIOD_S
 
     def serve(self) -> None:
-        """Answer what has arrived, without time passing; log data waits for the next step."""
+        """Answer the arrived packets, without time passing; log data waits for the next step."""
         while True:
             try:
                 datagram, address = self.socket.recvfrom(64)
@@ -101,7 +101,7 @@ class VehicleHost:
             self._send(self.server.handle(packet), address)
 
     def step(self) -> None:
-        """Serve what has arrived, advance by one control period, and send what is due."""
+        """Answer the arrived packets, advance by a control period, and send due log data."""
         self.serve()
         vehicle = self.vehicle
         vehicle.step()
@@ -136,7 +136,7 @@ class VehicleHost:
         self._silent_s = (self.elapsed_s, self.elapsed_s + duration_s)
 
     def truth(self) -> dict[str, Any]:
-        """The true state, SI and radians, and firmware outputs: no Crazyflie reports it."""
+        """The true state, SI and radians, and firmware outputs, by name."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
         ceiling_n, floor = world.push_n_and_on_floor()
         return {
@@ -155,7 +155,7 @@ class VehicleHost:
         }
 
     def replace_vehicle(self, scenario: Scenario) -> None:
-        """Put a new vehicle under the same link: connection and log blocks stay."""
+        """Replace the vehicle by a new vehicle; connection and log blocks stay."""
         self.vehicle = SimulatedVehicle(scenario, **self._parts)
         self.server.replace_firmware(self.vehicle.firmware)
 
@@ -265,8 +265,7 @@ class HostRunner:
         return max(0.0, next_s - self._clock())
 
     def _must_wait(self) -> bool:
-        """True while the flight's loop has not kept up, for `LOOP_PATIENCE_S` at most: what hangs
-        for good must not stop time."""
+        """True while the flight's loop has not kept up, for `LOOP_PATIENCE_S` at most."""
         limit_s, before_s = self._shared.limit_s, self._limit_s
         if self._host.elapsed_s < limit_s:
             self._waiting_since_s = None

@@ -30,8 +30,8 @@ LEAST_RISE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Undistorted rays (x, y, 1) at nodes `stride` px apart. If that is more than one pixel, a
-    margin of one node surrounds the picture.
+    """Undistorted rays (x, y, 1) at nodes `stride` px apart. With a stride above 1 px, a margin
+    of one node surrounds the picture.
 
     Node (j, i) then sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
     cv2.resize by `stride` puts its sample centres.
@@ -103,7 +103,7 @@ def trace_rays(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDA
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
-    """The picture's pixels per metre around a node (geometric mean of both directions)."""
+    """Pixels per metre around a node, mean of both directions, from the nodes' points, m."""
     row, col = min(max(row, 1), len(nodes) - 2), min(max(col, 1), nodes.shape[1] - 2)
     a = (nodes[row, col + 1] - nodes[row, col - 1]).astype(np.float64)
     b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)

@@ -38,11 +38,11 @@ class SimProcess:
     does not answer, `InvalidValue` when it refuses.
 
     Attributes:
-        uri: for cflib.
-        stream_url: for a network camera; "" without a camera.
-        capture: the motion capture's kind and address for `motioncapture`; None without one.
+        uri: address for cflib.
+        stream_url: address of the video; "" without a camera.
+        capture: the motion capture's kind and address for `motioncapture`, or None.
         shared_time: how far simulated time has come in real time, and how far it may go.
-        pid: of the child.
+        pid: process number of the child.
     """
 
     uri = stream_url = ""
@@ -76,8 +76,7 @@ class SimProcess:
         """Start the vehicle and wait until it answers. With `pace` "stepped" time passes by
         `advance` only.
 
-        `settings` are further arguments of `VehicleHost`. Raises `ConnectionFailed` when the child
-        ends, `TimedOut` when it does not answer.
+        `settings` are further arguments of `VehicleHost`.
         """
         return cls(pace, scenario or Scenario(), settings)
 

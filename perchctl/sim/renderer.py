@@ -212,7 +212,7 @@ class Renderer:
         motion_px: Array,
         length_px: float,
     ) -> Picture:
-        """The bare ceiling, several pixels drawn as one: it carries no measurement."""
+        """The bare ceiling, several pixels drawn as one."""
         rows, cols = nodes.shape[:2]
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
@@ -243,17 +243,17 @@ class Renderer:
             rows, cols = pixel_slices(view.box)
             xy = np.ascontiguousarray(pixels.xy[rows, cols])
             rays = RayGrid(xy, pixels.row_share[rows], pixels.boundary_xy)
-            picture[rows, cols] = cover(picture[rows, cols], view, maps, rays)
+            picture[rows, cols] = draw_sheet_over(picture[rows, cols], view, maps, rays)
             return
-        blocks, is_paper = as_blocks(picture)[view.box], view.is_plain & (view.alpha > 0)
+        blocks, is_paper = as_blocks(picture)[view.box], view.is_uniform & (view.alpha > 0)
         blocks[is_paper] = view.value[is_paper][:, None, None]
-        if view.is_plain.all():
+        if view.is_uniform.all():
             return
-        below = blocks[~view.is_plain]
-        xy = as_blocks(pixels.xy)[view.box][~view.is_plain].reshape(len(below), -1, 2)
+        below = blocks[~view.is_uniform]
+        xy = as_blocks(pixels.xy)[view.box][~view.is_uniform].reshape(len(below), -1, 2)
         rays = RayGrid(xy, pixels.row_share, pixels.boundary_xy)
-        covered = cover(below.reshape(len(below), -1), view, maps, rays)
-        blocks[~view.is_plain] = covered.reshape(below.shape)
+        covered = draw_sheet_over(below.reshape(len(below), -1), view, maps, rays)
+        blocks[~view.is_uniform] = covered.reshape(below.shape)
 
     # --- motion ---
 
@@ -290,8 +290,8 @@ def as_blocks(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels.reshape(shape).swapaxes(1, 2)
 
 
-def cover(below: Picture, view: SheetView, maps: Array, rays: RayGrid) -> Picture:
-    """Return `below` covered by the sheet along the rays, the mean over an exposure's `maps`."""
+def draw_sheet_over(below: Picture, view: SheetView, maps: Array, rays: RayGrid) -> Picture:
+    """Draw the sheet over `below`; `maps` (n, 3, 3): rays to plane at moments of the exposure."""
     texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
     seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
     alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
@@ -308,13 +308,13 @@ def mean_picture(pictures: Sequence[Picture]) -> Picture:
 
 
 def sample_texture(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
-    """The texture's bilinear values at `texels` (h, w, 2) float32; outside by `border`."""
+    """The bilinear values at `texels` (h, w, 2) float32; outside by OpenCV's `border` mode."""
     remap: Any = cv2.remap  # its stub denies that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
 
 def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
-    """Blur the blocks of `box` in place, with the margin that their blur reaches."""
+    """Blur a box of blocks in place by a Gaussian, with the margin that the blur reaches."""
     reach = math.ceil(3.0 * sigma_px) + 1
     near, far = pixel_slices(box, reach), pixel_slices(box, 2 * reach)
     blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)
@@ -370,8 +370,8 @@ def blur_sample_count(length_px: float) -> int:
 def resample_poses(poses: Array, count: int) -> Array:
     """Return `count` poses (count, 4, 4) at the middles of equal parts of the exposure.
 
-    Linear in the matrices of `poses` (n, 4, 4): within an exposure the turn is so small
-    (< 0.05 rad) that the loss of orthogonality is below 1e-3 of a pixel.
+    Linear in the matrices of `poses` (n, 4, 4): an exposure's rotation is so small that the error
+    is below 1e-3 of a pixel.
     """
     if len(poses) == 1:
         return np.broadcast_to(poses, (count, 4, 4))
@@ -383,7 +383,7 @@ def resample_poses(poses: Array, count: int) -> Array:
 
 
 def motion_blur_kernel(motion_px: Array) -> NDArray[np.float32] | None:
-    """The blur kernel of the path at the image's middle; None if it is too short to see."""
+    """The blur kernel of the path at the image's middle; None if the path is too short."""
     path = motion_px[0] - motion_px[0].mean(axis=0)
     reach = float(np.abs(path).max())
     if reach < SHARP_MOTION_PX / 2.0:

@@ -23,7 +23,7 @@ class Neighbour:
     Attributes:
         xy_m: its centre in the axes of the vehicle's own target.
         yaw_rad: its heading less the own target's.
-        large_id, small_id: of its markers, in the own dictionaries; None: the own target's ids.
+        large_id, small_id: its markers' ids, in the own dictionaries; None: the own target's ids.
     """
 
     xy_m: tuple[float, float]
@@ -152,7 +152,7 @@ _LEAST_GAP_S = 1.0
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """The seed's scenario. Values are drawn in a fixed order, so a range added at the end
-    leaves a seed's earlier ones; the groups of harder worlds come from other streams."""
+    leaves a seed's earlier values; harder worlds draw from other random streams."""
     sim = profile.simulation
     rng = np.random.default_rng([seed, _STREAM])
 
@@ -215,8 +215,8 @@ def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
 
 
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """The biases of gyroscope and accelerometer; the latter has none along z, where the
-    firmware's scale would take it out."""
+    """The biases of gyroscope and accelerometer; none along the accelerometer's z,
+    which the firmware's scale corrects."""
     rng = np.random.default_rng([seed, _IMU_STREAM])
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
     x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
@@ -273,9 +273,8 @@ CONNECTED_S = 4.0
 
 class RadioBursts:
     """Gilbert's two-state channel in continuous time: good and bad times have exponentially
-    distributed lengths, whatever the packets' rate. Both directions are lost together, as by
-    a Wi-Fi nearby or a body in the way. The times given to `is_lost` must not decrease; same
-    seed, same bursts.
+    distributed lengths, whatever the packets' rate. Both directions are lost together.
+    The times given to `is_lost` must not decrease; same seed, same bursts.
 
     Args:
         share: lost share of the time, above 0 and below 1.

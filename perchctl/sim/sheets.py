@@ -55,8 +55,8 @@ _BYTE_SIGMA = math.sqrt((256.0**2 - 1.0) / 12.0)
 
 
 class SheetTexture(NamedTuple):
-    """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage, and `clear`
-    the distance to the next change of either, in texels along x or y, at most 255.
+    """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage, and
+    `uniform_texels` the distance to the next change of grey or coverage, along x or y, up to 255.
 
     A point (x, y) of the target's plane (target axes) is at column
     ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``.
@@ -64,7 +64,7 @@ class SheetTexture(NamedTuple):
 
     value: Picture
     alpha: Picture
-    clear: Picture
+    uniform_texels: Picture
     px_per_m: float
     center_px: float
 
@@ -77,7 +77,7 @@ class Sheet:
         self._levels: dict[int, SheetTexture] = {}
 
     def texture(self, image_px_per_m: float) -> SheetTexture:
-        """The sheet's texture at the resolution for an image of that scale."""
+        """The texture at the resolution for an image of `image_px_per_m` pixels per metre."""
         ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
         # Level -1 is the finest resolution with single texels, for views nearer than it suits.
         level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
@@ -137,7 +137,7 @@ class CeilingTexture:
 
 
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
-    """The same smooth surface with more cells, whose opposite rims fit together."""
+    """The same smooth, seamless surface with more cells."""
     padded = np.pad(tile, 2, mode="wrap")
     # One axis after the other, without what lies around the tile: at the coarsest a third.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
@@ -159,28 +159,29 @@ _LOOK_UP_TEXELS = 2.5  # from a block's middle, rounded, to what a bilinear look
 class SheetView(NamedTuple):
     """A sheet in one exposure: `box` is its part of the picture, `to_texels` (3, 3) maps the plane
     of the vehicle's own target to the texture's columns and rows. Of the box's blocks (rows,
-    columns), `is_plain` are those whose pixels all show one `value` and `alpha`. `covers_all`:
+    columns), `is_uniform` are those whose pixels all show one `value` and `alpha`. `covers_all`:
     nothing else is in the picture."""
 
     texture: SheetTexture
     box: Box
     to_texels: Array
     covers_all: bool
-    is_plain: NDArray[np.bool_]
+    is_uniform: NDArray[np.bool_]
     value: Picture
     alpha: Picture
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedSheet:
-    """A sheet, and the map (3, 3) from the plane of the vehicle's own target to the sheet's."""
+    """A sheet, and the homography (3, 3) `to_sheet` from the plane of the vehicle's own target to
+    the sheet's; None: the same plane."""
 
     sheet: Sheet
-    to_sheet: Array | None = None  # None: the same plane
+    to_sheet: Array | None = None
 
     def view(self, nodes: NDArray[np.float32], length_px: float) -> SheetView | None:
-        """Where the sheet is seen at the coarse nodes (rows, columns, 2), in the own
-        target's axes; None where it is out of view.
+        """The sheet as seen at the coarse nodes' points (rows, columns, 2), m, in the own
+        target's axes; None if the sheet is out of view.
 
         `length_px` is the picture's longest motion in the exposure."""
         if self.to_sheet is not None:
@@ -206,12 +207,12 @@ class PlacedSheet:
         at = nodes[1:-1, 1:-1][rows, cols] * scale + centre
         inside = np.clip(np.rint(at), 0, len(texture.value) - 1).astype(int)
         u, v = inside[..., 0], inside[..., 1]
-        clear = np.maximum(np.abs(at - inside).max(axis=-1), texture.clear[v, u])
+        clear = np.maximum(np.abs(at - inside).max(axis=-1), texture.uniform_texels[v, u])
         value, alpha = texture.value[v, u], texture.alpha[v, u]
-        is_plain = clear > reach_m[rows, cols] * scale + _LOOK_UP_TEXELS
-        is_plain &= (alpha == 0) | (alpha == 255)
+        is_uniform = clear > reach_m[rows, cols] * scale + _LOOK_UP_TEXELS
+        is_uniform &= (alpha == 0) | (alpha == 255)
         covers_all = bool((off_m + reach_m < half_m - 2.0 / scale).all())
-        return SheetView(texture, (rows, cols), to_texels, covers_all, is_plain, value, alpha)
+        return SheetView(texture, (rows, cols), to_texels, covers_all, is_uniform, value, alpha)
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -44,7 +44,7 @@ class SimulatedVehicle:
 
     @property
     def t_s(self) -> float:
-        """Simulated time since the start; unlike the firmware's, no reboot resets it."""
+        """Simulated time since the start; no reboot resets it."""
         return self.world.t_s
 
     def advance_to(self, t_s: float) -> None:

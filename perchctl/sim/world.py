@@ -81,7 +81,7 @@ class World:
 
     @property
     def height_m(self) -> float:
-        """Height of the vehicle above its place on the floor."""
+        """Height of the vehicle above its position when it stands on the floor."""
         return float(self.z_m - REST_HEIGHT_M)
 
     @property
@@ -103,7 +103,7 @@ class World:
         self.powertrain.cell.set_rest_v(rest_v)
 
     def step(self, pwm: tuple[float, float, float, float]) -> None:
-        """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
+        """Advance by `CONTROL_PERIOD_S` with the duty cycles 0..65535 of M1..M4."""
         self._steps += 1
         f1, f2, f3, f4 = self.powertrain.step(pwm)
         if self._hand is not None:
@@ -144,7 +144,7 @@ class World:
         )
 
     def gear_tip_m(self) -> tuple[float, float, float]:
-        """The gear's tip in world axes."""
+        """The gear's tip (x, y, z) in world axes."""
         gx, gy, gz = self._scenario.gear_body_m
         rows = zip((self.x_m, self.y_m, self.z_m), self._R, strict=True)
         x, y, z = (place + a * gx + b * gy + c * gz for place, (a, b, c) in rows)
@@ -166,7 +166,7 @@ class World:
     ) -> None:
         """Put the vehicle into a pose, not rotating; `hold` keeps it there until `let_go`.
 
-        No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
+        The gyroscope does not measure the change of pose.
         """
         self._hand = World._stay if hold else None
         self.set_state(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
@@ -189,7 +189,7 @@ class World:
         velocity_mps: Sequence[float] | Array,
         rates_radps: Sequence[float] | Array,
     ) -> None:
-        """Set the state: position, R_world_body (3, 3), velocity and turning rates."""
+        """Set position and velocity, world axes, R_world_body (3, 3), and rates, body axes."""
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
         self._data.qpos[:3] = position_m
@@ -219,7 +219,7 @@ class World:
         )
 
     def push_n_and_on_floor(self) -> tuple[float, bool]:
-        """The push between vehicle and ceiling, N, and whether the floor is touched."""
+        """The contact force at the ceiling, N, and True if the vehicle touches the floor."""
         ceiling_n, floor = 0.0, False
         wrench = np.zeros(6)
         for i, pair in enumerate(self._data.contact.geom.tolist()):
@@ -299,7 +299,7 @@ class Magnet:
         self.let_go = False  # for good: it pulls no more
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
-        """The pull on the gear's tip at `tip_m`, world axes."""
+        """The pull on the gear's tip at `tip_m`, world axes; 0 unless `upright`."""
         scenario = self._scenario
         gap_m = max(0.0, scenario.ceiling_z_m - tip_m[2])
         target_x, target_y = self.target_xy_m
@@ -312,7 +312,7 @@ class Magnet:
 
     @property
     def hold_n(self) -> float:
-        """Force, N, that parts magnet and gear: at the first contact it may be less."""
+        """The force that parts magnet and gear; may be less at the first contact."""
         scenario = self._scenario
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
@@ -337,8 +337,8 @@ _WIND_STREAM = 1
 
 
 class Wind:
-    """A steady wind with gusts, each axis a sum of sines. Its speed is `Scenario.draught_mps` where
-    the gusts are at two standard deviations."""
+    """A steady wind with gusts, each axis a sum of sines. The wind has the speed
+    `Scenario.draught_mps` where the gusts are at two standard deviations."""
 
     def __init__(self, scenario: Scenario) -> None:
         x, y, z = scenario.draught_mps
@@ -355,7 +355,7 @@ class Wind:
             self._gusts.append([(amplitude, w, phase) for w, phase in terms])
 
     def at(self, t_s: float) -> Vector:
-        """The wind at t, m/s, world axes; exactly zero in still air."""
+        """The wind velocity at `t_s`, m/s, world axes; exactly zero in still air."""
         if self._still:
             return (0.0, 0.0, 0.0)
         x, y, z = (

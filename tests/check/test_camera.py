@@ -75,7 +75,7 @@ def rehearsed(
     link.advance_to(0.3)
     source = FaultyCamera(LockstepSource(vehicle, PROFILE.camera.latency_s), seed=1)
     if fault is not None:
-        source.begin(fault, 0.4)
+        source.begin_fault(fault, 0.4)
     clock = LockstepClock(link)
     return rehearse(link.telemetry, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
 

@@ -89,8 +89,8 @@ def drifted(
 ) -> float:
     drift = UndetectedDrift(effects, SCENARIO, by_target=by_target)
     for k in range(1, round(after_s / 0.1)):
-        drift.update_m(0.1 * k, phase)
-    return drift.update_m(after_s, phase)
+        drift.update_drift_m(0.1 * k, phase)
+    return drift.update_drift_m(after_s, phase)
 
 
 SLIDE = partial(e.estimate_error, step_m=(2.0, 0.0, 0.0), drift_mps=(0.3, 0.4, 9.0), for_s=4.0)
@@ -114,7 +114,7 @@ def test_a_slide_of_before_is_forgotten_once_it_is_under_the_target() -> None:
     """And counts anew on the way down, where no picture steers."""
     drift = UndetectedDrift((SLIDE,), SCENARIO, by_target=False)
     way = [(1.0, P.SEARCH), (2.0, P.ALIGN), (3.0, P.ASCEND), (4.0, P.LANDING)]
-    assert [drift.update_m(*each) for each in way] == pytest.approx([0.5, 0.5, 0.0, 0.5])
+    assert [drift.update_drift_m(*each) for each in way] == pytest.approx([0.5, 0.5, 0.0, 0.5])
 
 
 # --- the way down -----------------------------------------------------------------------

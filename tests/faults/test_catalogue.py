@@ -30,7 +30,7 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
             assert 0.0 <= case.moment_s <= USUAL_S[phase]
             assert case.effects
             assert (case.landed_from is not None) == (phase is Phase.LANDING)
-            assert (case.first_hold is not None) == (phase is Phase.RECOVER)
+            assert (case.first_hold_ratio is not None) == (phase is Phase.RECOVER)
             assert all(effect.keywords.get("for_s", 1.0) > 0.0 for effect in case.effects)
 
 
@@ -41,7 +41,7 @@ def test_the_same_seeds_draw_the_same_cases_for_ever() -> None:
         case = draw_case(seed, SCENARIO)
         effects = [(effect.func.__name__, effect.keywords) for effect in case.effects]
         drawn.update(repr((case.fault.name, case.phase, case.moment_s, effects)).encode())
-        drawn.update(repr((case.landed_from, case.landed_after_s, case.first_hold)).encode())
+        drawn.update(repr((case.landed_from, case.landed_after_s, case.first_hold_ratio)).encode())
     assert drawn.hexdigest()[:16] == "3b5972a2ac966813"
 
 

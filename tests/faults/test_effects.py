@@ -82,7 +82,7 @@ class Rig:
         moment_s: float = 0.0,
         capture: CaptureSettings | None = None,
     ) -> None:
-        scenario = e.scenario_for(scenario, effects)
+        scenario = e.apply_to_scenario(scenario, effects)
         self.vehicle = WatchedVehicle(scenario, CAMERA, TargetConfig(), capture)
         self.radio = FaultyRadio()
         self.by_link: list[float] = []
@@ -207,7 +207,7 @@ def frames_of(fault: CameraFault, before_s: float = 0.0) -> list[tuple[float, Fr
     frames = []
     for k in range(150):
         if k == 50:
-            camera.begin(fault, 1.0)
+            camera.begin_fault(fault, 1.0)
         if (frame := camera.poll(k * 0.02)) is not None:
             frames.append((k * 0.02, frame))
     return frames
@@ -366,12 +366,12 @@ def test_the_magnet_lets_go_after_the_contact() -> None:
 def test_what_is_so_from_the_start() -> None:
     weight_n = SCENARIO.mass_kg * GRAVITY_MPS2
     first = replace(SCENARIO, first_contact_force_n=0.1)
-    weak = e.scenario_for(first, (partial(e.magnet_holds, of_weight=0.5),))
+    weak = e.apply_to_scenario(first, (partial(e.magnet_holds, of_weight=0.5),))
     assert weak.magnet_force_n == pytest.approx(0.5 * weight_n)
     assert weak.first_contact_force_n is None
-    other = e.scenario_for(SCENARIO, (partial(e.room, ceiling_z_m=1.2, no_target=True),))
+    other = e.apply_to_scenario(SCENARIO, (partial(e.room, ceiling_z_m=1.2, no_target=True),))
     assert (other.ceiling_z_m, other.no_target) == (1.2, True)
-    assert e.scenario_for(SCENARIO, (partial(e.killed),)) == SCENARIO
+    assert e.apply_to_scenario(SCENARIO, (partial(e.killed),)) == SCENARIO
 
 
 # --- the operator and the program ---------------------------------------------------------------

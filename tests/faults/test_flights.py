@@ -223,9 +223,9 @@ def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> No
     scenario = draw_scenario(profile(), SEED)
     case = draw_fault_case(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
     flight = faulty.FaultyFlight(profile(), case, scenario)
-    assert flight._sample(0.0).heard
+    assert flight._sample(0.0).telemetry_ok
     flight._injector.begin(0.0)
-    assert flight._sample(0.02).heard is heard
+    assert flight._sample(0.02).telemetry_ok is heard
 
 
 def test_a_refusal_says_that_nothing_was_started(monkeypatch: pytest.MonkeyPatch) -> None:

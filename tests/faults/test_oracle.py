@@ -14,10 +14,10 @@ G = 9.81
 FLOOR = Sample(
     t_s=0.0, x_m=0.0, y_m=0.0, height_m=0.0, vz_mps=0.0, body_up_z=1.0, acc_g=1.0, motors_on=False,
     pressing=False, on_floor=True, hanging=False, hold_ratio=2.0, locked=False,
-    ended_by_vehicle=False,
+    supervisor_ended=False,
 )  # fmt: skip
 FLOOR_ON = FLOOR._replace(motors_on=True)
-LOCKED = FLOOR._replace(locked=True, ended_by_vehicle=True)
+LOCKED = FLOOR._replace(locked=True, supervisor_ended=True)
 HOVER = FLOOR._replace(height_m=1.0, motors_on=True, on_floor=False)
 LOW = HOVER._replace(height_m=0.05)
 HANGING = HOVER._replace(height_m=2.0, motors_on=False, hanging=True)
@@ -56,11 +56,11 @@ class Script:
         return self
 
     def press(self) -> Script:
-        self.oracle.note_press(self.t_s)
+        self.oracle.note_ctrl_c(self.t_s)
         return self
 
     def end(self) -> Script:
-        self.oracle.note_end(self.t_s)
+        self.oracle.note_program_end(self.t_s)
         return self
 
     @property
@@ -100,9 +100,9 @@ def test_a_flight_that_hangs_raises_nothing() -> None:
         (HOVER._replace(height_m=3.2), 0.5, set()),
         (HOVER._replace(height_m=3.4), 0.5, {"strayed"}),
         (FLOOR._replace(astray_m=2.5), 0.5, set()),  # where it landed
-        (HOVER._replace(overdue=True), 0.1, {"flies_on"}),
-        (HANGING._replace(overdue=True), 0.1, set()),
-        (FLOOR_ON._replace(overdue=True), 0.1, set()),
+        (HOVER._replace(descent_overdue=True), 0.1, {"flies_on"}),
+        (HANGING._replace(descent_overdue=True), 0.1, set()),
+        (FLOOR_ON._replace(descent_overdue=True), 0.1, set()),
         (FLOOR._replace(locked=True), 1.0, {"locked_needlessly"}),
     ],
 )
@@ -127,7 +127,7 @@ def test_what_is_a_flag_and_what_is_not_yet_one(
 )  # fmt: skip
 def test_touchdown(sink_mps: float, aside_mps: float, flags: set[str]) -> None:
     """By its speed before the floor brakes it; a vehicle that slides on is judged once."""
-    low = HOVER._replace(height_m=0.3, aside_mps=aside_mps)
+    low = HOVER._replace(height_m=0.3, horizontal_mps=aside_mps)
     script = Script((low, 0.1)).sink(low, iter([sink_mps] * 200)).show(FLOOR, 0.5)
     assert script.flags == flags
     low = HOVER._replace(height_m=0.1)
@@ -218,7 +218,7 @@ def test_lied(claim: Claim) -> None:
 
 
 def test_a_claim_may_be_of_before_or_become_true_within_half_a_second() -> None:
-    script = Script((HOVER._replace(body_up_z=0.2, ended_by_vehicle=True), 0.2), (FLOOR_ON, 1.0))
+    script = Script((HOVER._replace(body_up_z=0.2, supervisor_ended=True), 0.2), (FLOOR_ON, 1.0))
     script.claim("tilted", "ended by the supervisor", "motors off")
     assert script.show(FLOOR_ON, 0.3).show(FLOOR, 2.0).flags == set()
 
@@ -240,7 +240,7 @@ def test_motors_that_were_said_to_be_off_turn_no_more(claim: Claim) -> None:
     [
         (5.0, {}, set()),
         (6.5, {}, {"lied"}),
-        (6.5, {"heard": False}, set()),
+        (6.5, {"telemetry_ok": False}, set()),
         (6.5, {"motors_on": True}, set()),
     ],
 )
@@ -317,7 +317,7 @@ def test_one_ctrl_c_asks_for_no_stop_and_nobody_obeys_after_the_end() -> None:
     assert ended.show(FLOOR_ON, 1.0).flags == set()
 
 
-@pytest.mark.parametrize("changes", [{"ended_by_vehicle": True}, {"body_up_z": 0.3}])
+@pytest.mark.parametrize("changes", [{"supervisor_ended": True}, {"body_up_z": 0.3}])
 def test_a_lock_has_its_reason_in_a_crash_before_it(changes: dict[str, Any]) -> None:
     """What tumbles after the lock was locked without reason."""
     locked = FLOOR._replace(locked=True)

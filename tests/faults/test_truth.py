@@ -59,7 +59,7 @@ def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehi
     vehicle.world.set_pose((x_m + 0.04, y_m, 1.0), velocity_mps=(0.3, -0.4, 9.0))
     gear_m = SCENARIO.gear_body_m
     sample = true_sample(vehicle)
-    assert sample.aside_mps == pytest.approx(0.5)
+    assert sample.horizontal_mps == pytest.approx(0.5)
     assert sample.miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
     assert sample.below_m == pytest.approx(SCENARIO.ceiling_z_m - gear_m[2] - 1.0)
     above = WatchedVehicle(replace(SCENARIO, target_above_ceiling_m=0.1), CAMERA, TargetConfig())
@@ -113,7 +113,7 @@ def test_the_magnet_is_watched_by_the_world_not_by_the_report(
     it.magnet.let_go = True
     it.show(HANGING, DT_S)
     assert it.facts.magnet_failed_s == pytest.approx(it.t_s - DT_S)
-    assert it.facts.was_watched is watched
+    assert it.facts.hung_through_watch is watched
 
 
 def test_silence_that_ends_in_a_cut() -> None:
@@ -122,7 +122,7 @@ def test_silence_that_ends_in_a_cut() -> None:
     assert it.facts.silence_lock_s is None
     it.show(HOVER, 2.0, uplink=False).show(HOVER, 1.0, uplink=False, locked=True)
     assert it.facts.silence_lock_s == pytest.approx(4.0 + CUT_S + 0.05)
-    assert not it.facts.own_landing
+    assert not it.facts.onboard_landing
 
 
 @pytest.mark.parametrize(
@@ -147,8 +147,8 @@ def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() 
     it = Recorded().show(HOVER, 1.0)
     it.planner.active = True
     it.show(HOVER, CUT_S - 0.1, uplink=False)
-    assert not it.facts.own_landing
-    assert it.show(HOVER, 0.2, uplink=False).facts.own_landing
+    assert not it.facts.onboard_landing
+    assert it.show(HOVER, 0.2, uplink=False).facts.onboard_landing
 
 
 @pytest.mark.parametrize(("before", "flew"), [(HOVER, True), (HANGING, False)])

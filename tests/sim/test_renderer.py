@@ -242,7 +242,7 @@ def test_blocks_of_one_grey_are_what_each_pixel_s_look_up_gives(
 
     def each_pixel(*args: Any) -> SheetView | None:
         seen = view(*args)
-        return seen and seen._replace(is_plain=np.zeros_like(seen.is_plain), covers_all=False)
+        return seen and seen._replace(is_uniform=np.zeros_like(seen.is_uniform), covers_all=False)
 
     monkeypatch.setattr(PlacedSheet, "view", each_pixel)
     for poses, picture in zip(exposures, pictures, strict=True):

@@ -41,7 +41,7 @@ _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
 
 
 class Estimator:
-    """Writes `now` (an `Estimate`) and `acc_g` once a control period."""
+    """Computes `now`, the state estimate, and `acc_g`, the accelerometer's reading."""
 
     def __init__(self, scenario: Scenario, parameters: Mapping[str, float]) -> None:
         self._scenario, self._parameters = scenario, parameters
@@ -73,15 +73,14 @@ class Estimator:
             self.outside.reset()
 
     def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
-        """Take an external position, or pose; only a vehicle without a deck uses it."""
+        """Correct the estimate by an external position or pose; no effect with a deck."""
         if self.outside is not None and self._parameters["stabilizer.estimator"] == KALMAN:
             self.outside.update_position(position_m)
             if quaternion is not None:
                 self.outside.update_attitude(quaternion)
 
     def add_accelerometer_bias(self, z_mps2: float) -> None:
-        """Add to the accelerometer's bias along z. No effect with a deck, whose estimate
-        needs none."""
+        """Add to the accelerometer's bias along z. No effect with a deck."""
         if self._imu is not None:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
@@ -104,7 +103,8 @@ class Estimator:
         pressed: bool = False,
     ) -> None:
         """Advance by one control period. Drift runs once the vehicle `has_flown`; `spinning`
-        motors shake the accelerometer; `flying` is the supervisor's state."""
+        motors shake the accelerometer, `pressed` to the ceiling it is biased; `flying` is the
+        supervisor's state."""
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:
@@ -149,7 +149,7 @@ class Estimator:
         )
 
     def _integrate(self, world: World) -> tuple[float, float, float, float]:
-        """The attitude after one more control period of turning."""
+        """The attitude after one more control period."""
         truth = world.quaternion
         if self.gyro is None:
             return truth
@@ -168,7 +168,7 @@ class Estimator:
         return (scale * nw, scale * nx, scale * ny, scale * nz)
 
     def _walk(self, noise: Vector, keep: float, sigma: float) -> Vector:
-        """Return coloured noise, a step later: it keeps a share of what it was."""
+        """Return coloured noise a step later."""
         take, kick = self._white.pop, sigma * math.sqrt(1.0 - keep * keep)
         x, y, z = noise
         return keep * x + kick * take(), keep * y + kick * take(), keep * z + kick * take()

@@ -148,7 +148,7 @@ class Firmware:
         self.supervisor.emergency = True
 
     def take_external(self, position_m: Vector, quaternion: Quaternion | None = None) -> None:
-        """Take a position from outside, m, or a pose: w, x, y, z, body to world."""
+        """Take an external position, m, or a pose; `quaternion`: w, x, y, z, body to world."""
         self.estimator.take_external(position_m, quaternion)
 
     # What can be read ---------------------------------------------------------------
@@ -170,7 +170,7 @@ class Firmware:
         return LOG_VARIABLES[name].read(self)
 
     def get_parameter(self, name: str) -> float:
-        """Raises KeyError for an unknown name."""
+        """The value of a parameter. Raises KeyError for an unknown name."""
         return self._parameters[name]
 
     def set_parameter(self, name: str, value: float) -> None:

@@ -71,14 +71,14 @@ class Imu:
         self._count = 0
 
     def add(self, force_mps2: Vector, rates_radps: Vector) -> bool:
-        """Take the true specific force and rates, body axes; True if a mean is due."""
+        """Add the true specific force and rates, body axes; True if `read` is due."""
         values = (*force_mps2, *rates_radps)
         self._sums = [total + value for total, value in zip(self._sums, values, strict=True)]
         self._count += 1
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
-        """The mean of the values added since the last reading, with the sensors' errors."""
+        """The mean since the last reading, with sensor errors; `pressed`: to the ceiling."""
         if len(self._white) < 6:
             self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
         take = self._white.pop
@@ -219,7 +219,7 @@ class ExternalFilter:
         np.fill_diagonal(self.covariance, bounded)
 
     def _force(self, acceleration_mps2: Sequence[float], *, flying: bool) -> Vector:
-        """What is believed of the specific force, in world axes."""
+        """The assumed specific force, world axes."""
         w, x, y, z = self.quaternion
         ax, ay, az = acceleration_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)

@@ -94,7 +94,7 @@ class HighLevelPlanner:
         t_s: float,
         state: int = FLYING,
     ) -> bool:
-        """Plan the way to a height, in `state`; False if refused. `yaw_rad` None: same heading."""
+        """Plan a vertical flight to a height; False if refused. `yaw_rad` None: same heading."""
         if self.blocked or self.state not in ((IDLE, FLYING) if state == LANDING else (IDLE,)):
             return False
         x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
@@ -116,7 +116,7 @@ class HighLevelPlanner:
         relative: bool,
         t_s: float,
     ) -> None:
-        """Plan the way to a place; `relative` offsets are in world axes (firmware fact)."""
+        """Plan a flight to a pose; `relative`: x, y, z, yaw are offsets, in world axes."""
         if self.blocked:
             return
         if self.active:
@@ -130,7 +130,7 @@ class HighLevelPlanner:
         self.state = FLYING
 
     def setpoint(self, t_s: float) -> Setpoint:
-        """The setpoint at t; a null one (motors off) while idle."""
+        """The plan's setpoint at `t_s`; while idle a setpoint with motors off."""
         if self.state == LANDING and self.finished(t_s):
             self.state = IDLE
         if self.state == IDLE:

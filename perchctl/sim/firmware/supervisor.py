@@ -106,7 +106,7 @@ class Supervisor:
         return before in _IN_FLIGHT and self.state in (State.CRASHED, State.RESET)
 
     def info(self, *, hl_active: bool, hl_finished: bool) -> int:
-        """The `supervisor.info` bit field."""
+        """The `supervisor.info` bits; `hl_` is the high-level planner."""
         bits = {
             CAN_ARM: self.state is State.CHECKS_PASSED,
             ARMED: self.armed,
