@@ -46,7 +46,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "perchctl.flight.inputs:add_samples",
         "perchctl.perception.perception:update_calibration",
         "perchctl.flight.inputs:TurnReporter.flown",
-        "perchctl.flight.inputs:TurnReporter.report_waiting",
+        "perchctl.flight.inputs:TurnReporter.report_waiting_turn",
         "perchctl.flight.lockstep:TruthWatcher.tick",
     ),
 }

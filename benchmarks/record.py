@@ -79,12 +79,12 @@ def as_jpeg(frame: Frame) -> Frame:
 def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, RecordingEnd]:
     """Wall ms by part and by whether it was recorded, a value a turn."""
     logs = {
-        record: LogWatcher.real_time(folder, PROFILE, "udp://", "camera:0", record=record)
+        record: LogWatcher.open_real_time(folder, PROFILE, "udp://", "camera:0", record=record)
         for record in (False, True)
     }
     began_s = time.monotonic()
     camera: FrameSource = Camera(frames, began_s)
-    sources = {record: log.watched(camera) for record, log in logs.items()}
+    sources = {record: log.watch_source(camera) for record, log in logs.items()}
     setup, state = setup_with(), PipelineState()
     took: Times = {(part, record): [] for part in PARTS for record in logs}
     due_s, number = began_s, 0

@@ -70,7 +70,7 @@ def spawn(code: str, output: int | IO[bytes]) -> tuple[subprocess.Popen[bytes], 
 
 
 def connect_to_parent() -> Channel:
-    """The connection of a `spawn`ed child to its parent, and report that it is up."""
+    """Return a `spawn`ed child's connection to its parent, and tell the parent it is up."""
     channel = Channel(int(sys.argv[2]))
     channel.send(None)
     return channel
@@ -101,7 +101,7 @@ def wait_or_kill(child: subprocess.Popen[bytes], timeout_s: float) -> None:
 
 
 def last_line(output: IO[bytes]) -> str:
-    """The last line that a child has printed, with a colon before it, for a message."""
+    """A child's last line of output, after a colon, for a message; empty without output."""
     if output.closed:
         return ""
     output.seek(0)

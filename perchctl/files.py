@@ -63,14 +63,14 @@ def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str 
 
 
 def check_writable(path: Path, force: bool) -> None:
-    """Check that a file can be put there; to be called before any long work.
+    """Check that `path` can be written; to be called before any long work.
 
     Args:
         force: an existing file may be replaced.
 
     Raises:
-        InvalidValue: the path is a folder, a file that must not be replaced, or where no file
-        and no folder can be made.
+        InvalidValue: the path is a folder, a file that must not be replaced, or a place where
+        no file or folder can be made.
     """
     # Of os.path, which takes a folder without rights for one that holds nothing.
     if os.path.isdir(path):
@@ -84,15 +84,15 @@ def check_writable(path: Path, force: bool) -> None:
         raise InvalidValue(f"{path} cannot be written: no right to write in {folder}")
 
 
-def same_file(one: Path, other: Path) -> bool:
+def same_file(path: Path, other: Path) -> bool:
     """True if both paths exist and lead to the same file."""
-    return one.exists() and other.exists() and one.samefile(other)
+    return path.exists() and other.exists() and path.samefile(other)
 
 
 def write_error(
     path: Path, error: OSError, more: str = ": free some space, or choose another place"
 ) -> InvalidValue:
-    """The operating system's refusal as an error of one sentence."""
+    """The operating system's refusal as an error of one sentence, which ends with `more`."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 
 
@@ -144,8 +144,7 @@ def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
     """Write all files, or none: the first is renamed when the last is written.
 
     Args:
-        mode: permissions of those that are new, by default the system's; one that is replaced
-            keeps its own.
+        mode: permissions of new files, by default the system's; a replaced file keeps its own.
 
     Raises:
         InvalidValue: a path is a folder; or a full disk, or missing rights.

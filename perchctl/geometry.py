@@ -31,7 +31,7 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 """Maps target axes into OpenCV's marker axes (and back: it is its own inverse)."""
 
 
-def finite(values: Array) -> bool:
+def is_finite(values: Array) -> bool:
     """True if all values are finite (and none so great that their squares' sum is not)."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))

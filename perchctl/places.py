@@ -12,14 +12,13 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def data_folder(kind: str) -> Path:
-    """The folder of shipped `profiles` or `calib`: inside an installed wheel, or in the
-    checkout."""
+    """The folder of shipped files of a `kind` (`profiles`, `calib`), in the wheel or checkout."""
     shipped = _PACKAGE / "_data" / kind
     return shipped if shipped.is_dir() else _PACKAGE.parent / kind
 
 
 def data_file(kind: str, name: str) -> Path | None:
-    """A shipped or user file by name (with or without .yaml), or None."""
+    """Path of a user's or shipped file by name, with or without .yaml; None if missing."""
     for folder in (user_folder("config") / kind, data_folder(kind)):
         for candidate in (folder / name, folder / f"{name}.yaml"):
             if candidate.is_file():
@@ -34,8 +33,7 @@ def file_names(kind: str) -> list[str]:
 
 
 def is_shipped_example(path: Path) -> bool:
-    """Return whether a calibration is a shipped example by what is in it: a copy under another name
-    fits no other lens."""
+    """True if a calibration has the content of a shipped example, also under another name."""
     try:
         text = path.read_bytes()
         return any(text == file.read_bytes() for file in data_folder("calib").glob("example_*"))
@@ -44,8 +42,8 @@ def is_shipped_example(path: Path) -> bool:
 
 
 def user_folder(kind: Literal["config", "cache", "state", "runtime"]) -> Path:
-    """A folder of the user's by the XDG rules: for own profiles and calibrations, for what
-    can be made anew, for results, or for what lives no longer than a session. It is not made."""
+    """The user's folder by the XDG rules, which is not made: `config` for profiles and
+    calibrations, `cache` for what can be made anew, `state` for results, `runtime` for locks."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # where the system names none, another is taken
         find = getattr(platformdirs, f"user_{kind}_dir")

@@ -11,8 +11,6 @@ _MOST_SHOWN = 60
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that is there twice."""
-
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         first: dict[tuple[str, str], int] = {}
         for key, _ in node.value:
@@ -28,7 +26,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> Any:
-    """The value that the text holds, None for an empty one.
+    """The value that the text holds; None for an empty text.
 
     Raises ValueError, with a sentence, for what is not YAML or holds a key twice.
     """
@@ -55,6 +53,6 @@ def split_values(text: str) -> list[str]:
     return [row[part.start_mark.index : part.end_mark.index].strip() for part in node.value]
 
 
-def clip_text(text: str, most: int = _MOST_SHOWN) -> str:
-    """The text, or its beginning if it is longer than `most`."""
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+def clip_text(text: str, max_length: int = _MOST_SHOWN) -> str:
+    """The text, cut to `max_length` characters, then ending in ``...``."""
+    return text if len(text) <= max_length else f"{text[: max_length - 3]}..."

@@ -46,8 +46,8 @@ class Telemetry:
     acc_y_g: float = 0.0
     start: int = 0
 
-    def has_bit(self, bit: int) -> bool:
-        return bool(self.supervisor & bit)
+    def has_bit(self, supervisor_bit: int) -> bool:
+        return bool(self.supervisor & supervisor_bit)
 
 
 # --- What a vehicle may be doing, by its newest telemetry: what is old is unknown, and what is
@@ -59,7 +59,7 @@ FRESH_S = 0.3
 
 
 def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
-    """True if there is telemetry, and it is fresh."""
+    """True if the newest telemetry is at most `FRESH_S` old."""
     return newest is not None and now_s - newest.t_s <= FRESH_S
 
 
@@ -85,10 +85,10 @@ def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
 
 @dataclass(frozen=True)
 class ExternalPosition:
-    """Where the vehicle is, measured from outside: for its estimator, and no command.
+    """The vehicle's position as measured from outside, for its estimator; not a command.
 
-    In the world of the state estimate. `quaternion` (w, x, y, z) turns body axes to world
-    axes; None where only the position is known.
+    `position_m` is in the world of the state estimate. `quaternion` (w, x, y, z) turns body axes
+    to world axes; None where only the position is known.
     """
 
     position_m: tuple[float, float, float]
@@ -134,7 +134,7 @@ class StopMotors:
 
 @dataclass(frozen=True)
 class Land:
-    """High-level landing: handed over once, then the vehicle flies it alone."""
+    """High-level landing to `height_m` in the world: sent once, then flown by the vehicle alone."""
 
     height_m: float
     duration_s: float
@@ -149,5 +149,5 @@ Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencySto
 
 
 def is_battery_reading(volts: float) -> bool:
-    """True if a cell can have that voltage; NaN is none."""
+    """True if a battery cell can have that voltage; False for NaN."""
     return NO_BATTERY_READING_V <= volts <= MOST_CELL_V

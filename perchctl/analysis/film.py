@@ -74,7 +74,7 @@ def _film_pictures(
     stage = _Stage(flight, width_px)
     coming, image, newest = next(recorded, None), None, flight.log.records[0]
     for t_s in times_s:
-        index = flight.log.index_at(float(t_s))
+        index = flight.log.tick_index_at(float(t_s))
         record = flight.log.records[index]
         if record.get("frame") is not None:
             newest = record

@@ -211,7 +211,7 @@ class FlightAnalysis:
     def value_at(self, t_s: float, log_field: str) -> float:
         """A log field's value in the tick at `t_s`; NaN if it is missing or not a number."""
         records = self.log.records
-        value = records[self.log.index_at(t_s)].get(log_field) if records else None
+        value = records[self.log.tick_index_at(t_s)].get(log_field) if records else None
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return math.nan
         return float(value)

@@ -270,7 +270,7 @@ def captions_and_records(flight: FlightAnalysis) -> dict[int, tuple[str, dict[st
     log = flight.log
     found = {}
     for stay in log.phases:
-        until_then = log.records[log.index_at(stay.start_s) :: -1]
+        until_then = log.records[log.tick_index_at(stay.start_s) :: -1]
         record = next((r for r in until_then if r.get("frame") is not None), None)
         if stay.phase in DECIDED and record is not None:
             caption = f"{DECIDED[stay.phase]}, {log.to_flight_s(float(record['t_s'])):.1f} s"

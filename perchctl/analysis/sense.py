@@ -142,11 +142,11 @@ def replay_inputs(
     there the pipeline's state would differ from the flight's.
     """
     given = _Given(pictures, pipeline.camera.size_px, delay_s)
-    inputs = FlightInputs(given, given, pipeline, profile, recorded=True)
+    inputs = FlightInputs(given, given, pipeline, profile, is_logged=True)
     with _one_thread():
         for turn in turns:
             given.turn(turn)
-            inputs.poll_inputs(turn.began_s, look=turn.taken.look)
+            inputs.poll_inputs(turn.began_s, search=turn.taken.look)
             if turn.t_s != turn.began_s:
                 inputs.catch_up(turn.began_s, turn.t_s)
             yield ReplayedInputs(turn, inputs.poses, _observed(turn, inputs))

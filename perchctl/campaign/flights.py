@@ -64,7 +64,9 @@ def fly_seed(
     Errors: NotFound, InvalidValue (calibration, log)."""
 
     def fly(_scenario: Scenario) -> FlightResult:
-        log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
+        log = (
+            None if log_path is None else LogWatcher.open_lockstep(log_path, profile, seed, record)
+        )
         try:
             flight = fly_lockstep(profile, seed, log)
         except (SafetyAbort, TimedOut) as error:

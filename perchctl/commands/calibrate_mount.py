@@ -255,7 +255,7 @@ def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
     link.connect()
 
     def problem(now_s: float) -> str | None:
-        if link.motors_run:
+        if link.motors_running:
             raise SafetyAbort(
                 f"the motors of {uri} turn, or did 2 s ago: nothing is measured by hand "
                 f"with them on; switch it off and on"

@@ -184,7 +184,7 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
     """Fly, log, plot and report how the flight ended; return the exit code. `view`: open the live
     page; `confirm`: ask on the terminal before arming."""
     simulated_seed = options.seed if options.simulated else None
-    log = LogWatcher.real_time(
+    log = LogWatcher.open_real_time(
         options.log_dir,
         options.profile,
         options.uri,
@@ -268,10 +268,10 @@ def _session(
     asks: bool,
 ) -> tuple[FlightReport, float | None]:
     watchers: tuple[Watcher, ...] = (log, display)
-    watched = log.watched
+    watched = log.watch_source
     if page is not None:
         watchers = (*watchers, page)
-        watched = lambda source: page.watch_source(log.watched(source))  # noqa: E731
+        watched = lambda source: page.watch_source(log.watch_source(source))  # noqa: E731
     with operator_signals(switch, say):
         ask = partial(ask_before_arming, options.uri) if asks else None
         return fly_session(options, watchers, switch, watched, log.remarks, ask)

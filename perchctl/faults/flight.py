@@ -41,8 +41,8 @@ from perchctl.faults.truth import (
 from perchctl.flight import (
     FlightParts,
     OperatorSwitch,
-    feed_lockstep,
     fly,
+    lockstep_feed,
     lockstep_source,
 )
 from perchctl.geometry import GRAVITY_MPS2
@@ -97,7 +97,7 @@ class FaultyFlight:
             log.truth = self._for_log
             watchers = (self, log)
         pipeline = make_pipeline(profile, camera)
-        seen = source if log is None else log.watched(source)
+        seen = source if log is None else log.watch_source(source)
         self._parts = FlightParts(
             self._link,
             seen,
@@ -106,7 +106,7 @@ class FaultyFlight:
             pipeline,
             watchers,
             self._switch.read,
-            positions=feed_lockstep(self._link, profile),
+            positions=lockstep_feed(self._link, profile),
             remarks=tuple if log is None else log.remarks,
         )
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
@@ -261,7 +261,9 @@ def fly_with_fault(
     """Fly a case to its end and judge the flight by the true state; `log`: file for the flight
     log, if any. Errors: NotFound, InvalidValue (calibration, log)."""
     flown_by = e.apply_to_profile(profile, case.effects)
-    watcher = None if log is None else LogWatcher.lockstep(log, flown_by, scenario.seed, record)
+    watcher = (
+        None if log is None else LogWatcher.open_lockstep(log, flown_by, scenario.seed, record)
+    )
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
 

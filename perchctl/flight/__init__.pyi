@@ -2,8 +2,8 @@ from .clock import WallClock as WallClock
 from .criteria import GroundCriteria as GroundCriteria
 from .criteria import Problem as Problem
 from .inputs import FlightInputs as FlightInputs
-from .lockstep import feed_lockstep as feed_lockstep
 from .lockstep import fly_lockstep as fly_lockstep
+from .lockstep import lockstep_feed as lockstep_feed
 from .lockstep import lockstep_source as lockstep_source
 from .loop import FlightParts as FlightParts
 from .loop import fly as fly

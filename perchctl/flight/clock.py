@@ -20,14 +20,14 @@ class Clock(Protocol):
     """Time and waiting, in seconds: the one clock of a flight, real or simulated."""
 
     def now(self) -> float:
-        """Seconds, monotonic."""
+        """Return the present time, s, monotonic."""
 
     def wait_until(self, t_s: float) -> None:
-        """Return at `t_s`, or at once when it is past."""
+        """Wait until the clock reads `t_s`; return at once if that is past."""
 
 
 class WallClock:
-    """Real time."""
+    """The `Clock` of real time."""
 
     def now(self) -> float:
         return time.monotonic()
@@ -39,10 +39,11 @@ class WallClock:
 
 
 class SimulatedClock:
-    """Simulated time in real time: it waits for the loop, and the loop for it.
+    """Clock of a simulator in real time: simulator and flight loop wait for each other.
 
-    The simulator advances it; on a busy computer it stands still. Any thread may call `now`.
-    `zero_s`: its reading at the simulator's start, such that it first agrees with `time.monotonic`.
+    The simulator advances the clock, which stands still on a busy computer. Any thread may call
+    `now`. `zero_s`: the reading at the simulator's start, such that the first reading agrees with
+    `time.monotonic`.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class SimulatedClock:
 
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:
-        """A context in which simulated time goes on for `MARGIN_S` after each `wait_until` only."""
+        """Context manager: simulated time stops `MARGIN_S` after the time of each `wait_until`."""
         self._waits = True
         try:
             yield

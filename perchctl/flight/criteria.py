@@ -55,7 +55,7 @@ _FORBIDDEN = (
 
 @dataclass(frozen=True)
 class Problem:
-    """A finding on the ground: what was found, with what is allowed, and what to do about it."""
+    """A problem on the ground. `found`: the reading and its limit; `advice`: what to do."""
 
     found: str
     advice: str
@@ -67,14 +67,14 @@ class Problem:
 
 @dataclass(frozen=True)
 class GroundCriteria:
-    """The criteria for a vehicle at rest; each property is the problem that it finds, or None."""
+    """Criteria for a vehicle at rest; each returns the problem that it finds, or None."""
 
     telemetry: Telemetry
     profile: Profile
 
     @property
     def supervisor_fault(self) -> Problem | None:
-        """A fault that the supervisor reports and that waiting does not cure, such as a crash."""
+        """Problem: the supervisor reports a fault that waiting does not cure, such as a crash."""
         raw = f"0x{self.telemetry.supervisor:04X}"
         for bit, what, advice in _FORBIDDEN:
             if self.telemetry.has_bit(bit):
@@ -88,14 +88,14 @@ class GroundCriteria:
 
     @property
     def supervisor_not_ready(self) -> Problem | None:
-        """A supervisor that does not allow flight (yet)."""
+        """Problem: the supervisor does not allow flight (yet)."""
         if self.telemetry.has_bit(CAN_FLY):
             return None
         return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart it")
 
     @property
     def battery_too_low(self) -> Problem | None:
-        """A battery too low to take off; a missing reading is no problem here."""
+        """Problem: the battery is too low to take off; a missing reading is no problem."""
         rests_v, needed_v = self.telemetry.battery_v, self.profile.safety.min_rest_v
         if not NO_BATTERY_READING_V <= rests_v < needed_v:
             return None
@@ -107,7 +107,7 @@ class GroundCriteria:
 
     @property
     def estimate_unsettled(self) -> Problem | None:
-        """A state estimate whose variance is too large, or no number."""
+        """Problem: the variance of the state estimate is too large, or NaN."""
         variance = self.telemetry.position_variance_m2
         most = self.profile.safety.estimator_variance_m2
         if variance is None or variance <= most:
@@ -120,7 +120,7 @@ class GroundCriteria:
 
     @property
     def off_ground(self) -> Problem | None:
-        """A vehicle off the ground by its settled estimate: it hangs, or is held."""
+        """Problem: the settled state estimate is off the ground: the vehicle hangs, or is held."""
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",
@@ -138,13 +138,13 @@ class GroundCriteria:
 
     @property
     def tilt_deg(self) -> float:
-        """The larger of roll and pitch; NaN if one of them is."""
+        """The larger of abs(roll) and abs(pitch); NaN if either is NaN."""
         angles_rad = np.abs((self.telemetry.roll_rad, self.telemetry.pitch_rad))
         return math.degrees(float(angles_rad.max()))
 
     @property
     def not_level(self) -> Problem | None:
-        """A vehicle that does not stand level enough to take off."""
+        """Problem: the vehicle does not stand level enough to take off."""
         most_deg = self.profile.safety.start_tilt_deg
         if self.tilt_deg <= most_deg:
             return None
@@ -155,7 +155,7 @@ class GroundCriteria:
 
     @property
     def not_still(self) -> Problem | None:
-        """A vehicle that is moved or vibrates: its accelerometer does not read one g."""
+        """Problem: the vehicle moves or vibrates: its accelerometer does not read 1 g."""
         acc_z_g = self.telemetry.acc_z_g
         if abs(acc_z_g - 1.0) <= REST_ACC_G:
             return None
@@ -163,7 +163,7 @@ class GroundCriteria:
 
     @staticmethod
     def no_position_source(decks: Sequence[str], profile: Profile) -> Problem | None:
-        """A vehicle without any position source, which would fly by a sum of accelerations."""
+        """Problem: none of the detected `decks` measures positions, as the profile expects."""
         config = profile.positioning
         if config.by != "deck" or {*decks} & {*POSITION_DECKS, *config.decks}:
             return None
@@ -177,7 +177,7 @@ class GroundCriteria:
 
     @staticmethod
     def target_too_near(target: TargetEstimate | None) -> Problem | None:
-        """A target that is too near for a vehicle on the ground."""
+        """Problem: the target is too near for a vehicle on the ground."""
         if target is None or not target.tracked:
             return None
         away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -190,8 +190,8 @@ class GroundCriteria:
         )
 
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
-        """A position in another unit, with another axis up, or too far from the expected target,
-        which waiting does not cure. With the target as source only that distance counts."""
+        """Problem: `place` is in another unit, has another axis up, or is too far from the
+        expected target. If the target is the source, only the distance is checked."""
         x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
@@ -226,7 +226,7 @@ class GroundCriteria:
 
 
 def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
-    """The problem of a capture whose vertical is not that of the vehicle's own attitude."""
+    """Problem: the capture's vertical is not that of the vehicle's own attitude."""
     if place.quaternion is None:
         return None
     # The world's vertical in the capture's axes, if its body's axes are the vehicle's.
@@ -247,7 +247,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
 
 
 def feed_name(profile: Profile) -> str:
-    """The source of the external positions, in words."""
+    """Name of the source of external positions in messages."""
     by_target = profile.positioning.by == "target"
     return "the sight of the target" if by_target else "the motion capture"
 

@@ -42,7 +42,7 @@ HEARD_S = 0.15  # a sight carried on by an older estimate swings the vehicle
 
 
 class TelemetrySource(Protocol):
-    """The part of a `perchctl.link.Link` that is read here."""
+    """The part of a `perchctl.link.Link` that `FlightInputs` reads."""
 
     def telemetry(self) -> list[Telemetry]: ...
 
@@ -76,7 +76,7 @@ class FlightInputs:
     pipeline: Pipeline
     profile: Profile
     send: SendPosition = lambda place: True
-    recorded: bool = False  # then with the pictures' checksums and the present's spread
+    is_logged: bool = False  # then with the pictures' checksums and the present's spread
     perception: Perception = field(init=False)
     # Hands the vehicle's places to `send`, where the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
@@ -99,14 +99,15 @@ class FlightInputs:
     def history(self) -> History:
         return self.perception.history
 
-    def poll_inputs(self, now_s: float, *, look: bool = True) -> None:
-        """Take in telemetry and a frame, which without `look` only shows that the camera lives."""
+    def poll_inputs(self, now_s: float, *, search: bool = True) -> None:
+        """Read telemetry and at most one frame; without `search` the frame is not searched for the
+        target, and only shows that the camera works."""
         perception, positioning = self.perception, self._positioning
         samples = self.link.telemetry()
         perception.history = add_samples(self.history, samples, self.profile.safety)
         if positioning is not None:
-            positioning.begin_tick(self.history, now_s, in_contact=not look)
-        self.output, self.is_blind, self.repeated = None, not look, False
+            positioning.begin_tick(self.history, now_s, in_contact=not search)
+        self.output, self.is_blind, self.repeated = None, not search, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
         seen: FrameRecord | None = None
@@ -119,7 +120,7 @@ class FlightInputs:
             problem=problem,
             ended=self.source.finished,
             live=self.source.live,
-            look=look,
+            look=search,
         )
         used_s = perception.calibration.applied_delay_s
         if frame is not None and used_s:
@@ -140,7 +141,7 @@ class FlightInputs:
             return
         self.last_good_frame_s = now_s
         self.frames += 1
-        if look:
+        if search:
             for _, self.output in perception.process_fields(frame, used_s):
                 if positioning is not None and self._is_heard(now_s):
                     positioning.add_pose(perception.state.measured.surest, self.history, now_s)
@@ -152,12 +153,11 @@ class FlightInputs:
         return self.target_positioning if self.sends_sights else None
 
     def _is_heard(self, now_s: float) -> bool:
-        """True if the telemetry is new enough to carry a sight on to the present."""
         newest = self.history.newest
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def catch_up(self, began_s: float, now_s: float) -> None:
-        """Take in what has arrived while camera or vision hung, since the tick of `began_s`."""
+        """Take in the telemetry that came while camera or vision hung in the tick of `began_s`."""
         late = self.link.telemetry()
         self.perception.history = add_samples(self.history, late, self.profile.safety, late=True)
         self.taken = replace(self.taken, late=tuple(late))
@@ -188,14 +188,14 @@ class FlightInputs:
 
     @property
     def poses(self) -> dict[str, UnfilteredPose]:
-        """The unfiltered poses of this tick's picture."""
+        """The unfiltered poses by this tick's picture: of `large`, `small` and `joint` markers."""
         poses = {} if self.output is None else self.output.poses
         return {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def target(self, now_s: float) -> TargetEstimate | None:
-        """The target's estimate at the present; None before one was seen. It is not
-        `tracked` while no good frames come or are searched, since the filter coasts by frames."""
-        target = self.perception.target(now_s, spread=self.recorded)
+        """The target's estimate at `now_s`; None before the target was first seen. `tracked` is
+        False while no good frames come or are searched, since the filter coasts by frames."""
+        target = self.perception.target(now_s, spread=self.is_logged)
         if self._positioning is not None:  # else the estimate runs away
             target = self._positioning.with_fixed_target(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
@@ -211,7 +211,7 @@ class FlightInputs:
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
         kind = self.perception.health.assess(frame, live)
-        if self.recorded and self.taken.frame is not None:
+        if self.is_logged and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen.
@@ -238,7 +238,7 @@ the target by 12 cm."""
 
 
 class TargetPositioning:
-    """The target as the positioning system of one flight."""
+    """Sends positions measured from the target, the positioning system of one flight."""
 
     def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = TargetFeed(send, profile, pipeline.pose)
@@ -257,7 +257,7 @@ class TargetPositioning:
             self.feed.send_known(touching_m, now_s)
 
     def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
-        """Send the position that a picture gives, unless the vehicle is in contact."""
+        """Send the position that `pose` gives, if any, unless the vehicle is in contact."""
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
@@ -267,7 +267,7 @@ class TargetPositioning:
     def with_fixed_target(
         self, target: TargetEstimate | None, history: History
     ) -> TargetEstimate | None:
-        """The estimate with the target's known place; unchanged until the place is known."""
+        """Return `target` moved to the target's known place; unchanged until that is known."""
         newest = history.newest
         now = None if newest is None else attitude_at(history, newest.t_s)
         return target if target is None or now is None else self.feed.with_fixed_target(target, now)
@@ -296,14 +296,14 @@ class TurnWatcher(Watcher, Protocol):
     def turn(self, turn: Turn) -> None: ...
 
     def sent(self, sent: SentCommand) -> None:
-        """Called in the sender's own thread: must neither wait nor raise."""
+        """Take a command sent in the loop's place; in another thread, so never wait or raise."""
 
 
 Decision = tuple[PlannerState, Command, FeedStatus | None]
 
 
 class TurnReporter:
-    """Counts the loop's turns, and reports them to their watchers."""
+    """Counts the loop's turns, and reports them to each `TurnWatcher`."""
 
     def __init__(self, watchers: Iterable[Watcher]) -> None:
         self._watchers = [w for w in watchers if isinstance(w, TurnWatcher)]
@@ -315,10 +315,12 @@ class TurnReporter:
     def has_watchers(self) -> bool:
         return bool(self._watchers)
 
-    def begin(self, now_s: float) -> None:
+    def begin_turn(self, now_s: float) -> None:
         self._began_s = now_s
 
-    def report_waiting(self, inputs: FlightInputs, now_s: float, feed: FeedStatus | None) -> None:
+    def report_waiting_turn(
+        self, inputs: FlightInputs, now_s: float, feed: FeedStatus | None
+    ) -> None:
         turn = Turn(
             self._counted(),
             "waiting",
@@ -334,16 +336,16 @@ class TurnReporter:
         self._open = obs, None
 
     def note_decision(
-        self, obs: Observation, new: PlannerState, command: Command, feed: FeedStatus | None
+        self, obs: Observation, state: PlannerState, command: Command, feed: FeedStatus | None
     ) -> None:
         """Note that the planner has decided: a later failure is not the planner's."""
-        self._open = obs, (new, command, feed)
+        self._open = obs, (state, command, feed)
 
-    def report_redone(
-        self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
+    def report_redone_turn(
+        self, inputs: FlightInputs, obs: Observation, state: PlannerState, command: Command
     ) -> None:
         """Report a turn whose command is not sent, since the next turn decides again."""
-        self._report(replace(self.flown_turn(inputs, obs, new, command, None), role="redone"))
+        self._report(replace(self.flown_turn(inputs, obs, state, command, None), role="redone"))
 
     def report_failure(self, inputs: FlightInputs, error: BaseException) -> None:
         """Report the turn in which the flight broke off, with what was observed and decided: the
@@ -371,11 +373,11 @@ class TurnReporter:
         self,
         inputs: FlightInputs,
         obs: Observation,
-        new: PlannerState,
+        state: PlannerState,
         command: Command,
         feed: FeedStatus | None,
     ) -> Turn:
-        """The turn, once its command was sent."""
+        """The turn as it is logged, once its command was sent."""
         self._open = None
         return Turn(
             number=self._counted(),
@@ -386,13 +388,13 @@ class TurnReporter:
             poses=inputs.poses,
             observation=obs,
             command=command,
-            phase=new.phase,
-            row=new.row,
-            held=bool(new.hold),
-            attempts=new.attempts,
+            phase=state.phase,
+            row=state.row,
+            held=bool(state.hold),
+            attempts=state.attempts,
             outside=external_positions(feed),
-            outcome=new.outcome,
-            reason=new.reason,
+            outcome=state.outcome,
+            reason=state.reason,
         )
 
     def _counted(self) -> int:
@@ -405,7 +407,7 @@ class TurnReporter:
 
 
 def external_positions(status: FeedStatus | None) -> ExternalPositions | None:
-    """The feed's status as the log has it."""
+    """Convert a feed's status to the form that is logged; None to None."""
     if status is None:
         return None
     return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

@@ -85,13 +85,13 @@ class LockstepSource:
 
 
 def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
-    """A source of the vehicle's camera; it unmirrors frames if the profile says so."""
+    """The frame source of the simulated camera; mirrored frames are put right."""
     source = LockstepSource(vehicle, profile.camera.start_latency_s)
     return WrappedSource(source, unmirror_frame) if profile.camera.mirrored else source
 
 
 class TruthWatcher(Watcher):
-    """Watches the true vehicle, which the flight cannot see."""
+    """Watches the simulator's true vehicle, which the flight cannot see, for falls."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -118,7 +118,8 @@ class TruthWatcher(Watcher):
 
 @dataclass(frozen=True)
 class LockstepFlight:
-    """A finished flight and what only the simulator can measure."""
+    """A finished flight with its true end. `miss_m`: from gear to target centre, horizontal;
+    `hanging`: by the magnet; `locked`: by the supervisor."""
 
     report: FlightReport
     miss_m: float
@@ -166,19 +167,19 @@ def fly_lockstep(
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
     opened: LogWatcher | None = None
     if isinstance(log, (Path, str)):
-        log = opened = LogWatcher.lockstep(Path(log), profile, scenario.seed)
+        log = opened = LogWatcher.open_lockstep(Path(log), profile, scenario.seed)
     camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
     link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
-    positions = feed_lockstep(link, profile)
+    positions = lockstep_feed(link, profile)
     source = lockstep_source(vehicle, profile)
     truth = TruthWatcher(vehicle)
     watchers = (truth, *watchers)
     if log is not None:
         log.truth = truth.position_and_miss
         watchers = (*watchers, log)
-        source = log.watched(source)
+        source = log.watch_source(source)
     parts = FlightParts(
         link,
         source,
@@ -213,17 +214,17 @@ def fly_lockstep(
 # --- External positions in lockstep: the simulated motion capture, by the same feed ---
 
 
-def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
-    """A feed of the simulated motion capture that is called at the link's time; None
-    without a capture.
+def lockstep_feed(link: MockLink, profile: Profile) -> PositionFeed | None:
+    """A feed of the simulated motion capture that runs on the link's clock; None without a
+    capture.
 
-    Lets the time pass until the vehicle's body is seen, and starts the estimate there. Raises
-    ConnectionFailed if it is not seen.
+    Advances the simulation until the capture sees the vehicle, and starts the state estimate
+    there. Raises ConnectionFailed if the vehicle is not seen.
     """
     capture, config = link.vehicle.capture, profile.positioning
     if config.by == "target":
         origin_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
-        link.settle(config, VehiclePose(link.now_s, origin_m, np.eye(3)))
+        link.settle_estimator(config, VehiclePose(link.now_s, origin_m, np.eye(3)))
         return None
     if capture is None or config.by != "mocap":
         return None
@@ -236,5 +237,5 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
             why = feed.status(link.now_s).problem or f"nothing comes from {config.label}"
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
         link.advance_to(link.now_s + PositionFeed.PERIOD_S)
-    link.settle(config, place)
+    link.settle_estimator(config, place)
     return feed

@@ -75,7 +75,7 @@ class FlightParts:
     remarks: Callable[[], Sequence[str]] = tuple
 
     def position_age_s(self, now_s: float) -> float:
-        """Age of the newest position that a motion capture gave; 0 without one."""
+        """Age of the newest position by motion capture; 0 if positions come from elsewhere."""
         return 0.0 if self.positions is None else self.positions.status(now_s).age_s
 
 
@@ -92,7 +92,7 @@ def fly(parts: FlightParts) -> FlightReport:
         parts.pipeline,
         parts.profile,
         send=parts.link.send_external,
-        recorded=turns.has_watchers,
+        is_logged=turns.has_watchers,
     )
     _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
@@ -121,7 +121,6 @@ def fly(parts: FlightParts) -> FlightReport:
 
 
 def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    """A callback that shows watchers what is sent in the loop's place."""
     told = [watcher for watcher in parts.watchers if isinstance(watcher, TurnWatcher)]
 
     def tell(sent: SentCommand) -> None:
@@ -144,7 +143,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
         refuse_unfit_vehicle(newest, parts.profile)
         feed = _outside(parts, inputs, now_s)
         refuse_wrong_positions(feed, newest, parts.profile, now_s, at_rest)
-        turns.report_waiting(inputs, now_s, feed)
+        turns.report_waiting_turn(inputs, now_s, feed)
         waiting = still_waiting_for(
             newest,
             inputs.frames > 0,
@@ -182,9 +181,9 @@ def _mission(
     logged = inputs.perception.calibration.newest
     while True:
         began_s = now_s = clock.now()
-        turns.begin(began_s)
+        turns.begin_turn(began_s)
         # Against the ceiling the picture shows no target and steers nothing.
-        inputs.poll_inputs(began_s, look=state is None or state.phase is not Phase.COMPLETE)
+        inputs.poll_inputs(began_s, search=state is None or state.phase is not Phase.COMPLETE)
         if clock.now() - began_s > HUNG_S:  # a setpoint for the time before the hang is stale
             now_s = clock.now()
             inputs.catch_up(began_s, now_s)
@@ -198,7 +197,7 @@ def _mission(
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
-            turns.report_redone(inputs, obs, new, command)
+            turns.report_redone_turn(inputs, obs, new, command)
             continue
         state, redone = new, False
         if not isinstance(command, Idle):

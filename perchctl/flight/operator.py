@@ -19,11 +19,11 @@ _EPS_S = 1e-9
 
 @dataclass
 class OperatorSwitch:
-    """Ctrl-C as the planner understands it: once lands, twice stops.
+    """Reads Ctrl-C for the planner: one press lands, two stop the motors.
 
     `press` is Ctrl-C. A second press counts after at least `HELD_S` of silence and `AGAIN_S` after
     the first. The first repetition of a key held down looks the same, so after a silence of up to
-    `DELAY_S` it counts once no other has followed for `HELD_S`. Presses that still follow each
+    `DELAY_S` a press counts once no other has followed for `HELD_S`. Presses that still follow each
     other `INSIST_S` after the first are a stop as well. `land` is for STOP on the live page and for
     the signals that ask a program to end: it lands however often it comes, and never stops the
     motors. All methods may be called from any thread.

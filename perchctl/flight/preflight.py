@@ -27,7 +27,7 @@ from perchctl.vision import CameraModel, TargetEstimate
 
 
 def abort_on(problem: Problem | None) -> None:
-    """Raises SafetyAbort with the problem's sentence, if there is one."""
+    """Raises SafetyAbort with the problem's sentence; None passes."""
     if problem is not None:
         raise SafetyAbort(problem.sentence)
 
@@ -53,10 +53,10 @@ def refuse_wrong_positions(
     telemetry: Telemetry | None,
     profile: Profile,
     now_s: float,
-    at_rest: RestCheck | None = None,
+    rest_check: RestCheck | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body. A tilted or
-    moved vehicle is not judged, nor old data. `at_rest` remembers the earlier turns."""
+    """Raises SafetyAbort for positions in another unit, or of another world or body. Old data and a
+    tilted or moving vehicle are not checked. `rest_check` keeps the place of earlier turns."""
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
@@ -70,8 +70,8 @@ def refuse_wrong_positions(
     place = status.measured if stands else None
     if place is not None:
         abort_on(criteria.position_frame_problem(place))
-    if at_rest is not None:
-        abort_on(at_rest.moved_body_problem(place, profile))
+    if rest_check is not None:
+        abort_on(rest_check.moved_body_problem(place, profile))
 
 
 def still_waiting_for(
@@ -81,16 +81,16 @@ def still_waiting_for(
     waited_s: float,
     profile: Profile,
     target: TargetEstimate | None = None,
-    age_s: float = 0.0,
+    telemetry_age_s: float = 0.0,
     feed: FeedStatus | None = None,
 ) -> str:
-    """Return in words what is still missing; empty when ready. Errors: TimedOut if it took too
-    long, SafetyAbort off the ground or too near to the target."""
+    """Return in words what take-off still waits for; empty when ready. Errors: TimedOut after too
+    long a wait, SafetyAbort off the ground or too near to the target."""
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
-    if age_s > profile.safety.telemetry_hold_s:
-        return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
+    if telemetry_age_s > profile.safety.telemetry_hold_s:
+        return _bounded(f"telemetry (the newest is {telemetry_age_s:.1f} s old)", waited_s, limit_s)
     criteria = GroundCriteria(telemetry, profile)
     unsent = None if feed is None else unsent_problem(feed, profile)
     seen = None if feed is None else feed.measured
@@ -123,7 +123,6 @@ def still_waiting_for(
 
 
 def _first(problems: Mapping[str, Problem | None]) -> str:
-    """The first that has a problem, and in brackets which; empty without any."""
     found = (f"{what} ({problem.sentence})" for what, problem in problems.items() if problem)
     return next(found, "")
 
@@ -146,7 +145,7 @@ def view_problem(
 ) -> Problem | None:
     """The problem of a way up that loses the target: no marker would be wholly in the
     picture of a vehicle that leans a little, at take-off height over the start or over
-    `planner.approach_xy_m`. `yaw_rad`: its heading at the start."""
+    `planner.approach_xy_m`. `yaw_rad`: the vehicle's heading."""
     planner, (x, y, z) = profile.planner, start_m
     advice = f"lower planner.takeoff_height_m, now {planner.takeoff_height_m:g} m"
     for over in ((x, y), planner.approach_xy_m):

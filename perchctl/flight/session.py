@@ -144,7 +144,6 @@ def fly_session(
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:
-    """The gear's miss by the simulator; None without one, or if it is gone."""
     if simulated is None:
         return None
     with contextlib.suppress(ConnectionFailed, TimedOut):
@@ -190,12 +189,12 @@ def start_position_feed(
     clock: Clock,
     ground_z_m: float = 0.0,
 ) -> PositionFeed | None:
-    """Settle the estimate, and feed it a capture's positions until `stack` ends, after the link is
-    closed: a landing vehicle still needs them. None without a capture.
+    """Settle the state estimate, and send it a capture's positions until `stack` closes, which is
+    after the link has closed: a landing vehicle needs them. None without a capture.
 
-    Errors: those of `CflibLink.settle`, and InvalidValue, UsageError, ConnectionFailed."""
+    Errors: those of `CflibLink.settle_estimator`, InvalidValue, UsageError, ConnectionFailed."""
     if config.by == "target":
-        link.settle(None, ground_z_m)
+        link.settle_estimator(None, ground_z_m)
     if config.by != "mocap":
         return None
     capture = open_capture(config, clock.now)
@@ -203,5 +202,5 @@ def start_position_feed(
     feed = PositionFeed(capture, link.send_external, config)
     stack.callback(feed.close)
     feed.start(clock.now)
-    link.settle(feed)
+    link.settle_estimator(feed)
     return feed

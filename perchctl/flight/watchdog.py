@@ -55,7 +55,7 @@ LOOK_S = 0.5  # a rescue leaves a vehicle whose motors have been seen off for so
 class LastTick:
     """The last tick of the loop whose command was sent."""
 
-    due_s: float  # when the next one is due, from which the loop measures its lateness
+    next_due_s: float  # when the next tick is due, from which the loop measures its lateness
     state: PlannerState
     command: Command  # the last that was streamed
     obs: Observation
@@ -93,16 +93,18 @@ class Watchdog:
 
     # --- the loop's side ---
 
-    def tick(self, due_s: float, state: PlannerState, command: Command, obs: Observation) -> None:
-        """Note a tick of the loop whose command is on its way."""
+    def tick(
+        self, next_due_s: float, state: PlannerState, command: Command, obs: Observation
+    ) -> None:
+        """Note a tick whose command is being sent; the next is due at `next_due_s`."""
         if isinstance(command, (PositionSetpoint, RawThrust)):
             self._streamed = command
         if isinstance(command, EmergencyStop):
             self._cut_ordered = True
-        self._last = LastTick(due_s, state, self._streamed or command, obs)
+        self._last = LastTick(next_due_s, state, self._streamed or command, obs)
 
     def note_rescue(self) -> None:
-        """Note that the loop has ended by an error: only the operator's stop is left."""
+        """Note that the loop has ended by an error: `poll` then only obeys the operator's stop."""
         self._closing = True
 
     def end(self, *, motors_off: bool) -> None:
@@ -134,7 +136,7 @@ class Watchdog:
         if silent_s < REPEAT_AFTER_S:
             self._history = self._held = self._way_down = None
             return None
-        late_s = now_s - last.due_s
+        late_s = now_s - last.next_due_s
         overruled = operator is Operator.LAND or late_s > self._profile.safety.loop_late_land_s
         if overruled:
             self.overruled_s = max(self.overruled_s, late_s)
@@ -158,7 +160,6 @@ class Watchdog:
         newest: Telemetry | None,
         waiting: Sequence[Telemetry],
     ) -> Observation:
-        """The present observation: the newest telemetry, and no picture."""
         if self._history is None:
             self._history = History((last.obs.telemetry,), imu=last.obs.imu)
         new = [*waiting, *([] if newest is None else [newest])]
@@ -179,13 +180,11 @@ class Watchdog:
         )
 
     def _land(self, obs: Observation, last: LastTick) -> Command | None:
-        """The next command of the way down, from the loop's own state on."""
         state = self._way_down or last.state
         self._way_down, command = step_landing(state, obs, self._profile)
         return None if isinstance(command, Idle) else command
 
     def _hold(self, now_s: float, last: LastTick, newest: Telemetry | None) -> Command | None:
-        """The last safe setpoint; None where there is none to hold."""
         known = newest if has_fresh_position(newest, now_s) else None
         if self._held is None and known is not None:
             match last.command:

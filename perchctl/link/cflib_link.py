@@ -22,7 +22,7 @@ from perchctl.link.crtp import (
     Packet,
     encode,
 )
-from perchctl.link.external_position import StandingFeed, estimator_parameters, settle
+from perchctl.link.external_position import StandingFeed, estimator_parameters, settle_estimator
 from perchctl.link.firmware import check_firmware, detected_decks, read_parameters, set_parameters
 from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
@@ -55,7 +55,7 @@ class CflibLink:
     """`perchctl.link.protocol.Link` on an unmodified cflib.
 
     `connection` is None unless connected. `landing_wait_s`: how long `close` waits for a vehicle
-    that still flies. `positioning` by motion capture: the estimator is set to external positions.
+    that still flies. `positioning`: unless by decks, the estimator is set to external positions.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class CflibLink:
         except Exception:  # the library's; commands report their own
             return False
 
-    def settle(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
+    def settle_estimator(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
         """Start the estimator where `feed` says that the vehicle is; without a feed, at the world's
         origin, `ground_z_m` high. On the ground, after `connect`; bounded. Errors:
         ConnectionFailed, NotFound, InvalidValue, TimedOut."""
@@ -115,7 +115,9 @@ class CflibLink:
         cf, config, clock = self.connection.cf, self._positioning, self._clock
         standing = StandingFeed(self.send_external, ground_z_m, config.rate_hz, clock)
         wait = standing.wait if feed is None else time.sleep
-        settle(cf, self._uri, config, feed or standing, lambda: self._blocks.newest, clock, wait)
+        settle_estimator(
+            cf, self._uri, config, feed or standing, lambda: self._blocks.newest, clock, wait
+        )
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
@@ -151,7 +153,6 @@ class CflibLink:
         self._leave(farewell=farewell)
 
     def _prepare(self, connection: Connection) -> None:
-        """Make a connected vehicle ready to fly."""
         check_firmware(connection.cf, self._uri)
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)

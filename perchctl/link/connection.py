@@ -67,7 +67,7 @@ class Connection:
         self.cf.connection_failed.add_callback(self._on_failed)
 
     def open(self, uri: str, timeout_s: float) -> bool:
-        """True once the vehicle is connected, or refused (`lost`), within `timeout_s`."""
+        """Open the link; True if within `timeout_s` it was connected, or refused (see `lost`)."""
         # Opening a radio may block in its driver: it gets a thread and a bound.
         start_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
@@ -104,11 +104,11 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """True if the driver will never take a packet again. To be called repeatedly, and
-        only while it takes none: True once this has lasted for `DEAD_S`.
+        """True if the driver has been stuck for `DEAD_S` and will never take a packet again. To be
+        called repeatedly, and only while the driver takes none.
 
-        A radio out of reach counts its lost packets, and goes on by itself. One whose dongle was
-        pulled out counts nothing (cflib retries that for ever, too).
+        A radio out of reach counts its lost packets, and goes on by itself. A radio whose dongle
+        was pulled out counts nothing (cflib retries for ever, too).
         """
         now_s, asked_s = time.monotonic(), self._asked_s
         self._asked_s = now_s
@@ -173,7 +173,6 @@ class Connection:
             time.sleep(REOPEN_PAUSE_S)
 
     def _is_open_again(self) -> bool:
-        """Try once to open a new driver; True if it has taken over."""
         import cflib.crtp
 
         with self._change:
@@ -261,7 +260,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 def init_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence it: it logs what it also reports by callback, and prints on stdout."""
+    silence cflib, which logs what it also reports by callback, and prints on stdout."""
     import cflib.crtp
     from cflib.crtp import radiodriver
 
@@ -344,7 +343,7 @@ def lock_vehicle(uri: str) -> contextlib.ExitStack:
     """Lock the vehicle at `uri` for this process until the result is closed.
 
     Nothing is locked where no lock can be kept (no folder to write to, Windows).
-    Raises ConnectionFailed if another program has it.
+    Raises ConnectionFailed if another program has the lock.
     """
     path = user_folder("runtime") / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
     with contextlib.ExitStack() as claim:

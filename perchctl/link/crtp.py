@@ -57,7 +57,7 @@ class Packet(NamedTuple):
 
     @staticmethod
     def decode(datagram: bytes) -> Packet | None:
-        """The packet of these bytes; None for what cannot be one: empty or too long."""
+        """Return the datagram's packet; None if the datagram is empty or too long."""
         if not 1 <= len(datagram) <= 1 + MAX_DATA:
             return None
         return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
@@ -79,16 +79,16 @@ _REQUEST = 1
 _ARM, _EMERGENCY_STOP = 1, 3
 
 
-def encode(what: Command | ExternalPosition) -> tuple[Packet, ...]:
-    """The packets of a command, or of a position from outside, in the order in which they
-    are sent; none for `Idle`.
+def encode(message: Command | ExternalPosition) -> tuple[Packet, ...]:
+    """The packets of a command or of an external position, in the order in which they are
+    sent; none for `Idle`.
 
     Raises InvalidValue for a number that its field cannot hold.
     """
     try:
-        return _packets(what)
+        return _packets(message)
     except (struct.error, OverflowError) as error:
-        raise InvalidValue(f"{what} does not fit into a packet: {error}") from None
+        raise InvalidValue(f"{message} does not fit into a packet: {error}") from None
 
 
 def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:

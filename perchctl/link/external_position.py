@@ -61,7 +61,7 @@ def estimator_start_parameters(start: VehiclePose) -> dict[str, float]:
     return {f"kalman.initial{name}": value for name, value in values.items()}
 
 
-def settle(
+def settle_estimator(
     cf: Any,
     uri: str,
     config: PositioningConfig,
@@ -137,8 +137,8 @@ def _agree(
 
 
 class StandingFeed:
-    """Feed of a vehicle at the world's origin, level, its front along x, which defines the world.
-    `wait` sends that place, `rate_hz` times a second."""
+    """Feed of a vehicle that stands level at the world's origin, its front along x; its place
+    defines the world. `wait` sends that place, `rate_hz` times a second."""
 
     def __init__(
         self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]

@@ -28,7 +28,7 @@ def check_firmware(cf: Any, uri: str) -> None:
 
 
 def missing_variables(cf: Any) -> list[str]:
-    """The needed variables that the firmware does not log."""
+    """Names of the needed log variables that the firmware lacks."""
     table = cf.log.toc
     return [name for name in NEEDED if table.get_element_by_complete_name(name) is None]
 
@@ -63,7 +63,6 @@ def set_parameters(
 
 
 def _read_back(parameters: Any, name: str) -> str | None:
-    """Ask the vehicle for a parameter's value; None without an answer."""
     group, _, short = name.partition(".")
     answers: queue.SimpleQueue[str] = queue.SimpleQueue()
 

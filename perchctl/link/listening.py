@@ -86,8 +86,8 @@ class AttitudeLink(ReadOnlyLink):
         self._motors_run = False
 
     @property
-    def motors_run(self) -> bool:
-        """True if the motors turn by the newest packet, and for 2 s after they stopped."""
+    def motors_running(self) -> bool:
+        """True while the newest packet reports turning motors: until 2 s after they stop."""
         return self._motors_run
 
     def samples(self) -> list[AttitudeSample]:
@@ -132,7 +132,7 @@ _ECHO_MARK = 1  # cflib's own pings begin with 0
 class ProbeLink(ReadOnlyLink):
     """A `ReadOnlyLink` that accepts any firmware, since it is there to find what is wrong.
 
-    `quality`: the radio's, 100 % if no packet had to be sent again; None without a radio.
+    `quality`: the radio link's, %; 100 if no packet had to be sent again; None without a radio.
     `missing` names the log variables that perchctl needs and the firmware lacks.
     """
 
@@ -164,18 +164,18 @@ class ProbeLink(ReadOnlyLink):
         """All parameters by name, as read when the link was opened."""
         return read_parameters(self._cf)
 
-    def age_s(self) -> float:
+    def position_age_s(self) -> float:
         """The age of the newest sample's position; infinite without a sample."""
         newest = self._blocks.newest
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
     def lost(self) -> str | None:
-        """Why the link is gone, None while it is there."""
+        """Why the link is lost; None while it works."""
         return "it was closed" if self.connection is None else self.connection.lost
 
     def round_trips_s(self, duration_s: float) -> list[float]:
-        """Send echo packets for `duration_s`, and wait `ANSWER_S` for the last. Returns the time
-        after which each came back, s; infinite for one that did not."""
+        """Send echo packets for `duration_s`, and wait `ANSWER_S` for the last. Returns the
+        round-trip time of each packet, s; infinite for a lost packet."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
         all_back = threading.Event()

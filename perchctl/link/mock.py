@@ -111,7 +111,7 @@ class MockLink:
         self.vehicle.advance_to(t_s)
 
     def call_every(self, period_s: float, call: Callable[[float], object]) -> None:
-        """Call `call` with the time every `period_s` from now on: a thread's stand-in."""
+        """Call `call` with the time every `period_s` from now on, in place of a thread."""
         self._call, self._call_period_s, self._call_due_s = call, period_s, self.now_s
 
     def connect(self) -> None:
@@ -158,7 +158,7 @@ class MockLink:
         self._hand_over(encode(place))
         return True
 
-    def settle(self, config: PositioningConfig, start: VehiclePose) -> None:
+    def settle_estimator(self, config: PositioningConfig, start: VehiclePose) -> None:
         """Set the estimator to positions from outside, and start it at `start`."""
         firmware = self.vehicle.firmware
         parameters = estimator_parameters(config) | estimator_start_parameters(start)

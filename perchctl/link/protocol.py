@@ -58,7 +58,7 @@ class Link(Protocol):
         after the link was lost, and the farewell; from the link's own thread if it has one."""
 
     def close(self) -> None:
-        """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""
+        """Close the link, after a bounded wait until the vehicle no longer flies."""
 
 
 # --- The forms of a vehicle's URI ---
@@ -94,7 +94,7 @@ log in again, and plug the radio or the vehicle in again."""
 
 
 def check_uri(uri: str) -> str:
-    """The URI's scheme. Raises InvalidValue, which names what is allowed."""
+    """Return the URI's scheme. Raises InvalidValue unless the URI is one of a vehicle."""
     scheme, _, rest = uri.partition("://")
     fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
     if not fits or (scheme == "udp" and int(rest.rpartition(":")[2]) > 65535):
@@ -103,7 +103,7 @@ def check_uri(uri: str) -> str:
 
 
 def vehicle_uri(uri: str) -> str:
-    """The URI without what does not identify the vehicle: dongle, letter case, options."""
+    """Return one text for all URIs of a vehicle: without dongle, letter case and options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":

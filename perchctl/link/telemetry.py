@@ -41,10 +41,10 @@ VARIANCE_BLOCK = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
 
-def telemetry_from(
+def telemetry_from_log(
     values: Mapping[str, float], t_s: float, behind_s: float = 0.0, start: int = 0
 ) -> Telemetry:
-    """Return telemetry from log values by name; `behind_s` and `start` as in `Telemetry`.
+    """Return telemetry from log variables by name; `behind_s` and `start` as in `Telemetry`.
     Raises KeyError when a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
     variances = [values[name] for name in VARIANCE_BLOCK if name in values]
@@ -83,9 +83,9 @@ REBOOTED_MS = 1000
 class Timebase:
     """Maps log time stamps to the loop's clock by the fastest delivery seen so far.
 
-    The smallest difference between arrival and stamp belongs to the packet that
-    waited least; it may grow slowly, so that a drifting clock is followed. A vehicle that has
-    started again is followed from its first stamp on; `start` counts how often it has.
+    The smallest difference between arrival and stamp belongs to the packet that waited least;
+    it may grow slowly, so that a drifting clock is followed. A vehicle that has started again is
+    followed from its first stamp on; `start` counts how often it has.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class Timebase:
         self._last_arrival_s = 0.0
 
     def to_loop_s(self, stamp_ms: int, arrival_s: float) -> float:
-        """The time of a stamp, ms, that arrived at `arrival_s`."""
+        """The loop's time of a log packet with stamp `stamp_ms` that came at `arrival_s`."""
         if self._last_ms is None:
             self._unwrapped_ms = stamp_ms
         else:
@@ -134,7 +134,7 @@ MOST_CARRIED_S = 0.05
 
 
 class SampleAssembler:
-    """Puts the newest values of all blocks together.
+    """Makes telemetry samples of the newest values of all log blocks.
 
     Only the attitude's block completes a sample; the other values are the last that came. By how
     much the position's block is older is written into the sample (`Telemetry.behind_s`), since
@@ -151,8 +151,8 @@ class SampleAssembler:
     ) -> Telemetry | None:
         """Take one packet of a block and return the sample that it completes, if any.
 
-        `t_s` is its stamp on the loop's clock, `start` the vehicle's start; values from before the
-        newest start are dropped."""
+        `t_s` is the packet's stamp on the loop's clock, `start` as in `Timebase`; values from
+        before the newest start are dropped."""
         if start < self._start:
             return None
         if start > self._start:
@@ -163,7 +163,7 @@ class SampleAssembler:
         if block != "attitude" or self._state_s is None:
             return None
         behind_s = t_s - self._state_s
-        return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
+        return telemetry_from_log(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
@@ -282,7 +282,7 @@ def start_block(
 ) -> Any:
     """Start a block in cflib's `log` and return it.
 
-    `variables`: their types by name, None: as the firmware has it. `period_s` is rounded to 10 ms.
+    `variables`: their types by name, None for the firmware's own. `period_s` is rounded to 10 ms.
     `on_data` gets the stamp in ms, the values by name and the block. Raises NotFound for a refused
     block.
     """

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.perception.history import History, attitude_at, velocity_at
 from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.values import replace
@@ -63,7 +63,7 @@ def update_calibration(
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
     before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
     after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
-    is_measured = pose.cov is not None and finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
+    is_measured = pose.cov is not None and is_finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
     if is_measured and before is not None and after is not None:
         velocity_mps = velocity_at(history, t_s - delay_s)
         moment = rows_variance_range(pose, before, after, velocity_mps, delay_s, setup)

@@ -41,7 +41,7 @@ class DiskFile:
         return done
 
     def tell(self) -> int:
-        """The length of the file."""
+        """Return the length of the file, bytes."""
         return self._good_bytes
 
     def flush(self) -> None:

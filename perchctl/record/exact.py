@@ -176,7 +176,7 @@ def to_rounded_json(value: Any) -> Any:
 
 
 def encode_line(record: Mapping[str, Any]) -> bytes:
-    """The record as one line, keys in the record's own order, ended by a newline.
+    """The record as one JSON line with its newline, numbers rounded, keys in their own order.
 
     Top-level keys whose value is None are left out.
     """

@@ -115,7 +115,7 @@ FIELDS: dict[str, str] = {
 
 
 def event_record(event: Event) -> dict[str, Any]:
-    """An event as a flat record. Severities are continue, hold, back off, land and stop."""
+    """An event as a flat log record. Severities are continue, hold, back off, land and stop."""
     return {
         "t_s": event.t_s,
         "event": event.kind.value,
@@ -132,7 +132,7 @@ def tick_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """A tick as a flat record of all `FIELDS` in order, with a simulation's truth if any."""
+    """A tick as a flat record of all `FIELDS` in order; the truth is known in simulation only."""
     seen, battery = tick.output or tick.target, tick.state.battery
     values: dict[str, Any] = {
         "t_s": tick.t_s,

@@ -38,8 +38,8 @@ def make_header(
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """A log's first record. Without `started` it depends only on its arguments and the
-    files that the profile names. `t0_s` is the loop's time at the log's beginning."""
+    """A log's first record. Without `started` it depends only on the other arguments and
+    the files that the profile names. `t0_s` is the loop's time at the log's beginning."""
     return {
         "kind": "header",
         "format": FORMAT,

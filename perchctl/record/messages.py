@@ -42,14 +42,14 @@ TARGET_KEYS = ("tx_m", "ty_m", "tz_m", "tyaw_rad")
 SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 
-def image_message(ns: int, frame: Frame) -> CompressedImage:
+def image_message(time_ns: int, frame: Frame) -> CompressedImage:
     """A picture's message: the camera's own JPEG, or else a PNG."""
     data = frame.encoded
     if data is None:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]
         data = png.tobytes()
     form = "png" if data.startswith(b"\x89PNG") else "jpeg"
-    return CompressedImage(timestamp=to_stamp(ns), frame_id=CAMERA, data=data, format=form)
+    return CompressedImage(timestamp=to_stamp(time_ns), frame_id=CAMERA, data=data, format=form)
 
 
 _TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
@@ -78,19 +78,19 @@ TICK_SCHEMA = {
 _OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
 
-def to_stamp(ns: int) -> Timestamp:
+def to_stamp(time_ns: int) -> Timestamp:
     """Return nanoseconds since 1970 as protobuf's time stamp."""
-    return Timestamp(seconds=ns // NS, nanos=ns % NS)
+    return Timestamp(seconds=time_ns // NS, nanos=time_ns % NS)
 
 
-def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
+def corners_message(time_ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
     """The markers' outlines in the frame of a tick's record; empty for
     a frame without the target, which clears the previous outlines."""
     return ImageAnnotations(
-        timestamp=to_stamp(ns),
+        timestamp=to_stamp(time_ns),
         points=[
             PointsAnnotation(
-                timestamp=to_stamp(ns),
+                timestamp=to_stamp(time_ns),
                 type=PointsAnnotation.LINE_LOOP,
                 points=[Point2(x=x, y=y) for x, y in zip(px[::2], px[1::2], strict=True)],
                 outline_color=_OUTLINE,
@@ -114,14 +114,14 @@ def fixed_transforms(profile: Profile) -> list[FrameTransform]:
 
 
 def moving_transforms(
-    ns: int, sampled_ns: int, record: Mapping[str, Any]
+    time_ns: int, sampled_ns: int, record: Mapping[str, Any]
 ) -> Iterator[FrameTransform]:
     """Yield the transforms from the world to a tick record's body (at `sampled_ns`), target and
     setpoint, without any that is missing or not finite."""
     for child, at_ns, keys in (
         (BODY, sampled_ns, BODY_KEYS),
-        (TARGET, ns, TARGET_KEYS),
-        (SETPOINT, ns, SETPOINT_KEYS),
+        (TARGET, time_ns, TARGET_KEYS),
+        (SETPOINT, time_ns, SETPOINT_KEYS),
     ):
         values: list[Any] = [record.get(key) for key in keys]
         if all(value is not None and math.isfinite(value) for value in values):

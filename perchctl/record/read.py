@@ -47,7 +47,8 @@ class PhaseSpan:
     Attributes:
         reason: why the phase was entered.
         row: the row of the mission's transition table that led there.
-        severity, simulated: as in the log's event. Empty where the log has none.
+        severity: as in the log's event.
+        simulated: what the simulated scenario did that led there. Empty texts if unknown.
     """
 
     phase: str
@@ -96,7 +97,7 @@ class FlightLog:
         return [parse_exact(SentCommand, record) for record in self.sent_records]
 
     def column(self, key: str) -> Array:
-        """A field over the ticks, shape (n,); NaN where it is missing.
+        """The values of field `key` in all ticks, shape (n,); NaN where missing.
 
         Raises InvalidValue for a value that is no number.
         """
@@ -107,7 +108,7 @@ class FlightLog:
         return np.array(values, dtype=np.float64)
 
     def texts(self, key: str) -> list[str]:
-        """A field over the ticks as text, empty where it is missing."""
+        """The values of field `key` in all ticks as text, empty where missing."""
         return [str(record.get(key) or "") for record in self.records]
 
     @cached_property
@@ -172,12 +173,12 @@ class FlightLog:
         """Time of the last tick since the flight's first turn; 0 without any."""
         return self.to_flight_s(float(self.records[-1]["t_s"])) if self.records else 0.0
 
-    def index_at(self, t_s: float) -> int:
-        """The index of the last tick up to `t_s`, counted from the first turn."""
+    def tick_index_at(self, t_s: float) -> int:
+        """Index of the last tick up to `t_s`, a time since the first turn; 0 before any tick."""
         return max(0, int(np.searchsorted(self.t_s, t_s + SAME_S / 2, side="right")) - 1)
 
     def tick_slice(self, start_s: float, end_s: float) -> slice:
-        """The ticks in [start_s, end_s), times since the first turn."""
+        """Slice of the ticks in [start_s, end_s), times since the first turn."""
         first, last = np.searchsorted(self.t_s, (start_s - SAME_S / 2, end_s - SAME_S / 2))
         return slice(int(first), int(last))
 
@@ -192,7 +193,7 @@ class FlightLog:
 
     @property
     def setup_text(self) -> str:
-        """The flown profile's name, and the seed of a simulated flight, as people read them."""
+        """The flown profile's name, and a simulated flight's seed, for messages."""
         seed = self.header.get("seed")
         return f"profile {self.profile_name or '?'}" + ("" if seed is None else f", seed {seed}")
 
@@ -224,7 +225,7 @@ class FlightLog:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
-        """The mask (height, width), True on the gear, or None. Errors: InvalidValue."""
+        """The mask (height, width), True on the gear; None without a mask. Errors: InvalidValue."""
         text = self.header.get("mask")
         if text is None:
             return None

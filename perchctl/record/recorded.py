@@ -44,7 +44,7 @@ def recorded_pictures(
     lies beside; a cut-off last picture is left out.
 
     If `numbers` is given, only these frames are decoded. Errors, with the first picture: NotFound
-    without a recording; InvalidValue for a file that is none.
+    without a recording; InvalidValue for any other file.
     """
     path = recording_path(path)
     for frame, message in recorded_frames(path):
@@ -77,7 +77,6 @@ def recorded_frames(path: Path) -> Iterator[tuple[dict[str, Any], CompressedImag
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
-    """Yield the records of a file, up to its end or its first torn one."""
     try:
         stream = path.open("rb")
     except FileNotFoundError:

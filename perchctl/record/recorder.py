@@ -57,7 +57,7 @@ RESERVE_BYTES = 200_000_000
 class Recorder:
     """Writes one flight's recording. Only `open` raises.
 
-    The loop calls `write_frame` and `write_tick`. Live, these only fill a queue, and a thread
+    The loop calls `write_frame` and `write_tick`. If `live`, both only fill a queue, and a thread
     writes each turn at its end, while the loop sleeps. In lockstep everything is written at once,
     and nothing is dropped.
 

@@ -39,7 +39,7 @@ class FlightSummary:
         outcome: ``perched``, ``landed``, ``aborted``, or ``unknown`` for a log
             that ends without its summary.
         cause: what decided it, such as ``target not found``.
-        miss_m: None where no truth is known.
+        miss_m: true distance from gear to target centre; None if unknown.
         contact: estimated error of the contact; None unless the vehicle hangs.
         touchdown: how the vehicle met the floor, as far as telemetry shows it.
         lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
@@ -64,7 +64,7 @@ class FlightSummary:
 
     @classmethod
     def from_log(cls, log: FlightLog) -> FlightSummary:
-        """The summary by the log's summary record, or without one by its ticks."""
+        """The summary from the log's summary record, or from the ticks if that is missing."""
         battery_v = log.column("battery_v")
         known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
         ends = f"ends in {log.phases[-1].phase}" if log.phases else "holds no flight"
@@ -90,7 +90,7 @@ class FlightSummary:
         )
 
     def as_record(self) -> dict[str, Any]:
-        """The record for `LogWatcher.end`, which adds the log's own losses."""
+        """The record for `LogWatcher.end`, which adds the number of lost records."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,
@@ -108,7 +108,7 @@ class FlightSummary:
         }
 
     def text(self, log_path: Path | None = None) -> str:
-        """A few lines about the flight, without colour and a last line break."""
+        """A few lines about the flight, without colour or a last line break."""
         lines = [f"{self.outcome.upper()}: {self.reason}".rstrip(": ")]
         if self.cause and self.cause != self.outcome:
             lines[0] += f" [{self.cause}]"
@@ -158,7 +158,6 @@ def _keys_of(part: Any, keys: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _part_in(end: Mapping[str, Any], kind: Any, keys: Mapping[str, str]) -> Any:
-    """The part of that kind; None where the record does not have it."""
     known = {name: end[key] for key, name in keys.items() if end.get(key) is not None}
     if next(iter(keys.values())) not in known:
         return None

@@ -54,7 +54,7 @@ class LogWatcher:
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight goes on.
         truth: returns the true state at a tick; set by a simulation.
-        recorder: records the frames of the `watched` source; None without a recording.
+        recorder: records the frames of the watched source; None without a recording.
     """
 
     def __init__(self, path: Path, header_line: bytes, live: bool, file: DiskFile) -> None:
@@ -108,13 +108,15 @@ class LogWatcher:
             ) from None
 
     @classmethod
-    def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
-        """Open a simulated flight's log: one seed gives the same bytes. Errors: InvalidValue."""
+    def open_lockstep(
+        cls, path: Path, profile: Profile, seed: int, record: bool = False
+    ) -> LogWatcher:
+        """Open a simulated flight's log; the seed fixes its bytes. Errors: InvalidValue."""
         header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
         return cls._opened(path, header, profile, record, live=False)
 
     @classmethod
-    def real_time(
+    def open_real_time(
         cls,
         directory: Path,
         profile: Profile,
@@ -145,12 +147,12 @@ class LogWatcher:
                 raise
         return log
 
-    def watched(self, source: FrameSource) -> FrameSource:
+    def watch_source(self, source: FrameSource) -> FrameSource:
         """The source, wrapped so that its frames are recorded if there is a recorder."""
         return source if self.recorder is None else WrappedSource(source, self.recorder.write_frame)
 
     def remarks(self) -> list[str]:
-        """The recording's problem, a sentence, at the first call after it occurred."""
+        """The recording's problem, one sentence, once; else an empty list."""
         problem = None if self.recorder is None else self.recorder.problem
         if problem is None or self._has_remarked:
             return []
@@ -321,12 +323,12 @@ def path_beside(log: Path | str, suffix: str) -> Path:
 
 
 def recording_path(path: Path | str) -> Path:
-    """The recording's path, by the log's or by its own."""
+    """The path of a log's recording; a recording's own path is returned unchanged."""
     return path_beside(path, ".mcap")
 
 
 def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
-    """The path of a flight that starts now: ``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl``
+    """The path of a new flight's log: ``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl``
     in the directory. A campaign names its logs ``flight_seed<seed>.jsonl``."""
     safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
     return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"

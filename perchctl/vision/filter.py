@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from filterpy.kalman import predict
 
-from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.profile import KalmanConfig
 from perchctl.values import replace
 from perchctl.vision.types import MarkerTrack
@@ -188,14 +188,14 @@ def step_track(
     3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap beyond
     `MAX_TRACK_GAP_S` in either direction starts afresh.
     """
-    if measured is not None and not finite(measured.z):
+    if measured is not None and not is_finite(measured.z):
         measured = None
     if not math.isfinite(t_s):
         return track
     if track is None:
         return None if measured is None else start_track(measured, t_s, setup)
     dt_s = t_s - track.t_s
-    if abs(dt_s) > MAX_TRACK_GAP_S or not finite(track.x):
+    if abs(dt_s) > MAX_TRACK_GAP_S or not is_finite(track.x):
         return None if measured is None else start_track(measured, t_s, setup)
     if dt_s <= 0.0:
         return track

@@ -17,7 +17,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
+from perchctl.geometry import R_MARKER_TARGET, Array, is_finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.values import replace
 from perchctl.vision.lens import undistort_px
@@ -84,7 +84,7 @@ def estimate_pose(
     """
     source: _Source = "joint" if len(detections) > 1 else detections[0].marker
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
-    if not finite(image_px):
+    if not is_finite(image_px):
         return None  # the lens cannot have imaged them
     K, lift = setup.camera.K, setup.curl_lift_m[source]
     points = weigh_corners(detections, setup.corners_m[source], image_px, K, lift)
@@ -346,7 +346,7 @@ def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
 
 def _usable(candidate: PoseCandidate) -> bool:
     rvec, tvec = candidate.rvec, candidate.tvec
-    return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
+    return bool(is_finite(rvec) and is_finite(tvec) and tvec[2] > 0.0)
 
 
 def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilt_jacobian
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
@@ -135,7 +135,7 @@ def track_measurement(
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
         bias[1:] = attitude.R_world_level.dot(bias[1:])
-    R = np.asarray(noise[_YAW_FIRST] + _LEAST_NOISE) if finite(noise) else None
+    R = np.asarray(noise[_YAW_FIRST] + _LEAST_NOISE) if is_finite(noise) else None
     return Measurement(z, R, bias)
 
 

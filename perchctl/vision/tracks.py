@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from perchctl.geometry import Array, finite, wrap_rad
+from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.values import replace
 from perchctl.vision.filter import (
     MAX_TRACK_GAP_S,
@@ -381,7 +381,7 @@ def expected_corners(
     rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
     corners = project(setup.corners_m["joint"], rvec, tvec, setup.camera)
     moved = PoseCandidate(rvec, tvec)
-    if not finite(corners):
+    if not is_finite(corners):
         return None, moved
     return {"large": corners[:4], "small": corners[4:]}, moved
 

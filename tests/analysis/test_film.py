@@ -31,7 +31,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The log of a flight with its recording."""
     path = tmp_path_factory.mktemp("film") / "flight.jsonl"
     profile = short_profile()
-    log = LogWatcher.lockstep(path, profile, SEED, record=True)
+    log = LogWatcher.open_lockstep(path, profile, SEED, record=True)
     flight = fly_lockstep(profile, SEED, log)
     log.close(flight.report, flight.perched_miss_m, flight.fell)
     return path

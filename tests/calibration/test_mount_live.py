@@ -104,7 +104,7 @@ def test_turning_motors_end_it(
 ) -> None:
     """A vehicle in a hand must not have them on."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(AttitudeLink, "motors_run", True)
+    monkeypatch.setattr(AttitudeLink, "motors_running", True)
     words = ["-p", "crazyflie", "-u", sim.uri, "--source", sim.stream_url]
     said = calibrate("mount", *words)
     assert said.exit_code == 52

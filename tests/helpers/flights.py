@@ -54,7 +54,7 @@ class _Heights(LogWatcher):
         self.truth: Callable[[], Truth] | None = None
         self.z_m = 0.0
 
-    def watched(self, source: FrameSource) -> FrameSource:
+    def watch_source(self, source: FrameSource) -> FrameSource:
         return source
 
     def remarks(self) -> list[str]:

@@ -20,7 +20,7 @@ from perchctl.link.external_position import (
     RESET_PARAMETER,
     RESETS,
     StandingFeed,
-    settle,
+    settle_estimator,
 )
 from perchctl.positioning import FeedStatus, VehiclePose
 from perchctl.profile import PositioningConfig
@@ -87,7 +87,7 @@ class Bench:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(external_position, "set_parameters", self.set_parameters)
             wait = self.wait if self.feed is None else self.feed.wait
-            settle(None, "udp://x", CONFIG, feed, self.newest, self.clock, wait)
+            settle_estimator(None, "udp://x", CONFIG, feed, self.newest, self.clock, wait)
 
     def refused(self, kind: type[PerchError]) -> str:
         """The one sentence by which it is refused, within the bound."""

@@ -19,7 +19,7 @@ from perchctl.link.telemetry import (
     WRAP_MS,
     SampleAssembler,
     Timebase,
-    telemetry_from,
+    telemetry_from_log,
 )
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING
@@ -33,7 +33,7 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
         "stateEstimate.yaw": 30.0,
         "supervisor.info": 0x021E,
     }
-    sample = telemetry_from(values, 1.5)
+    sample = telemetry_from_log(values, 1.5)
     assert sample.roll_rad == pytest.approx(math.radians(10))
     assert sample.pitch_rad == pytest.approx(-math.radians(20))
     assert sample.yaw_rad == pytest.approx(math.radians(30))
@@ -43,7 +43,7 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
     assert sample.climb_variance_m2ps2 is None
     assert sample.battery_v == 0.0  # unknown, which to the planner is not empty
     variances = {"kalman.varPX": 3e-4, "kalman.varPY": 2e-4, "kalman.varPZ": 1e-4}
-    sample = telemetry_from(values | variances, 1.5)
+    sample = telemetry_from_log(values | variances, 1.5)
     assert (sample.position_variance_m2, sample.climb_variance_m2ps2) == (3e-4, 1e-4)
 
 
@@ -131,7 +131,7 @@ def test_whether_motors_turn_is_the_newest_packet_s() -> None:
     link = Listened()
     for bits in (FLYING, 0, FLYING | 0x2):
         link.hear(**{"supervisor.info": bits, "gyro.x": math.nan})
-        assert link.motors_run == bool(bits)
+        assert link.motors_running == bool(bits)
 
 
 def test_samples_are_in_radians_right_handed_and_of_one_moment() -> None:

@@ -221,7 +221,7 @@ def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
 
 
 def test_a_flight_that_never_began_leaves_no_file(tmp_path: Path) -> None:
-    log = LogWatcher.real_time(tmp_path, recorded.PROFILE, "usb://0", "camera:0", record=True)
+    log = LogWatcher.open_real_time(tmp_path, recorded.PROFILE, "usb://0", "camera:0", record=True)
     assert {path.suffix for path in tmp_path.iterdir()} == {".jsonl", ".mcap"}
     log.abandon("no vehicle answers")
     assert not list(tmp_path.iterdir())
@@ -229,7 +229,7 @@ def test_a_flight_that_never_began_leaves_no_file(tmp_path: Path) -> None:
 
 def test_log_and_recording_share_a_name_that_neither_had(tmp_path: Path) -> None:
     (tmp_path / "f.mcap").write_bytes(b"another flight's")
-    log = LogWatcher.lockstep(tmp_path / "f.jsonl", recorded.PROFILE, 1, record=True)
+    log = LogWatcher.open_lockstep(tmp_path / "f.jsonl", recorded.PROFILE, 1, record=True)
     log.close()
     assert {path.name for path in tmp_path.iterdir()} == {"f.mcap", "f_2.jsonl", "f_2.mcap"}
     assert (tmp_path / "f.mcap").read_bytes() == b"another flight's"

@@ -62,7 +62,7 @@ def test_what_one_sends_in_one_go_is_told_together(log: Path) -> None:
 
 def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
     rig, link = hung_rig(5.0)
-    watcher = LogWatcher.lockstep(tmp_path / "f.jsonl", PROFILE, 1)
+    watcher = LogWatcher.open_lockstep(tmp_path / "f.jsonl", PROFILE, 1)
     parts = rig.parts()
     report = fly(type(parts)(**{**vars(parts), "watchers": (watcher,)}))
     watcher.close(report)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array, finite
+from perchctl.geometry import Array, is_finite
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import (
     BEFORE,
@@ -190,7 +190,7 @@ def _refined_once(
     shift = known
     if shift is None:
         corners = _intersect(lines)
-        if not finite(corners):
+        if not is_finite(corners):
             return found
         shift = _measured_shift(markers, sides, inner, lines, residual_px, corners)
     applied = shift or EdgeShift(0.0, shift_prior_px(float(sides.grey[:, :, -1].mean())))
@@ -198,7 +198,7 @@ def _refined_once(
         lines = lines.copy()
         lines[:, 2] += _outwards(markers, lines) * (applied.shift_px / markers.px_per_unit)
     corners = _intersect(lines)
-    if not finite(corners):
+    if not is_finite(corners):
         return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, residual_px, corners_px)
@@ -417,7 +417,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
     turn = np.sign(doubled_area(raw_px))
     is_square = turn.all() and sides_px.min() > 1e-6
-    if not (is_square and finite(corners)):
+    if not (is_square and is_finite(corners)):
         return None
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
@@ -467,7 +467,7 @@ def measure_edges(
     offset_px, weight, blur_px = locate_edges(grey, half_px, near_px, around)
     points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES, 2)
-    points = points if finite(points) else np.nan_to_num(points)
+    points = points if is_finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_px)
     sides, inner_edges = (
         EdgeData(grey[part], near_px[part], points[part], weight[part], blur_px[part])

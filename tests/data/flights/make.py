@@ -77,7 +77,7 @@ def _seen(log: Path) -> None:
         "simulation.camera_noise_sigma": [0.4, 0.4],
     }
     profile = short_profile(SMALL | changes)
-    watcher = LogWatcher.lockstep(log, profile, 4, record=True)
+    watcher = LogWatcher.open_lockstep(log, profile, 4, record=True)
     flight = fly_lockstep(profile, 4, watcher, **ordered({Phase.PERCH: Operator.STOP}))
     watcher.close(flight.report, flight.perched_miss_m, flight.fell)
 
