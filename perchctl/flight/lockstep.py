@@ -230,9 +230,9 @@ def lockstep_feed(link: MockLink, profile: Profile) -> PositionFeed | None:
         return None
     config = config.model_copy(update={"system": capture.SYSTEM, "host": "sim"})
     feed = PositionFeed(capture, link.send_external, config)
-    link.call_every(PositionFeed.PERIOD_S, feed.turn)
+    link.call_every(PositionFeed.PERIOD_S, feed.poll_and_send)
     end_s = link.now_s + FIRST_FRAME_S
-    while (place := feed.place()) is None:
+    while (place := feed.sent_pose()) is None:
         if link.now_s >= end_s:
             why = feed.status(link.now_s).problem or f"nothing comes from {config.label}"
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")

@@ -88,7 +88,7 @@ def settle_estimator(
             raise ConnectionFailed(
                 f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
             )
-        start = feed.place()
+        start = feed.sent_pose()
         assert start is not None  # one was sent
         x, y, z = start.position_m
         set_parameters(cf, uri, estimator_start_parameters(start))
@@ -119,7 +119,7 @@ def _agree(
     end_s = clock() + AGREE_WITHIN_S
     since_s: float | None = None
     while (now_s := clock()) < end_s:
-        status, placed, sample = feed.status(now_s), feed.place(), newest()
+        status, placed, sample = feed.status(now_s), feed.sent_pose(), newest()
         agree = (
             status.problem is None
             and placed is not None
@@ -159,5 +159,5 @@ class StandingFeed:
     def status(self, now_s: float) -> FeedStatus:
         return FeedStatus(0.0, None, self._count, self._place)
 
-    def place(self) -> VehiclePose:
+    def sent_pose(self) -> VehiclePose:
         return VehiclePose(self._clock(), np.array(self._place.position_m), np.eye(3))

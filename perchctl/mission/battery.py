@@ -40,7 +40,7 @@ BACK_OFF_S = 3.0  # until it is steady and sees the target again
 
 
 def read_battery(c: Context) -> EnergyState:
-    """The battery's state with this tick's reading; one that is not fresh counts as none."""
+    """The battery's state after this tick's reading; a stale reading counts as no reading."""
     tel = c.telemetry
     reading_v = tel.battery_v if c.obs.battery_age_s <= FRESH_S else math.nan
     dt_s = max(0.0, c.t_s - c.state.t_s)
@@ -50,7 +50,7 @@ def read_battery(c: Context) -> EnergyState:
 def update_energy(
     state: EnergyState, dt_s: float, battery_v: float, thrust: float, battery_mah: float
 ) -> EnergyState:
-    """The state after `dt_s` under a commanded thrust 0..65535.
+    """The state `dt_s` later, under a commanded thrust 0..65535, for a battery of `battery_mah`.
 
     A `battery_v` that no cell can have, or NaN, counts as no reading."""
     load = max(0.0, min(1.0, thrust / FULL_THRUST))
@@ -96,12 +96,12 @@ def fit_sag_model(state: EnergyState) -> tuple[float, float]:
 
 
 def charge_from_rest_v(rest_v: float) -> float:
-    """The share of its charge, 0..1, that a cell with that resting voltage has."""
+    """The share of its charge, 0..1, that a cell of resting voltage `rest_v` has."""
     return min(1.0, max(0.0, _along(VOLTS, SHARES, rest_v)))
 
 
 def rest_v_from_charge(share: float) -> float:
-    """The resting voltage at a share of the charge."""
+    """The resting voltage, V, of a cell with `share` (0..1) of its charge."""
     return _along(SHARES, VOLTS, share)
 
 
@@ -143,7 +143,7 @@ def _towards(value: float, goal: float, part: float) -> float:
 
 
 def battery_outlook(c: Context) -> BatteryOutlook:
-    """What the battery has left, and for how many attempts that is enough. An unknown charge counts
+    """How long the battery still lasts, and for how many attempts. An unknown charge counts
     for at most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.state.energy
     used_mah = energy.used_share * c.profile.vehicle.battery_mah
@@ -182,8 +182,8 @@ def hover_left_s(state: EnergyState, profile: Profile, load: float) -> float | N
 
 
 def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
-    """The seconds that this attempt, each retry and the landing take, by the height of a target
-    that was seen."""
+    """The seconds that this attempt, each retry and the landing take, in this order, by the
+    height of the known target."""
     planner = c.planner
     up_m = max(0.0, c.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
@@ -204,7 +204,7 @@ def is_short_of_charge(c: Context) -> bool:
 
 
 def battery_shortfall(c: Context) -> str:
-    """The shortfall with its figures, as a sentence."""
+    """Text: the seconds left, and those that an attempt, the landing and the reserve take."""
     seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, attempt_retry_landing_s(c)
     has = "what the battery has left is not known"
     if seconds is not None:

@@ -62,7 +62,8 @@ def _contact(c: Context) -> bool:
     felt_s = c.t_s - c.obs.imu.steady_s
     wanted = perch.contact_thrust_ratio * c.state.hover_thrust  # as far as there is more
     return (
-        abs(c.error_z_m) <= perch.contact_z_m + (CARRIED_ON_MPS * unseen_s(c) if c.by_sight else 0)
+        abs(c.error_z_m)
+        <= perch.contact_z_m + (CARRIED_ON_MPS * sight_age_s(c) if c.by_sight else 0)
         and (steady or felt_s >= perch.contact_dwell_s)
         and c.reads_one_g
         and c.state.hover_thrust > 0
@@ -71,24 +72,24 @@ def _contact(c: Context) -> bool:
     )
 
 
-def unseen_s(c: Context) -> float:
+def sight_age_s(c: Context) -> float:
     """Seconds since the exposure of the last picture with the target."""
     return max(0.0, c.t_s - c.state.reckoning.sight_s)
 
 
 def contact_error(c: Context) -> ContactError:
-    """How far the gear is from the target's axis. With decks the last sight is carried on by the
-    estimate, which drifts and is shaken by the impact on the ceiling."""
+    """The gear's distance from the target's axis, and its sigma, which with decks grows after the
+    last sight: the estimate drifts, and the impact on the ceiling shakes it."""
     reckoning = c.state.reckoning
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if c.profile.positioning.by == "deck" and c.placed:
-        sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * unseen_s(c))
+        sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * sight_age_s(c))
     return ContactError(math.hypot(*reckoning.aside_m), sigma_m)
 
 
 def last_touch_error(c: Context) -> ContactError | None:
     """The `contact_error` of the last touch, in RECOVER only; None with a fresh sight, or once
-    motion capture shows that the vehicle has left that place."""
+    motion capture shows that the vehicle has left the place of that touch."""
     state = c.state
     if state.phase is not Phase.RECOVER or state.contact is None or c.fresh:
         return None
@@ -101,10 +102,10 @@ def last_touch_error(c: Context) -> ContactError | None:
 
 
 def contact_tolerance_m(c: Context) -> float:
-    """Tolerance of the target's height for a gear in contact."""
+    """The height difference (m) between gear and target up to which the gear is in contact."""
     planner = c.planner
     drift_mps = CARRIED_ON_MPS if c.by_sight else planner.landing.drift_mps
-    return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * unseen_s(c))
+    return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * sight_age_s(c))
 
 
 def is_at_target(c: Context) -> bool:
@@ -114,13 +115,13 @@ def is_at_target(c: Context) -> bool:
 
 
 def max_press_thrust(profile: Profile) -> float:
-    """The largest thrust that a press can have."""
+    """The largest thrust that a press can have, 0..65535."""
     perch = profile.planner.perch
     return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
 
 
 def is_hover_thrust(c: Context) -> bool:
-    """True if the thrust is what hovering takes: neither carried nor pressed nor accelerated."""
+    """True if the thrust is hover thrust: nothing carries, presses or accelerates the vehicle."""
     tel, setpoint = c.telemetry, c.state.setpoint
     vz = tel.velocity_mps[2]
     stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < 0.05
@@ -230,7 +231,6 @@ def _carried(c: Context) -> bool:
 
 
 def _saturated(c: Context) -> bool:
-    """True at full thrust on which the vehicle does not rise."""
     full = c.telemetry.thrust >= SATURATED * FULL_THRUST
     return full and -0.15 < c.climb_mps < 0.05
 
@@ -292,7 +292,7 @@ PROOFS = BY_PLACE | {C.MAGNET_HOLDS, C.WEIGHT_HANGS, C.DOWN, C.CARRIED, C.SATURA
 
 
 def update_conditions(c: Context) -> dict[Condition, float]:
-    """`PlannerState.since` after this tick: the start of each condition that holds now."""
+    """`PlannerState.since` after this tick: when each condition that holds now began."""
     old, now_s, void = c.state.since, c.t_s, _void(c)
     return {
         name: old.get(name, now_s)
@@ -302,7 +302,7 @@ def update_conditions(c: Context) -> dict[Condition, float]:
 
 
 def lasting_conditions(since: dict[Condition, float]) -> dict[Condition, float]:
-    """The entries of `since` that outlast a change of the phase, or a hold."""
+    """The entries of `since`, condition to start, that outlast a change of phase, or a hold."""
     return {name: s for name, s in since.items() if name in LASTING}
 
 

@@ -18,24 +18,24 @@ HANGING_S = 1.0  # to prove the magnet
 
 
 class Context:
-    """The argument of the table's predicates and the phases' actions: one tick, whole.
+    """State, observation and profile of one tick: the argument of all predicates and actions.
 
     Attributes:
         by_sight: the target itself is the positioning system.
-        mismatch: of latency or mounting, by which the target seems to move; zero while it rests.
+        mismatch: error of latency or mounting that makes the target seem to move; else zero.
         height_m: above the ground that the flight started from.
-        attitude_age_s: of attitude, acceleration, thrust and supervisor bits, which come
-            together; `imu_proves`: new enough to prove anything.
-        variance_m2: of the position; 0 if the firmware reports none, infinite for a NaN.
-        thrust_is_known: the thrust that is read follows what is ordered.
+        attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
+            together; `imu_proves`: they are new enough to prove anything.
+        variance_m2: variance of the position; 0 if the firmware reports none, infinite for a NaN.
+        thrust_is_known: the measured thrust follows the ordered thrust.
         reads_one_g: the accelerometer reads 1 g, as on anything that is supported.
-        telemetry_age_s: of its oldest part; a frozen reading is as old as its first one; `proves`:
-            new enough.
-        position_age_s: of the newest external position that was sent to the vehicle; with decks, of
-            the newest correction of its estimate; `position_is_stale`: none is fresh (fault 10).
+        telemetry_age_s: age of the oldest part of the telemetry; a frozen reading is as old as its
+            first sample; `proves`: all parts are new enough to prove anything.
+        position_age_s: age of the newest external position sent to the vehicle; with decks, of the
+            newest correction of its estimate; `position_is_stale`: it is too old (fault 10).
         located: the estimated position and speed are believed: positions have come for a while,
-            and fit the accelerometer if they are from pictures; `placed`: they are fresh, too, and
-            can prove something.
+            and fit the accelerometer if they are from pictures; `placed`: located,
+            and the telemetry `proves`.
         is_blown: after a blow or gust that only the accelerometer has measured, until a sight
             corrects the estimate: the firmware's estimator ignores sideways forces.
         climb_mps: vertical speed, by the estimate where that is believed and fresh, else by the
@@ -45,12 +45,12 @@ class Context:
         error_xy_m, error_z_m, error_yaw_rad: from the gear to the target; infinite while none was
             seen.
         contact_goal_z_m: height of the body at which the gear touches the target.
-        target_age_s: since the exposure of the last frame in which the target was measured.
-        tracked: the target is seen, or coasts within the filter's n_max frames; `fresh`: and was
+        target_age_s: time since the exposure of the last frame in which the target was measured.
+        tracked: the target is seen, or coasts within the filter's n_max frames; `fresh`: it was
             measured as lately as the latency allows; `small_is_fresh`: so was the small marker.
-        far_below_target: the camera sees that nothing holds the vehicle where it is.
+        far_below_target: the camera sees the target too far above to hold the vehicle.
         is_near_standoff: the gear is at the height at which an ascent settles.
-        cone_m: how far aside an ascent may be at the present height.
+        cone_m: how far from the target's axis an ascent may be at the present height.
     """
 
     def __init__(self, state: PlannerState, obs: Observation, profile: Profile) -> None:
@@ -120,11 +120,11 @@ class Context:
         return Context(state, self.obs, self.profile)
 
     def evolve(self, **changes: Any) -> Context:
-        """The same tick with changes of its state."""
+        """The same context with `changes` of its state's fields."""
         return self.with_state(replace(self.state, **changes))
 
     def held_s(self, condition: Condition) -> float:
-        """Seconds for which the condition has been true; -1 when it is not."""
+        """Seconds for which the condition has been true; -1 while it is false."""
         since = self.state.since.get(condition)
         return -1.0 if since is None else self.t_s - since
 

@@ -51,13 +51,13 @@ CAUGHT_MPS = -0.1  # by then the thrust is above the weight
 
 
 def hold_here(c: Context) -> PositionSetpoint:
-    """The present position and heading of the estimate."""
+    """The setpoint at the vehicle's estimated position and heading."""
     x, y, z = c.telemetry.position_m
     return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
 
 
 def body_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
-    """The body's place at which the gear is under the target at that heading."""
+    """The body's world x and y (m) at which the gear is under the target at heading `yaw_rad`."""
     target = c.target_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
@@ -67,9 +67,9 @@ def body_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
 def step_towards(
     c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> PositionSetpoint:
-    """The setpoint one tick later: towards the goal, at limited speeds, slower while nothing
-    confirms the camera's mounting. A landing does not turn. Only a search, an ascent, a take-off
-    and the press pass an `up_mps`."""
+    """The setpoint one tick later: towards `goal`, climbing at most at `up_mps`, sinking at most at
+    `down_mps`, and slower sideways while nothing confirms the camera's mounting. In a landing the
+    heading stays."""
     old, dt_s, align = c.state.setpoint or hold_here(c), c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if c.state.phase is Phase.LANDING:
@@ -88,8 +88,8 @@ def step_towards(
 
 
 def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """Integral of the gear's position error, m, world axes, limited, and frozen while the error is
-    large; it removes the offset that a steady draught leaves."""
+    """The integral (x, y) of the position's error to `goal_xy`, m, world axes: limited, and frozen
+    while the error is large. The integral removes the offset that a steady draught leaves."""
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
@@ -106,7 +106,7 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
 def correct_setpoint(
     c: Context, reference: PositionSetpoint, *, lift: bool = True
 ) -> PositionSetpoint:
-    """The setpoint that brings the vehicle to the reference: with the learned trim, a stiffer
+    """The setpoint that brings the vehicle to `reference`: with the learned integral, a stiffer
     position loop near the target, and, with `lift`, a multiple of the error in height against
     the onboard integrator's overshoot."""
     tel = c.telemetry
@@ -136,7 +136,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held setpoint a tick later; lower if the target gives the position, and is not seen."""
+    """The held `setpoint` a tick later; lower if the position source is a target out of view."""
     if not (c.by_sight and c.position_is_stale) or c.state.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
@@ -167,7 +167,7 @@ def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 
 
 def is_pressing(c: Context) -> bool:
-    """True if the thrust is at its limit, or above that of hovering, and nothing moves."""
+    """True if the thrust is at its limit, or above hover thrust, and the vehicle does not move."""
     return (
         _is_strong(c)
         and abs(c.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
@@ -181,8 +181,8 @@ def _is_strong(c: Context) -> bool:
 
 
 def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
-    """A setpoint below the vehicle until it is away from what it pressed against and the onboard
-    integrators have come down; None once they have, or if nothing was pressed."""
+    """The state, and a setpoint below the vehicle until it is away from what it pressed against and
+    the onboard integrators have come down; None after that, or if nothing was pressed."""
     state, tel = c.state, c.telemetry
     x, y, z = state.entry_m
     if not state.pressed:
@@ -199,7 +199,7 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 
 def lower_thrust(c: Context) -> Action:
-    """The release's first stage: the setpoint goes down in steps, or the raw thrust of a press."""
+    """The release's first stage: lower the setpoint, or a press's raw thrust, in steps."""
     complete, perch, state = c.planner.complete, c.planner.perch, c.state
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
@@ -220,7 +220,7 @@ def lower_thrust(c: Context) -> Action:
 
 def release_by_thrust(c: Context) -> Action:
     """The release's second stage: raw thrust down to still motors, and the stop when the whole
-    weight has hung long enough. Old telemetry restarts it; a landing accepts older telemetry."""
+    weight has hung long enough. Old telemetry restarts the stage; a landing takes older samples."""
     late_s = c.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
     if not c.imu_proves and c.attitude_age_s > late_s:
         return hold_by_position(c)
@@ -256,8 +256,8 @@ def motors_are_still(c: Context) -> bool:
 
 
 def stop_motors(c: Context) -> Action:
-    """Send stop and notify `STOPS` times, since a lost notify locks a hanging vehicle; more while
-    there is thrust."""
+    """Send stop and notify `STOPS` times, since a lost notify locks a hanging vehicle; send more
+    while telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
@@ -269,13 +269,13 @@ def stop_motors(c: Context) -> Action:
 
 
 def catch_goal_above_m(hover_thrust: float, thrust: float) -> float:
-    """How far above the vehicle the setpoint has to be that stops its fall."""
+    """How far above the vehicle the setpoint must be to stop its fall, by its present `thrust`."""
     turning = thrust > 0.5 * hover_thrust
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
 
 
 def catch_slip(c: Context) -> Action | None:
-    """The setpoint far above that stops a slip; None once it is caught, or with old telemetry."""
+    """The setpoint far above that stops a slip; None after the fall, or with old telemetry."""
     state, tel = c.state, c.telemetry
     if state.caught or not c.imu_proves:
         return None
@@ -299,7 +299,7 @@ def _braked_place_m(c: Context) -> tuple[float, float]:
 
 
 def clear_contact_below(c: Context, below_m: float) -> Context:
-    """The context without its contact once the vehicle is `below_m` under it."""
+    """The context; without its contact if the vehicle is more than `below_m` below the contact."""
     contact_z_m = c.state.contact_z_m
     if contact_z_m is None or c.telemetry.position_m[2] >= contact_z_m - below_m:
         return c

@@ -58,14 +58,14 @@ UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
 
 @dataclass(frozen=True)
 class Corrections:
-    """The variance of the vertical speed, which shows if anything still corrects the estimate."""
+    """The estimate's variance of vertical speed, which only grows when nothing corrects it."""
 
     variance_m2ps2: float | None = None  # the newest
-    changed_s: float = -math.inf  # when that came
-    none_since_s: float = math.inf  # since when it only grows
+    changed_s: float = -math.inf  # when that variance came
+    none_since_s: float = math.inf  # since when it has only grown
 
     def age_s(self, now_s: float) -> float:
-        """Age of the last correction, if it is certain that none comes any more; else 0."""
+        """Age of the last correction if corrections have certainly ceased; else 0."""
         certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
         return now_s - self.none_since_s if certain else 0.0
 
@@ -81,7 +81,7 @@ class Corrections:
 
 @dataclass(frozen=True)
 class Impact:
-    """A blow from below, as the floor gives one."""
+    """A blow from below, such as a touchdown's."""
 
     t_s: float = -math.inf  # -inf: there was none
     estimated_mps: float = 0.0  # vertical speed just before it, by the state estimate
@@ -92,7 +92,7 @@ class Impact:
 
 @dataclass(frozen=True)
 class ImuMotion:
-    """Motion by accelerometer and attitude alone; loop times, `-inf` for what never happened."""
+    """The vehicle's motion by accelerometer and attitude alone; loop times are -inf for never."""
 
     t_s: float = -math.inf  # of the newest sample
     velocity_mps: Vector = ZERO  # since the first sample, world axes
@@ -135,7 +135,7 @@ class ImuMotion:
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-        """The motion with one more sample; `last` is the one before, None at the first."""
+        """The motion with one more sample; `last`: the sample before it, None at the first."""
         dt_s = math.inf if last is None else new.t_s - last.t_s
         started_anew = last is not None and new.start != last.start
         motion = replace(
@@ -215,7 +215,7 @@ class ImuMotion:
         sample: Telemetry, offset_g: Vector, tilt_off_rad: tuple[float, float] = (0.0, 0.0)
     ) -> Vector:
         """Acceleration in world axes by force and attitude of a sample, less the accelerometer's
-        offset and the error of roll and pitch."""
+        offset and the error of roll and pitch, `tilt_off_rad`."""
         roll_rad, pitch_rad = sample.roll_rad - tilt_off_rad[0], sample.pitch_rad - tilt_off_rad[1]
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
@@ -255,7 +255,6 @@ def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) ->
 
 
 def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
-    """True if the estimate excludes a fall between two samples."""
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     way_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
@@ -316,14 +315,12 @@ _PLACE = attrgetter("position_m", "velocity_mps")
 def _frozen_s(
     before_s: float, last: Telemetry | None, new: Telemetry, reading: Callable[[Telemetry], object]
 ) -> float:
-    """Seconds for which a reading has been the very same."""
     if last is None:
         return before_s
     return 0.0 if reading(last) != reading(new) else before_s + max(0.0, new.t_s - last.t_s)
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    """The hover thrust with one more sample of free flight."""
     flies = sample.has_bit(FLYING) and sample.thrust < SATURATED * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
@@ -341,7 +338,8 @@ def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Speed and place under the target in world axes, carried on by the accelerometer."""
+    """Velocity of the vehicle and place of its gear under the target, world axes, carried on by the
+    accelerometer. `beside_mps`: sideways velocity that the state estimate alone has gained."""
 
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
@@ -450,8 +448,8 @@ def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:
 
 
 def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) -> DeadReckoning:
-    """The reckoning with the step of the position between two samples that its speed does not
-    explain. Steps add up; after a gap in the samples no step is added."""
+    """The reckoning with one more step of the estimated position: the part of the way between two
+    samples that the velocity does not explain. After a gap in the samples no step is added."""
     dt_s = _position_s(sample) - _position_s(last)
     if not 0.0 < dt_s <= UNSEEN_S:
         return old
@@ -475,7 +473,7 @@ def _position_s(sample: Telemetry) -> float:
 def add_sighting(
     old: DeadReckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> DeadReckoning:
-    """The reckoning restarted at a sight; `aside_m`: from gear to target axis, world axes."""
+    """The reckoning restarted at a sight; `aside_m` +- `sigma_m`: world x, y, gear to target."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
     )

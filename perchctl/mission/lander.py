@@ -115,7 +115,7 @@ def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the way down without the mission's table, for watchdog and rescue; the
-    first call begins it. `state` is None if the planner has none yet."""
+    first call begins the landing. `state` is None if the planner has not run yet."""
     c = Context(state or PlannerState.on_ground(obs), obs, profile)
     c = remember_observation(begin_landing(c))
     state, command = act(c.evolve(since=update_conditions(c)))
@@ -123,7 +123,7 @@ def step_landing(
 
 
 def begin_landing(c: Context) -> Context:
-    """The tick in the phase LANDING; unchanged if the landing had begun before."""
+    """The context in the phase LANDING; unchanged if the landing had begun before."""
     if c.state.phase is Phase.LANDING:
         return c
     new = c.evolve(
@@ -141,7 +141,7 @@ def begin_landing(c: Context) -> Context:
 
 
 def enter_landing(c: Context, old: PlannerState) -> Context:
-    """The tick with the state in which a landing from `old` starts; the phase is set already."""
+    """The context with a landing's first state; `c` is in LANDING, `old` is the state before."""
     tel, stopped_s = c.telemetry, old.stopped_s
     heard = c.t_s - tel.t_s <= c.safety.proof_age_s
     ordered = heard and tel.has_bit(HL_ACTIVE) and not c.by_sight
@@ -196,23 +196,22 @@ def _is_sighted(c: Context) -> bool:
 
 
 def _has_lost_its_position(c: Context) -> bool:
-    """True if only accelerometer and attitude are left."""
     return not (_is_sighted(c) if c.by_sight else c.located or c.state.astray)
 
 
 def is_in_magnet_reach(c: Context) -> bool:
-    """True if the magnet may hold the vehicle: since a contact, or since it was reckoned near."""
+    """True if the magnet may hold the vehicle: after a contact, or once reckoned near."""
     return c.state.contact_z_m is not None or c.state.reach_s is not None
 
 
 def is_motor_borne(c: Context) -> bool:
-    """True if neither the weight was put on the magnet nor the motors stopped."""
+    """True until the release by raw thrust begins or the motors are stopped."""
     return c.state.released_s is None and c.state.stopped_s is None
 
 
 def find_rest_state(c: Context) -> RestState:
     """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
-    above, or by the falls that were felt since it came into the magnet's reach."""
+    above, or by the falls measured since the vehicle came into the magnet's reach."""
     tel, state = c.telemetry, c.state
     if _is_held_elsewhere(c):
         return RestState.HELD
@@ -228,7 +227,6 @@ def find_rest_state(c: Context) -> RestState:
 
 
 def _is_held_elsewhere(c: Context) -> bool:
-    """True if it is up, and not on the target's magnet."""
     state = c.state
     if state.phase is not Phase.LANDING:
         return False
@@ -264,7 +262,7 @@ def is_still_hanging(c: Context) -> bool:
 
 
 def hangs_with_motors_off(c: Context) -> bool:
-    """True if the motors were stopped where it hung, and it is still there."""
+    """True if the motors were stopped while the vehicle hung, and it still hangs."""
     stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
     if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
         return False
@@ -275,7 +273,7 @@ def hangs_with_motors_off(c: Context) -> bool:
 
 
 def remember_observation(c: Context) -> Context:
-    """The tick with the state updated from its observation, for every kind of landing."""
+    """The context with its state updated from its observation, for every kind of landing."""
     state, obs = c.state, c.obs
     if state.last is not None and obs.t_s - state.t_s > c.profile.positioning.hold_s:
         kept = lasting_conditions(state.since)
@@ -302,7 +300,7 @@ def remember_observation(c: Context) -> Context:
 
 
 def record_thrust_order(state: PlannerState, command: Command) -> PlannerState:
-    """The state after recording the raw thrust that was just commanded."""
+    """The state with `raw_order` set by `command`: its raw thrust, or None for a setpoint."""
     if isinstance(command, RawThrust):
         return replace(state, raw_order=command.thrust)
     if isinstance(command, Idle):
@@ -323,7 +321,7 @@ def _answered(c: Context) -> Context:
 
 
 def give_up_position(c: Context) -> Context:
-    """The tick from which on only accelerometer and attitude are used, for good."""
+    """The context from which on only accelerometer and attitude are used, for good."""
     hover = _hover_thrust(c.state, c.obs)
     return c.evolve(blind_s=c.t_s, blind_height_m=c.height_m, hover_thrust=hover)
 
@@ -441,7 +439,6 @@ def _moved(place: Vector, by_m: Vector) -> Vector:
 
 
 def _hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """The hover thrust as learned, or as measured now."""
     tel = obs.telemetry
     measured = max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
     return state.hover_thrust or obs.imu.hover_thrust or measured
@@ -451,7 +448,7 @@ def _hover_thrust(state: PlannerState, obs: Observation) -> float:
 
 
 def act(c: Context) -> Action:
-    """The landing's command: on proof of a fall or of standing, else by what is known."""
+    """The landing's new state and command: by proof of a fall or of standing, else a descent."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
@@ -493,7 +490,6 @@ def _descend(c: Context) -> Action:
 
 
 def _falls_free(c: Context) -> bool:
-    """True if it has come off the magnet, and falls."""
     if not c.imu_proves:
         return False
     if not is_motor_borne(c):
@@ -558,10 +554,10 @@ def _by_setpoints(c: Context) -> Action:
 
 
 def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
-    """The order for the vehicle's own landing from `z_m`, a quintic from rest to rest.
+    """The order for the firmware's own landing from height `z_m`, a quintic from rest to rest.
 
-    It aims below the ground, by more the longer the estimate may have drifted, and never above the
-    vehicle: at the trajectory's end the motors stop.
+    The goal is below the ground, by more the longer the flight (`flown_s`) and so the drift, and
+    never above the vehicle: at the trajectory's end the motors stop.
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
@@ -569,7 +565,6 @@ def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z
 
 
 def _own_landing(c: Context) -> Action:
-    """The vehicle's own landing, ordered again while it shows no effect."""
     tel = c.telemetry
     state, away = leave_press(c)
     if away is not None and not _is_doubtful(c) and not state.orders:
@@ -657,7 +652,7 @@ def is_landing_over(c: Context) -> bool:
 
 
 def clear_contact_after_fall(c: Context) -> Context:
-    """The context without its contact, once the vehicle is below it by a position, or fell."""
+    """The context; without its contact once a position shows the vehicle lower, or after a fall."""
     if c.placed and c.state.blind_s is None:
         return clear_contact_below(c, PEELED_M)
     reach_s = c.state.reach_s
@@ -672,7 +667,6 @@ def clear_contact_after_fall(c: Context) -> Context:
 
 
 def _learned_hover(c: Context, dt_s: float) -> float:
-    """The hover thrust, drawn to the thrust for each g in free flight."""
     state, tel = c.state, c.telemetry
     first = state.level_hover or state.hover_thrust
     within = state.level_within
@@ -721,7 +715,6 @@ def _braking(c: Context) -> tuple[float, float]:
 
 
 def _against(mps: float) -> float:
-    """The limited tilt, in rad, that brakes a sideways speed."""
     return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))
 
 

@@ -34,7 +34,7 @@ _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 @dataclass(frozen=True)
 class MountSample:
-    """Vehicle and target in the plane of the estimate's world, x + iy. `lean_m`: from
+    """Positions of vehicle and target at `t_s`, as world x + iy in m. `lean_m`: from
     the vehicle to where its upward axis meets the target's plane."""
 
     t_s: float
@@ -49,7 +49,7 @@ class MountSample:
 
 
 def mount_sample(t_s: float, telemetry: Telemetry, target_m: Array) -> MountSample:
-    """The sight of a target at `target_m` (3,), by the vehicle's newest sample."""
+    """The sample of a target at `target_m` (3,), world, and of the vehicle as in `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
     lean_m = (float(target_m[2]) - z) * up
@@ -63,8 +63,8 @@ class MountingMonitor:
 
     sights: tuple[MountSample, ...] = ()
     paused_until_s: float = -math.inf
-    fits: bool = False  # the target has stood still over `PROVEN_M`: the check is over
-    still: bool = False  # it has stood still so far
+    mounting_fits: bool = False  # the target has stood still over `PROVEN_M`: the check is over
+    target_still: bool = False  # the target has stood still so far
     doubts: int = 0  # sights in a row that speak against the mounting
     turn_rad: float = 0.0  # the turn that would make the target stand still
 
@@ -75,19 +75,19 @@ class MountingMonitor:
 
     @property
     def is_unconfirmed(self) -> bool:
-        return not (self.fits or self.still)
+        return not (self.mounting_fits or self.target_still)
 
 
 def update_monitor(old: MountingMonitor, sight: MountSample) -> MountingMonitor:
     """The monitor with one more sight of a measured target."""
-    if old.fits or old.is_wrong:
+    if old.mounting_fits or old.is_wrong:
         return old
     kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= WINDOW_S)
     if kept and _jumped(kept, sight):
         return MountingMonitor(paused_until_s=sight.t_s + SETTLES_S)
     if sight.t_s < old.paused_until_s:
         return old
-    new = replace(old, sights=(*kept, sight), still=False, doubts=0)
+    new = replace(old, sights=(*kept, sight), target_still=False, doubts=0)
     return new if len(new.sights) < LEAST_SIGHTS else _judged(new, old.doubts)
 
 
@@ -117,7 +117,7 @@ def _judged(watch: MountingMonitor, against: int) -> MountingMonitor:
     pairs = [(aim - p0, target - q0) for aim, target in zip(aims, targets, strict=True)]
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
     if abs(along) < STANDS_STILL:
-        return replace(watch, fits=moved_m >= PROVEN_M, still=True)
+        return replace(watch, mounting_fits=moved_m >= PROVEN_M, target_still=True)
     spread_m = math.sqrt(sum(abs(q) ** 2 for _, q in pairs) / n)
     unexplained_m = math.sqrt(sum(abs(q - along * p) ** 2 for p, q in pairs) / n)
     turn = 1.0 - along

@@ -81,7 +81,7 @@ def step_mission(
     profile: Profile,
     table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the mission; `state` is None in the first, on the ground."""
+    """Fly one tick of the mission; `state` is None in the first tick, on the ground."""
     c = _remember(Context(state or PlannerState.on_ground(obs), obs, profile))
     row = first_transition(c, table)
     if row is not None:
@@ -124,7 +124,6 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 
 
 def _mount_watched(c: Context) -> MountingMonitor:
-    """The mounting's watch with this tick's frame, if measured over fresh telemetry."""
     state = c.state
     measured = c.obs.new_frame and state.confirmed > 0 and c.proves and not state.hold
     if state.target_m is None or not measured or state.phase not in IN_THE_OPEN:
@@ -221,7 +220,6 @@ def _started_phase(new: Context, c: Context) -> Context:
 
 
 def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
-    """Where the gear touched something; None if nothing was touched."""
     if row == "not-released":  # the contact was proven, and nothing has come off
         return old.contact
     if old.phase is Phase.RECOVER:  # pressed again before it had left
@@ -237,7 +235,7 @@ def _touched(old: PlannerState, row: str, c: Context) -> ContactError | None:
 
 
 def act(c: Context) -> Action:
-    """The phase's command for this tick."""
+    """The phase's new state and command for this tick."""
     # A fall is caught and a press ended although the vehicle is held: the setpoint is above.
     leaves = c.state.phase is Phase.RECOVER and (c.state.pressed or not c.state.caught)
     if c.state.hold and c.state.setpoint is not None and not leaves:

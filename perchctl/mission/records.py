@@ -43,19 +43,19 @@ class Event:
 
     @classmethod
     def of_rescue(cls, t_s: float, error: BaseException, rest: str) -> Event:
-        """The note on a vehicle's fate after an error in flight; `rest`: see `rest_text`."""
+        """The note on a vehicle's fate after an error in flight; `rest`: by `rest_text`."""
         return cls(t_s, EventKind.NOTE, f"{type(error).__name__}{RESCUE}{rest}")
 
     @property
     def is_rescue(self) -> bool:
-        """True for an event `of_rescue`."""
+        """True if `of_rescue` created the event."""
         return self.kind is EventKind.NOTE and RESCUE in self.reason
 
     @classmethod
     def of_tick(
         cls, before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
     ) -> list[Event]:
-        """The events of one tick; `before` is None in the first."""
+        """The events of one tick; `before`: the state before it, None in the first tick."""
         events: list[Event] = []
         if before is None:
             before = PlannerState.on_ground(obs)
@@ -93,7 +93,7 @@ class SentCommand:
 
 @dataclass(frozen=True)
 class ExternalPositions:
-    """State of the external positions for the vehicle: the newest, its age, the count `sent`."""
+    """External positions sent to the vehicle: how many, at what rate, the newest and its age."""
 
     age_s: float  # of the newest
     problem: str | None  # why none is sent now
@@ -116,7 +116,8 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class TurnInputs:
-    """The samples and the frame that link and camera gave in one turn."""
+    """The samples that the link, and the frame that the camera gave in one turn. `late`: samples
+    that came while camera or vision hung; `look`: the frame was to be searched."""
 
     samples: tuple[Telemetry, ...] = ()  # in the order in which they came
     late: tuple[Telemetry, ...] = ()  # those that came while camera or vision hung
@@ -183,17 +184,17 @@ class Tick:
 
 
 class Watcher(Protocol):
-    """What looks on at a flight: flight log, panel, live page. Its methods must not raise."""
+    """Receiver of ticks and events: flight log, panel, live page. Its methods must not raise."""
 
     def tick(self, tick: Tick) -> None:
-        """Take a flown turn."""
+        """Handle a turn that was flown."""
         return
 
     def event(self, event: Event) -> None:
-        """Take something that happened."""
+        """Handle an event of the flight."""
         return
 
     @property
     def problem(self) -> str | None:
-        """Why the watcher lost something; None while it lost nothing."""
+        """Why the watcher lost records; None while it has lost none."""
         return None

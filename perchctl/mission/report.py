@@ -157,9 +157,9 @@ def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: fl
 
 
 def find_touchdown(c: Context) -> Touchdown | None:
-    """The newest blow from below, where it may have been the floor's; None if there was none.
+    """The newest blow from below, if it may be a touchdown; None if there is no such blow.
 
-    Its speed is the estimate's where that is believed, else as reckoned by the accelerometer."""
+    The speed is the state estimate's where that is believed, else the dead reckoning's."""
     tel, imu, reckoning = c.telemetry, c.obs.imu, c.state.reckoning
     blow = imu.blow
     if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > LATEST_S:
@@ -172,7 +172,6 @@ def find_touchdown(c: Context) -> Touchdown | None:
 
 
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
-    """Why the flight ended so, behind what led to the landing where there was one."""
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
     told = why and (state.phase is not Phase.ABORTED or state.row == "landing-timeout")
     return f"{why}; {state.reason}" if told else state.reason

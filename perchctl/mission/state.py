@@ -54,7 +54,7 @@ TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 
 
 class Severity(IntEnum):
-    """How grave a transition is. From `LAND` on it only rises until the flight is over."""
+    """How grave a transition is. From `LAND` on, a flight's severity only rises."""
 
     CONTINUE = 0
     HOLD = 1
@@ -62,9 +62,9 @@ class Severity(IntEnum):
     LAND = 3
     STOP = 4
 
-    def escalate(self, row: Severity) -> Severity:
-        """The flight's severity after a transition: from `LAND` on it only rises."""
-        return max(self, row) if self >= Severity.LAND else row
+    def escalate(self, transition: Severity) -> Severity:
+        """The flight's severity after a transition of the given severity."""
+        return max(self, transition) if self >= Severity.LAND else transition
 
 
 class Outcome(Enum):
@@ -128,7 +128,7 @@ class ContactError:
 
 
 class Operator(IntEnum):
-    """The operator's command, which never falls: Ctrl-C once lands, twice stops."""
+    """The operator's command, which only rises: Ctrl-C once lands, twice stops."""
 
     NONE = 0
     LAND = 1
@@ -146,7 +146,7 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class VisualInertialMotion:
-    """The vehicle's motion by pictures and accelerometer at `t_s`, world axes."""
+    """The vehicle's motion at `t_s` by pictures and accelerometer; pairs are world x and y."""
 
     t_s: float
     velocity_mps: tuple[float, float]  # sideways
@@ -156,7 +156,7 @@ class VisualInertialMotion:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """All that is known in one tick. Times are on the loop's clock; ages are in seconds."""
+    """The planner's input in one tick. Times are on the loop's clock; ages are in seconds."""
 
     t_s: float
     telemetry: Telemetry  # the newest sample; its age is `t_s - telemetry.t_s`
@@ -183,7 +183,8 @@ class Observation:
 
 @dataclass(frozen=True)
 class EnergyState:
-    """The battery as fitted so far. Shares are of the full charge, loads of full thrust."""
+    """The battery as fitted so far. Shares are of the full charge, loads of full thrust.
+    `fit_sums`, of least squares: sag^2, sag * hunger, hunger^2, and the two right sides."""
 
     ground_v: float | None = None  # at rest; from the first reading where that was under load
     used_share: float = 0.0  # by the count of the thrust, for a battery as assumed
@@ -192,13 +193,12 @@ class EnergyState:
     rest_v: float | None = None  # estimated resting voltage now
     loaded_s: float = 0.0  # how long there were readings under load
     unknown_s: float = 0.0  # since the last reading
-    # Sums of least squares: sag^2, sag * hunger, hunger^2, and the two right sides.
     fit_sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """What the battery is enough for, by the energy model; None where that is unknown."""
+    """How long, and for how many attempts, the battery lasts by the energy model; None: unknown."""
 
     left_s: float | None = None  # of hovering, until `battery-low` would land it
     attempts: int | None = None  # with the landing after the last; None before a target

@@ -138,14 +138,14 @@ def astray_reason(c: Context) -> str:
 
 
 def is_position_lost(c: Context) -> bool:
-    """True if no position came for `positioning.land_s`, or the estimate is useless before."""
+    """True if no position came for `positioning.land_s`, or the estimate is useless earlier."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
 
 
 def position_loss_text(c: Context) -> str:
-    """The words for how long no external position was sent, and why."""
+    """Text: for how long no external position was sent, and why."""
     if c.is_blown:
         return "pushed aside while the target was not seen"
     age_s, why = c.position_age_s, c.obs.position_problem
@@ -173,7 +173,7 @@ def latency_reason(c: Context) -> str:
 
 
 def is_mounting_wrong(c: Context) -> bool:
-    """True if the target moves with the vehicle, or seems to lie below it."""
+    """True if the target moves along with the vehicle, or seems to lie below the vehicle."""
     below = c.held_s(C.TARGET_BELOW) >= BELOW_S
     return c.state.mount.is_wrong or c.mismatch.turn_rad != 0.0 or below
 
@@ -215,7 +215,7 @@ def is_held(c: Context) -> bool:
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """True if something holds the vehicle at another height than the target's, or beside it."""
+    """True if something holds the vehicle off the target's height, or beside the target."""
     touched = last_touch_error(c)
     error = touched or contact_error(c)
     at_its_height = touched is not None or abs(c.error_z_m) <= contact_tolerance_m(c)
@@ -276,7 +276,7 @@ def contact_reason(c: Context) -> str:
 
 
 def stopped_for_s(c: Context) -> float:
-    """Seconds since the first order to stop the motors; -1 before one."""
+    """Seconds since the first order to stop the motors; -1 before that order."""
     return -1.0 if c.state.stopped_s is None else c.t_s - c.state.stopped_s
 
 
@@ -327,7 +327,9 @@ def unconfirmed_reason(c: Context) -> str:
 # --- The ways out of the mission ---
 
 
-def cut_row(name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY) -> Transition:
+def motor_cut_row(
+    name: str, when: Predicate, reason: str, outcome: Outcome = O.SAFETY
+) -> Transition:
     """A row of the table: cut and lock the motors at once, in any airborne phase."""
     return Transition(name, AIR, when, P.ABORTED, reason, S.STOP, outcome, stop=EmergencyStop())
 
@@ -360,7 +362,7 @@ def give_up_row(name: str, when: Predicate, reason: Reason) -> Transition:
 
 TABLE: tuple[Transition, ...] = (
     # --- the safety rows, gravest first ---
-    cut_row(
+    motor_cut_row(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
         "second Ctrl-C: emergency stop",
@@ -377,7 +379,7 @@ TABLE: tuple[Transition, ...] = (
     end_row("locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"),
     end_row("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
     end_row("crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"),
-    cut_row(
+    motor_cut_row(
         "tilted",
         lambda c: c.held_s(C.TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
         "tilted beyond the limit: motors cut",
@@ -724,8 +726,8 @@ TABLE: tuple[Transition, ...] = (
 
 
 def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
-    """The first transition that applies, or None to stay. Whatever the table says, one that would
-    lead from a landing to a flying phase is passed over."""
+    """The first transition that applies, or None to stay. Whatever the table says, a transition
+    from a landing to a flying phase is passed over."""
     landing = c.state.severity >= Severity.LAND
     for row in table:
         undoes = landing and row.to in FLYING_PHASES

@@ -53,9 +53,9 @@ def add_samples(
 ) -> History:
     """The history with new samples.
 
-    `jumped` and `turned_rad` are about the new samples, with `late` also about the earlier ones of
-    the same turn. A sample without position or velocity gets both from the sample before; others
-    with NaN, or out of order, are left out (fault 35).
+    `jumped` and `turned_rad` are about the new samples, with `late` also about the earlier
+    samples of the same turn. A sample without position or velocity gets both from the sample
+    before; other samples with NaN, or out of order, are left out (fault 35).
     """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu
@@ -83,8 +83,8 @@ def add_samples(
 def attitude_at(history: History, t_s: float) -> Attitude | None:
     """Attitude, position and velocity at `t_s`, linear between samples (yaw on the circle).
 
-    Before the oldest sample the oldest counts; beyond the newest the newest is
-    carried on by its velocity for at most 0.1 s. None without samples.
+    Before the oldest sample its values hold; after the newest sample its velocity carries
+    the position on for at most 0.1 s. None without samples.
     """
     samples = history.samples
     if not samples:
@@ -142,7 +142,6 @@ def _turned_rad(a: Telemetry, b: Telemetry) -> float:
 
 
 def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the position moved farther than its speed explains."""
     moved_m = math.dist(a.position_m, b.position_m)
     rise_m = abs(b.position_m[2] - a.position_m[2])
     fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))
@@ -160,7 +159,6 @@ def _is_placed(s: Telemetry) -> bool:
 
 
 def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
-    """The sample with position and velocity of the last one."""
     behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
     return replace(
         new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s

@@ -34,7 +34,7 @@ class OnlineCalibration:
     """Estimate of the camera's latency and mounting from pictures and telemetry.
 
     `newest` is the solution of `sums` at `solved_s`; `applied_delay_s` is the latency beyond the
-    profile's that is subtracted from the pictures' times, since the one of `last_picture_s`.
+    profile's that is subtracted from the pictures' times, since the picture of `last_picture_s`.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
@@ -53,7 +53,7 @@ def update_calibration(
     camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """The estimate with one more picture in its sums, and once a second with their solution.
+    """The estimate with one more picture in its sums, and once a second with the sums' solution.
 
     `t_s` is the picture's arrival less the profile's latency. A pose that is not finite, too near,
     or without the attitude of its time is ignored.
@@ -66,7 +66,7 @@ def update_calibration(
     is_measured = pose.cov is not None and is_finite(pose.cov) and pose.tvec_m[2] >= LEAST_RANGE_M
     if is_measured and before is not None and after is not None:
         velocity_mps = velocity_at(history, t_s - delay_s)
-        moment = rows_variance_range(pose, before, after, velocity_mps, delay_s, setup)
+        moment = consistency_rows(pose, before, after, velocity_mps, delay_s, setup)
         new = replace(old, sums=add_rows(old.sums, t_s, *moment))
         if t_s - old.solved_s >= SOLVE_EVERY_S:
             newest = solve_consistency(new.sums, attitude_sigma_rad)
@@ -126,7 +126,7 @@ class ConsistencySums:
     """A flight's sums for `solve_consistency`.
 
     `level` (3, 8), the filtered rows, and their `variance` (3,) after the newest frame, None before
-    the first; `information` (8, 8) of the innovations; `row_count` of their rows.
+    the first; `information` (8, 8) of the innovations; `row_count`: how many rows gave them.
     """
 
     t_s: float = -math.inf
@@ -137,7 +137,7 @@ class ConsistencySums:
     row_count: int = 0
 
 
-def rows_variance_range(
+def consistency_rows(
     pose: MarkerPose,
     before: Attitude,
     after: Attitude,
@@ -146,10 +146,10 @@ def rows_variance_range(
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
     """A frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
-    variance (3,) of the target's place; and its range, m.
+    variance (3,) of each row's noise; and the target's range, m.
 
     `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time less `delay_s`, the likely delay; `velocity_mps` is its velocity then.
+    time less `delay_s`, the likely delay; `velocity_mps` is the vehicle's velocity then.
     """
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
@@ -205,7 +205,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """The sums with one frame more, by its `rows_variance_range`. After a gap, or a jump,
+    """The sums with one more frame, given by its `consistency_rows`. After a gap, or a jump,
     the level starts anew; what was learned of delay and turn is kept."""
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)

@@ -92,14 +92,14 @@ class Perception:
         return self._mirrored >= MIRRORED_FRAMES
 
     def target(self, t_s: float, spread: bool = True) -> TargetEstimate | None:
-        """The target at the present, for the vehicle's newest attitude; None while none was seen.
-        Without `spread` its standard deviations are those of the newest frame."""
+        """The target at `t_s` (now) for the vehicle's newest attitude; None before any sight.
+        Without `spread` the standard deviations remain those of the newest frame."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
     def camera_errors(self) -> CameraErrors | None:
-        """Errors of latency and mounting by all pictures so far; None if there were too few."""
+        """Errors of latency and mounting by all pictures so far; None after too few pictures."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sightings(self) -> None:
@@ -107,7 +107,6 @@ class Perception:
         self.motion = drop_sightings(self.motion)
 
     def _calibrate(self, output: PipelineOutput, applied_delay_s: float) -> None:
-        """Update what is estimated of motion, latency and mounting."""
         pose = self.state.measured.surest
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history

@@ -53,21 +53,21 @@ class VisualInertialWindow:
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window without its sights; from now on it accepts a rougher motion."""
+    """The window without its sights; from now on the window accepts a rougher motion."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
 def estimate_motion(
     old: VisualInertialWindow,
     t_s: float,
-    way_m: Vector,
+    body_to_target_m: Vector,
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
 ) -> VisualInertialWindow:
-    """The window with one more sight, `way_m` from body to target in body axes; `samples`:
+    """The window with one more sight, `body_to_target_m` in body axes at `t_s`; `samples`:
     telemetry of the last 2 s, oldest first; `offset_g`: what the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
-    new = replace(old, sights=(*kept, (t_s, way_m)))
+    new = replace(old, sights=(*kept, (t_s, body_to_target_m)))
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
     if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
         return new
@@ -108,10 +108,11 @@ def _found(wanders_m: Array) -> Mismatch | None:
 def fit_hypotheses(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
-    """The motion under each of n hypotheses, pairs of `LATER_S` and `TURNS_RAD`.
+    """The motion under each of n hypotheses: the delay `LATER_S[i]` and camera turn `TURNS_RAD[i]`.
 
-    Returns the target's sideways motion, rms in m, (n,); the vehicle's velocity at the newest
-    sample, m/s, (3, n); and the offset of its acceleration, m/s2, (3, n).
+    `sights`: times, and ways from body to target, m, body axes. Returns the target's apparent
+    sideways motion, rms in m, (n,); the vehicle's velocity at the newest sample, m/s, (3, n);
+    and the offset of its acceleration, m/s2, (3, n).
     """
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])

@@ -38,8 +38,8 @@ _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """The capture that the child connects to. `skip_empty`: frames without a body are dropped,
-    since the library returns frames by its own clock, whether or not anything has arrived."""
+    """The child process's connection: the library's name of the system, and options for it.
+    `skip_empty`: drop frames without a body, which the library returns without any arrival."""
 
     kind: str
     options: dict[str, str] = field(default_factory=dict)
@@ -56,8 +56,8 @@ class CaptureFailure:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """The child's connection: Vicon and VRPN take a port in the host's name, the others as
-    an option of its own."""
+    """The child process's connection. Vicon and VRPN take a port in the host's name, the other
+    systems as a separate option."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -80,7 +80,7 @@ def open_capture(
 class MotionCapture:
     """A `perchctl.positioning.feed.CaptureSource`, whose child process ends with it.
 
-    `who` names the capture in sentences; a frame that shows `body` goes before one that does not.
+    `who` names the capture in sentences; `poll` prefers a frame that shows `body`.
     Creating it waits for the first frame. Errors: ConnectionFailed, UsageError for a library that
     does not load.
     """
@@ -106,14 +106,14 @@ class MotionCapture:
             raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame since the last call, if possible one that shows the body."""
+        """The newest frame since the last call, preferably with the body; None without a frame."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
             frames[-1] if frames else None
         )
 
     def frames(self) -> list[CaptureFrame]:
-        """All frames since the last call or poll, oldest first."""
+        """All frames since the last `frames` or `poll`, oldest first."""
         return [self._frames.popleft() for _ in range(len(self._frames))]
 
     def problem(self, now_s: float) -> str | None:
@@ -126,7 +126,7 @@ class MotionCapture:
         return f"{self._who} has sent {what} for {silent_s:.1f} s"
 
     def close(self) -> None:
-        """End the child, wherever in its library it is, in bounded time."""
+        """End the child process, wherever in its library it is, in bounded time."""
         self._closed = True
         if self._child.poll() is None:
             self._child.kill()
@@ -212,7 +212,7 @@ Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, 
 
 
 def serve_parent() -> None:
-    """Send frames until the parent is gone, or the library gives up."""
+    """Send the capture's frames to the parent process until it ends, or the library fails."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_to_parent()
     setup = channel.receive(START_TIMEOUT_S)

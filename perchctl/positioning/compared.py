@@ -31,7 +31,7 @@ class CaptureComparison(BaseModel):
     """The result of comparing one vehicle with its motion capture by hand, as its file stores it.
 
     `set_up` identifies vehicle, capture, body and mounting of the body; the result holds for that
-    set-up only. `at` is None if no comparison was made.
+    set-up only. `at` is None if no comparison was made; `found`: the result in words.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -72,7 +72,7 @@ def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """The vehicle's comparison in this set-up; an unmade one if no file can be read."""
+    """The vehicle's comparison in this set-up; with `at` None if no file can be read."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())
@@ -84,9 +84,9 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureCompariso
 def save_comparison(
     config: PositioningConfig, vehicle: str, at: datetime, passed: bool, found: str
 ) -> str | None:
-    """Write a comparison in the place of the last one of this vehicle in this set-up. `at` has a
-    time zone. Returns None, or why it could not be written; then the last one is deleted if the
-    new one did not pass."""
+    """Write a comparison over the old comparison of this vehicle and set-up. `at` has a time zone;
+    `found`: the result in words. Returns None, or why the file could not be written; then the
+    old comparison is deleted if the new comparison did not pass."""
     path = comparison_path(config, vehicle)
     record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)
     try:

@@ -51,10 +51,10 @@ class CaptureSource(Protocol):
     """A motion-capture system, real or simulated; nothing in it blocks."""
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame that has arrived by `now_s`, None if none since the last call."""
+        """The newest frame that has arrived by `now_s`; None if no frame is new."""
 
     def problem(self, now_s: float) -> str | None:
-        """None while it works; otherwise one sentence with the cause."""
+        """None while the system works; otherwise one sentence with the cause."""
 
     def close(self) -> None: ...
 
@@ -75,9 +75,9 @@ class FeedStatus:
     """The state of a position feed, which the flight loop reads in each turn.
 
     `age_s`: time since the exposure of the newest position that was sent; inf before the first.
-    `problem`: None while positions are sent, else one sentence with the cause. `sent`: how many
-    were sent so far, `rate_hz` in the last second. `measured`: `pose` with its attitude, also where
-    only the position is sent.
+    `problem`: None while positions are sent, else one sentence with the cause. `sent`: positions
+    sent so far; `rate_hz`: in the last second. `pose`: the newest position sent; `measured`: that
+    with its attitude, also where only the position is sent.
     """
 
     age_s: float = math.inf
@@ -101,8 +101,7 @@ class SendingRate:
         return now_s >= self._due_s - 1e-6
 
     def note_sent(self, now_s: float) -> None:
-        """Note that a position was sent. A late turn does not delay the following positions, and
-        is not made up for."""
+        """Note a sent position: a late call delays no later position, and is not made up for."""
         self._due_s = max(self._due_s + self.period_s, now_s)
         self.count += 1
         self._times_s.append(now_s)
@@ -119,8 +118,8 @@ class SendingRate:
 
 
 class PositionFeed:
-    """Hands on the positions of a capture. `turn` is called every `PERIOD_S`: by a thread from
-    `start` until `close`, or in lockstep; `status` from any thread."""
+    """Hands on the positions of a capture. `poll_and_send` is called every `PERIOD_S`: by a
+    thread from `start` until `close`, or in lockstep; `status` from any thread."""
 
     PERIOD_S = 0.01
 
@@ -156,13 +155,13 @@ class PositionFeed:
             raise no_motion_capture()
 
     def start(self, clock: Callable[[], float]) -> None:
-        """Call `turn` in a thread from now on. `clock`: the flight loop's. A turn may hang in the
-        link's library; then `status` says so."""
+        """Call `poll_and_send` in a thread from now on. `clock`: the flight loop's. A call may
+        hang in the link's library; then `status` says so."""
 
         def run() -> None:
             due_s = clock()
             while not self._closed.is_set():
-                self.turn(clock())
+                self.poll_and_send(clock())
                 due_s = max(due_s + self.PERIOD_S, clock() - self.PERIOD_S)
                 self._closed.wait(max(0.0, due_s - clock()))
 
@@ -176,10 +175,10 @@ class PositionFeed:
             self._thread.join(END_TIMEOUT_S)
 
     def stop(self) -> None:
-        """Send nothing from here on: the positions contradict what the vehicle feels."""
+        """Send nothing from here on: the positions contradict the vehicle's own sensors."""
         self._stopped = True
 
-    def turn(self, now_s: float) -> None:
+    def poll_and_send(self, now_s: float) -> None:
         """Poll the source, and send its position if it is plausible and due. Raises nothing: after
         a failure the age in `status` grows, with the cause."""
         try:
@@ -189,7 +188,7 @@ class PositionFeed:
         with self._lock:
             self._turned_s, self._problem = now_s, problem
 
-    def place(self) -> VehiclePose | None:
+    def sent_pose(self) -> VehiclePose | None:
         """The newest pose that was sent, even if only its position was; None before that."""
         return self._placed
 
@@ -278,7 +277,7 @@ class VehiclePose:
 
 
 class PoseValidator:
-    """Checks each frame's pose for plausibility; keeps the last accepted and rejected one."""
+    """Checks each frame's pose for plausibility; keeps the last accepted and last rejected pose."""
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
@@ -351,7 +350,6 @@ def _is_pose(pose: BodyPose) -> bool:
 
 
 def _jumps(a: VehiclePose, b: VehiclePose) -> bool:
-    """True if no vehicle can have gone from `a` to `b` in their time."""
     dt_s = b.t_s - a.t_s
     first_s = min(dt_s, AT_FASTEST_S)
     far_m = NOISE_M + FASTEST_MPS * first_s + HELD_MPS * (dt_s - first_s)

@@ -60,8 +60,8 @@ def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseS
 class TargetFeed:
     """Sends the vehicle's position by sights of the target, called by the flight loop's thread.
 
-    `target`: its place; None until it was seen from the ground. `off`: the body's place by the
-    sights less its estimate, averaged against noise: the estimator lags behind late positions.
+    `target`: the target's place; None until it was seen from the ground. `off`: the body's place by
+    the sights less its estimate, averaged against noise: the estimator lags behind late positions.
     """
 
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
@@ -94,14 +94,14 @@ class TargetFeed:
         x, y, z = self.target.position_m - way_m
         return float(x), float(y), float(z)
 
-    def with_fixed_target(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
-        """The estimate with the target's known place, as the state estimate has it by its
-        learned offset `off`; unchanged until the place is known."""
+    def with_fixed_target(self, seen: TargetEstimate, attitude: Attitude) -> TargetEstimate:
+        """`seen` with the target's known place instead, moved by `off` into the world of the state
+        estimate, for the vehicle's `attitude`; unchanged until the place is known."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
         world_yaw_rad = wrap_rad(self.target.yaw_rad - self.off.yaw_rad)
-        e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, now, self._setup)
+        e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, self._setup)
         return replace(
             seen, e_m=e_m, e_yaw_rad=e_yaw_rad, world_m=world_m, world_yaw_rad=world_yaw_rad
         )
@@ -109,8 +109,9 @@ class TargetFeed:
     def add_pose(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
-        """Take a pose of this turn's picture; `then`: the vehicle's attitude and estimated position
-        at the exposure."""
+        """Send the vehicle's position by a pose of this turn's picture; while the target's place is
+        unknown, learn it instead if the vehicle is `at_rest`. `then`, `now`: the vehicle's attitude
+        and estimated position at the exposure and at `now_s`."""
         if pose.t_s <= self._seen_s:
             return
         # A known place may be newer than a picture that is still on its way.

@@ -93,7 +93,7 @@ UNITS_OF = {
 
 
 def key_unit(path: str) -> str:
-    """The unit that the ending of a key's name stands for; empty without one."""
+    """The unit that the ending of a key's name stands for; empty without such an ending."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))
     return UNITS_OF.get(name) or next((UNITS[e] for e in endings if e in UNITS), "")
@@ -107,8 +107,7 @@ def split_constant_keys(
 ) -> tuple[dict[str, Any], list[str], list[str]]:
     """A profile's values without the keys that have become constants (class variables of
     `model` or of its nested models); a note for each such key with the constant's value; and an
-    error sentence for each with another value.
-    """
+    error sentence for each with another value. `path`: the keys' prefix in these texts."""
     result, notes, lost = dict(values), list[str](), list[str]()
     for key, value in values.items():
         kind = model.model_fields[key].annotation if key in model.model_fields else None

@@ -64,10 +64,10 @@ def _parsed(setting: str, option: str) -> tuple[str, str]:
     return key.strip(), text
 
 
-def profile_value(profile: Profile, dotted: str) -> Any:
-    """The value at a dotted key, in JSON types; None if there is no such key."""
+def profile_value(profile: Profile, key: str) -> Any:
+    """The value of a key such as ``camera.latency_s``, in JSON types; None without such a key."""
     value: Any = profile.model_dump(mode="json")
-    for name in dotted.split("."):
+    for name in key.split("."):
         value = value.get(name) if isinstance(value, dict) else None
     return value
 
@@ -151,7 +151,7 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
     added at its section's end, a missing section at the file's end.
 
     Raises:
-        ValueError: a section holds no keys.
+        ValueError: what should be a section of `text` holds no keys.
     """
     yaml = YAML()
     yaml.preserve_quotes, yaml.width = True, 10**6

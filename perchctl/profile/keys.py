@@ -21,10 +21,10 @@ from perchctl.profile.schema import Profile
 
 @dataclass(frozen=True)
 class Key:
-    """One leaf of the profile's schema.
+    """One key of the profile, such as ``camera.latency_s`` (its `path`).
 
     `meaning` is the schema's description, with backticks around literals; `allowed` the bounds or
-    choices, in words; `default` its default value.
+    choices, in words; `default` its value in the section given to `keys`.
     """
 
     path: str
@@ -75,7 +75,6 @@ def _allowed_of(kind: dict[str, Any]) -> str:
 
 
 def _span(number: dict[str, Any]) -> str:
-    """Describe the bounds of a number; empty without any."""
     above, below = number.get("exclusiveMinimum"), number.get("exclusiveMaximum")
     least, most = number.get("minimum"), number.get("maximum")
     if least is None and above is None:

@@ -52,7 +52,7 @@ def find_profile(name: str) -> Path:
 
 
 def load_profile(name: str, *, with_weights: bool = True) -> Profile:
-    """Read, resolve `extends` and check a profile.
+    """The profile with path or name `name`, its `extends` resolved, checked.
 
     `with_weights`: `merge.weights` are read from `merge.weights_file`. Keys that have become
     constants are dropped with a `ProfileNote` as warning.
@@ -116,7 +116,7 @@ def _read_weights(name: str) -> WeightsConfig:
 
 
 def find_calibration(name: str) -> Path:
-    """A calibration file by its path, or by its name in `calib/`."""
+    """The calibration file at path `name`, or of that name in `calib/`. Raises NotFound."""
     given = Path(name).expanduser()
     if given.is_file():
         return given
@@ -135,7 +135,7 @@ _WHITE = 127
 
 
 def find_mask(name: str) -> Path:
-    """A mask's file; a loaded profile names it by its full path."""
+    """The mask file at path `name`. Raises NotFound."""
     path = Path(name)
     if not path.is_file():
         raise NotFound(

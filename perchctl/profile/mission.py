@@ -8,7 +8,7 @@ from perchctl.profile.base import Section, key
 
 
 class SearchConfig(Section):
-    """Phase 2. Waits `wait_s`, climbs `step_m`, tries again; never above `max_height_m`."""
+    """Phase 2: the vehicle waits `wait_s`, climbs `step_m`, tries again, up to `max_height_m`."""
 
     attempts: int = key(6, "number of waits for the target before landing", ge=1, le=100)
     wait_s: float = key(1.5, "wait at each height", gt=0, le=60)
@@ -46,11 +46,11 @@ class AlignConfig(Section):
 
 
 class AscendConfig(Section):
-    """Phase 5. Climbs to `standoff_m` under the target and settles there.
+    """Phase 5: the vehicle climbs to `standoff_m` under the target and settles there.
 
-    Falls back to ALIGN outside the cone `cone_base_m + cone_slope * distance`.
+    The vehicle goes back to ALIGN outside the cone `cone_base_m + cone_slope * distance`.
     `standoff_m` is between gear and target; the small marker must be in view there.
-    Settled is a gear within `settle_xy_m` of the axis, not more than `settle_z_m` below
+    The gear is settled within `settle_xy_m` of the axis, not more than `settle_z_m` below
     the stand-off.
     """
 
@@ -135,7 +135,7 @@ class CompleteConfig(Section):
 
 
 class RecoverConfig(Section):
-    """After a miss or a slip: descend, steady, back to phase 3."""
+    """After a miss or a slip the vehicle descends, steadies and returns to phase 3."""
 
     descend_m: ClassVar[float] = 0.10  # below where the attempt ended
     dwell_s: ClassVar[float] = 0.5
@@ -151,9 +151,9 @@ OVERDUE_SHARE = 0.5
 
 
 class LandingConfig(Section):
-    """Position setpoints at `speed_mps` down to `handover_m`, then the firmware's landing. Its
+    """A landing by position setpoints at `speed_mps` to `handover_m`, then by the firmware, whose
     goal is `undershoot_m` plus `drift_mps` times the flight's time below the estimated ground,
-    so that it ends on the floor in spite of drift."""
+    so that the vehicle reaches the floor in spite of drift."""
 
     speed_mps: float = key(0.3, "descent speed of the landing", gt=0, le=1)
     handover_m: float = key(

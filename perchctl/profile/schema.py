@@ -74,7 +74,7 @@ class Profile(Section):
 
     @classmethod
     def constant_key_errors(cls, values: dict[str, Any]) -> list[str]:
-        """A sentence for each key that is now a constant of another value."""
+        """An error sentence for each value that differs from the constant its key has become."""
         return split_constant_keys(values, cls)[2]
 
     @model_validator(mode="after")

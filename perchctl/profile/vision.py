@@ -38,10 +38,10 @@ def dictionary_size(name: str) -> int:
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 
-def have_same_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
-    """True if two markers have the same cells, in any rotation, as ``DICT_4X4_50`` has
-    the first ids of ``DICT_4X4_1000``."""
-    one, two = aruco_dictionary(name), aruco_dictionary(other)
+def have_same_pattern(dictionary: str, marker_id: int, other: str, other_id: int) -> bool:
+    """True if two markers, each a dictionary and an id, have the same cells in any rotation, as
+    ``DICT_4X4_50`` has the first ids of ``DICT_4X4_1000``."""
+    one, two = aruco_dictionary(dictionary), aruco_dictionary(other)
     if one.markerSize != two.markerSize:
         return False
     turns = two.bytesList[other_id].reshape(4, -1)  # a row for each quarter turn
@@ -49,11 +49,11 @@ def have_same_pattern(name: str, marker_id: int, other: str, other_id: int) -> b
     return any(bool((cells == turn).all()) for turn in turns)
 
 
-def check_marker_id(name: str, marker_id: int) -> None:
+def check_marker_id(dictionary: str, marker_id: int) -> None:
     """Raises ValueError when the id is outside its dictionary."""
-    count = dictionary_size(name)
+    count = dictionary_size(dictionary)
     if marker_id >= count:
-        raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}")
+        raise ValueError(f"id {marker_id} is outside {dictionary}, which holds 0..{count - 1}")
 
 
 # --- The keys ---

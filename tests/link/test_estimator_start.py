@@ -79,7 +79,7 @@ class Bench:
     def status(self, now_s: float) -> FeedStatus:
         return FeedStatus(0.01, self.status_problem, 0 if self.status_problem else 9)
 
-    def place(self) -> VehiclePose:
+    def sent_pose(self) -> VehiclePose:
         return VehiclePose(self.now_s, np.array(self.place_m), rot_z(2.0))
 
     def settle(self) -> None:

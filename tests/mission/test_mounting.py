@@ -160,7 +160,7 @@ def test_a_right_mounting_flies_on() -> None:
     it = Follows(0.0)
     state = fly(state_in(Phase.ALIGN), it, 3.98).state
     assert state.phase is not Phase.LANDING
-    assert state.mount.fits
+    assert state.mount.mounting_fits
     assert max(it.far_m) > 0.3
     assert it.far_m[15] <= 0.25 * 0.3 + 1e-9
 

@@ -15,7 +15,7 @@ from perchctl.perception.online_calibration import (
     STAMPS_S,
     ConsistencySums,
     add_rows,
-    rows_variance_range,
+    consistency_rows,
     solve_consistency,
 )
 from perchctl.profile import Profile
@@ -116,7 +116,7 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
         sums = add_rows(
             sums,
             t_s,
-            *rows_variance_range(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
+            *consistency_rows(pose, before, after, velocity(t_s - told_s), told_s, SETUP),
         )
     return sums
 

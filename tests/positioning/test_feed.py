@@ -67,7 +67,7 @@ class Rig:
     def frame(self, bodies: dict[str, BodyPose], age_s: float = 0.0) -> FeedStatus:
         self.now_s += 0.01
         self.capture.frame = CaptureFrame(self.now_s - age_s, bodies)
-        self.feed.turn(self.now_s)
+        self.feed.poll_and_send(self.now_s)
         return self.feed.status(self.now_s)
 
     def at(
@@ -82,7 +82,7 @@ class Rig:
     def idle(self, duration_s: float) -> FeedStatus:
         for _ in range(round(duration_s / 0.01)):
             self.now_s += 0.01
-            self.feed.turn(self.now_s)
+            self.feed.poll_and_send(self.now_s)
         return self.feed.status(self.now_s)
 
 
@@ -189,7 +189,7 @@ def test_a_frame_is_read_once_and_a_stamp_from_the_future_is_not_fresh_for_longe
     for _ in range(3):
         rig.now_s += 0.01
         rig.capture.frame = frame  # stamped as the one before
-        rig.feed.turn(rig.now_s)
+        rig.feed.poll_and_send(rig.now_s)
     assert len(rig.places) == 1
     for count in (2, 3):
         status = rig.at(1.0, age_s=-5.0)
