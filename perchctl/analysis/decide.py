@@ -62,9 +62,12 @@ def replay_decisions(
     profile: Profile,
     observation_of: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[ReplayedDecision]:
-    """Replay the planner turn by turn. `observation_of` returns a turn's observation (default: as
-    recorded), or None to skip the turn. Only flown turns advance the planner's state. The replay
-    ends with the first turn on which the planner raises, as a flight does."""
+    """Replay the planner turn by turn.
+
+    `observation_of` returns a turn's observation (default: as recorded), or None to skip the turn.
+    Only flown turns advance the planner's state. The replay ends with the first turn on which the
+    planner raises, as a flight does.
+    """
     state: PlannerState | None = None
     tick = 0
     for turn in turns:

@@ -195,10 +195,12 @@ class Sweep:
     profiles: tuple[Profile, ...]
 
     def record(self, results: Sequence[FlightResult]) -> dict[str, Any]:
-        """The sweep's results for JSON, over the seeds flown with all values. `cells`: each value's
-        figures; `best`: the value with the most successes, then the smallest median miss;
-        `best_against_own`: `Comparison` of the original value (A) with `best` (B), None if these
-        are the same."""
+        """The sweep's results for JSON, over the seeds flown with all values.
+
+        `cells`: each value's figures; `best`: the value with the most successes, then the smallest
+        median miss; `best_against_own`: `Comparison` of the original value (A) with `best` (B),
+        None if these are the same.
+        """
         seeds = results_by_seed(results, len(self.profiles))
         own = len(self.profiles) - 1
         cells = [

@@ -60,8 +60,10 @@ def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
 ) -> FlightResult:
     """Fly one seed of the profile's scenario; any executor can send this function to a worker.
+
     `record` writes the pictures beside the log. A refused flight is a result, too, without a log.
-    Errors: NotFound, InvalidValue (calibration, log)."""
+    Errors: NotFound, InvalidValue (calibration, log).
+    """
 
     def fly(_scenario: Scenario) -> FlightResult:
         log = (

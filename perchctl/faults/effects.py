@@ -275,9 +275,11 @@ def latency_drop_s(effect: Effect) -> float:
 
 
 class Injector:
-    """Begins effects `moment_s` into `phase`, or when the phase ends earlier. `tick` is called with
-    each tick of the loop, `begin_due` every `SAMPLE_S` of simulated time. `begin_s` is None until
-    the effects begin; `flown` is the phase of the newest tick."""
+    """Begins effects `moment_s` into `phase`, or when the phase ends earlier.
+
+    `tick` is called with each tick of the loop, `begin_due` every `SAMPLE_S` of simulated time.
+    `begin_s` is None until the effects begin; `flown` is the phase of the newest tick.
+    """
 
     def __init__(
         self, rig: FaultRig, effects: tuple[Effect, ...], phase: Phase, moment_s: float

@@ -53,9 +53,12 @@ class Link(Protocol):
         """Return None while the link works, otherwise one sentence with the cause."""
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
-        """Call `guard` regularly from now on, until the link is closed. `on_sent` is called with
-        each command that the link has sent in the loop's place: the guard's, an order repeated
-        after the link was lost, and the farewell; from the link's own thread if it has one."""
+        """Call `guard` regularly from now on, until the link is closed.
+
+        `on_sent` is called with each command that the link has sent in the loop's place: the
+        guard's, an order repeated after the link was lost, and the farewell; from the link's own
+        thread if it has one.
+        """
 
     def close(self) -> None:
         """Close the link, after a bounded wait until the vehicle no longer flies."""

@@ -466,11 +466,13 @@ def act(c: Context) -> Action:
 
 
 def _descend(c: Context) -> Action:
-    """Come down level, by thrust, unless the place is known. In the magnet's reach a setpoint below
-    takes the thrust to its least, and what that does not move is given to the magnet. Else sink by
-    setpoints to the hand-over, and from there by the vehicle's own landing: at once where height,
-    stream or loop are doubtful. By the target it would follow an estimate that rests on pictures,
-    to an unmeasured floor: then it is level from there."""
+    """Come down level, by thrust, unless the place is known.
+
+    In the magnet's reach a setpoint below takes the thrust to its least, and what that does not
+    move is given to the magnet. Else sink by setpoints to the hand-over, and from there by the
+    vehicle's own landing: at once where height, stream or loop are doubtful. By the target it would
+    follow an estimate that rests on pictures, to an unmeasured floor: then it is level from there.
+    """
     if not _knows_its_place(c):
         return _level(c)
     landing, in_reach, doubtful = c.planner.landing, is_in_magnet_reach(c), _is_doubtful(c)

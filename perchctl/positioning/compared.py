@@ -84,9 +84,11 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureCompariso
 def save_comparison(
     config: PositioningConfig, vehicle: str, at: datetime, passed: bool, found: str
 ) -> str | None:
-    """Write a comparison over the old comparison of this vehicle and set-up. `at` has a time zone;
-    `found`: the result in words. Returns None, or why the file could not be written; then the
-    old comparison is deleted if the new comparison did not pass."""
+    """Write a comparison over the old comparison of this vehicle and set-up.
+
+    `at` has a time zone; `found`: the result in words. Returns None, or why the file could not be
+    written; then the old comparison is deleted if the new comparison did not pass.
+    """
     path = comparison_path(config, vehicle)
     record = CaptureComparison(set_up=_set_up(config, vehicle), at=at, passed=passed, found=found)
     try:

@@ -80,9 +80,11 @@ class Board:
         return columns - 1, rows - 1
 
     def corners_m(self) -> Array:
-        """The inner corners (n, 3) in metres, row by row from the top left one; x right,
-        y down. The origin is the top left corner of the print, as that of
-        `cv2.aruco.CharucoBoard.getChessboardCorners`; on a chessboard it is the first corner."""
+        """The inner corners (n, 3) in metres, row by row from the top left one; x right, y down.
+
+        The origin is the top left corner of the print, as that of
+        `cv2.aruco.CharucoBoard.getChessboardCorners`; on a chessboard it is the first corner.
+        """
         first = 1 if self.kind == "charuco" else 0
         across, down = (
             (np.arange(count) + first) * self.square_m * scale

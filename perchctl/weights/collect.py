@@ -290,9 +290,11 @@ class Experiment:
     wait: Callable[[float], None]
 
     def run(self, positions: int, frames: int) -> None:
-        """Collect positions of `frames` frames each until the session holds `positions`. Raises
-        Interrupted when the person stops (complete positions are kept), and the errors of the
-        source and the truth."""
+        """Collect positions of `frames` frames each until the session holds `positions`.
+
+        Raises Interrupted when the person stops (complete positions are kept), and the errors of
+        the source and the truth.
+        """
         while self.session.done < positions:
             number = self.session.next_position
             self.say(

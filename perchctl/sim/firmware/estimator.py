@@ -102,9 +102,11 @@ class Estimator:
         flying: bool = False,
         pressed: bool = False,
     ) -> None:
-        """Advance by one control period. Drift runs once the vehicle `has_flown`; `spinning`
-        motors shake the accelerometer, `pressed` to the ceiling it is biased; `flying` is the
-        supervisor's state."""
+        """Advance by one control period.
+
+        Drift runs once the vehicle `has_flown`; `spinning` motors shake the accelerometer,
+        `pressed` to the ceiling it is biased; `flying` is the supervisor's state.
+        """
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:
