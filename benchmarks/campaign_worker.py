@@ -45,7 +45,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "history, turns, log": (
         "perchctl.flight.inputs:add_samples",
         "perchctl.perception.perception:update_calibration",
-        "perchctl.flight.inputs:TurnReporter.flown",
+        "perchctl.flight.inputs:TurnReporter.flown_turn",
         "perchctl.flight.inputs:TurnReporter.report_waiting_turn",
         "perchctl.flight.lockstep:TruthWatcher.tick",
     ),

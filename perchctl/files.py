@@ -98,8 +98,10 @@ def write_error(
 
 @contextmanager
 def atomic_write(path: Path, mode: int | None = None) -> Iterator[Path]:
-    """Yield a temporary path for the block to write a file to. As the block ends, the file is
-    brought to the disk and gets its place; after an error nothing is left.
+    """Yield a temporary path for the block to write a file to.
+
+    As the block ends, the file is brought to the disk and gets its place; after an error nothing is
+    left.
 
     The temporary path has the suffix of `path`, by which some libraries choose the format; its
     folder is made. A file that is replaced keeps its permissions; a new one gets `mode`, by

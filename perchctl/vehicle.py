@@ -119,8 +119,10 @@ class PositionSetpoint:
 
 @dataclass(frozen=True)
 class RawThrust:
-    """A raw thrust 0..65535 at an attitude, level by default, without position control. Roll to the
-    right and pitch nose down are positive, as in telemetry."""
+    """A raw thrust 0..65535 at an attitude, level by default, without position control.
+
+    Roll to the right and pitch nose down are positive, as in telemetry.
+    """
 
     thrust: int
     roll_rad: float = 0.0

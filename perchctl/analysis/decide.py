@@ -106,8 +106,10 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
 
 
 def field_difference(name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
-    """The first subfield of field `name` in which its two values differ, or None. Values of
-    different classes are returned whole, as text with their class."""
+    """The first subfield of field `name` in which its two values differ, or None.
+
+    Values of different classes are returned whole, as text with their class.
+    """
     if type(recorded) is not type(replayed):
         return name, _shown(recorded), _shown(replayed)
     return _first_differing(name, to_exact_json(recorded), to_exact_json(replayed))

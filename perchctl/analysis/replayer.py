@@ -79,8 +79,10 @@ class PerceptionReplay:
 
     @property
     def is_identical(self) -> bool:
-        """True if no replayed value differs. A picture that is missing or unreadable does not
-        count as a difference."""
+        """True if no replayed value differs.
+
+        A picture that is missing or unreadable does not count as a difference.
+        """
         return not (self.differences or (self.missing is not None and self.missing.is_different))
 
 

@@ -232,8 +232,10 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 @dataclass(frozen=True)
 class DecisionPicture:
-    """Last camera picture before a phase change, as a JPEG with the detected markers drawn. The
-    caption has the picture's time, as the last centimetres are flown without pictures."""
+    """Last camera picture before a phase change, as a JPEG with the detected markers drawn.
+
+    The caption has the picture's time, as the last centimetres are flown without pictures.
+    """
 
     caption: str
     jpeg: bytes

@@ -167,8 +167,10 @@ def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> Came
 def calibration_text(
     camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
 ) -> str:
-    """The text of a calibration file; `name` is the camera's. `notes` are further keys, ignored
-    by ROS readers, with numbers, texts or arrays (n, m)."""
+    """The text of a calibration file; `name` is the camera's.
+
+    `notes` are further keys, ignored by ROS readers, with numbers, texts or arrays (n, m).
+    """
     # ROS wants five coefficients of plumb_bob.
     short = camera.model == "plumb_bob" and camera.dist.size == 4
     entries: dict[str, str | float | int | Array] = {

@@ -103,8 +103,11 @@ NAMES = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class ConnectedCamera:
-    """A camera of this computer. `stable_path`: a link, the same at every port, or empty;
-    `problem`: why the camera cannot be opened, or empty."""
+    """A camera of this computer.
+
+    `stable_path`: a link, the same at every port, or empty; `problem`: why the camera cannot be
+    opened, or empty.
+    """
 
     number: int
     name: str = ""

@@ -220,8 +220,11 @@ class LiveSource:
         began_s: float | None = None,
         encoded: bytes | None = None,
     ) -> None:
-        """Keep a picture that has arrived now. `waited_s`: its time under way beyond the usual.
-        `began_s`: start of its arrival; the latency counts from there. `encoded`: as in `Frame`."""
+        """Keep a picture that has arrived now.
+
+        `waited_s`: its time under way beyond the usual. `began_s`: start of its arrival; the
+        latency counts from there. `encoded`: as in `Frame`.
+        """
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
         grey = to_grey(image)

@@ -100,8 +100,10 @@ def compare_variants(results: Iterable[FlightResult]) -> Comparison:
 def compare_pairs(
     pairs: Sequence[Pair], figures: Sequence[str] = tuple(FIGURES), comparisons: int = 1
 ) -> Comparison:
-    """The comparison of two flights per seed by `figures` (keys of `FIGURES`). `comparisons`:
-    number of comparisons that share the 5 % significance level."""
+    """The comparison of two flights per seed by `figures` (keys of `FIGURES`).
+
+    `comparisons`: number of comparisons that share the 5 % significance level.
+    """
     questions = comparisons * (1 + len(figures))
     level = 1.0 - (1.0 - LEVEL) / questions
     return {

@@ -57,8 +57,11 @@ def offline_rows(options: FlyOptions) -> list[Row]:
 
 
 def warnings_before_flight(options: FlyOptions) -> list[str]:
-    """A sentence for each offline row that warns. Errors: SafetyAbort for the first row that
-    fails; InvalidValue, NotFound (calibration file); InvalidValue (log folder)."""
+    """A sentence for each offline row that warns.
+
+    Errors: SafetyAbort for the first row that fails; InvalidValue, NotFound (calibration file);
+    InvalidValue (log folder).
+    """
     profile_camera(options.profile.camera)
     check_writable(options.log_dir / "flight.jsonl", force=True)
     rows = offline_rows(options)

@@ -105,8 +105,10 @@ def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack)
 
 @dataclass(frozen=True)
 class VehicleChecks:
-    """Checks of a vehicle and its motion capture. `uri`: the given address; `probe` may have the
-    address of a simulated vehicle."""
+    """Checks of a vehicle and its motion capture.
+
+    `uri`: the given address; `probe` may have the address of a simulated vehicle.
+    """
 
     probe: ProbeLink
     uri: str

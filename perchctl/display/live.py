@@ -91,8 +91,10 @@ class LivePage:
             self._changed.notify_all()
 
     def set_state(self, describe: Callable[[], dict[str, Any]], *, live: bool = True) -> None:
-        """Show the values that `describe` returns; it is called when a browser polls. With `live`,
-        the page warns when `set_state` is no longer called."""
+        """Show the values that `describe` returns; it is called when a browser polls.
+
+        With `live`, the page warns when `set_state` is no longer called.
+        """
         self._describe = describe
         self._state_s = self._clock() if live else None
 

@@ -65,8 +65,10 @@ PROBE = Packet(Port.LINK, 0, b"")
 
 
 class FaultyFlight:
-    """One flight with a fault and its judge, ready for a single call of `fly`. It is also a
-    `Watcher` of the loop; `problem` is the error of the log's disk, or None."""
+    """One flight with a fault and its judge, ready for a single call of `fly`.
+
+    It is also a `Watcher` of the loop; `problem` is the error of the log's disk, or None.
+    """
 
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None

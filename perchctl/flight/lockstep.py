@@ -118,8 +118,11 @@ class TruthWatcher(Watcher):
 
 @dataclass(frozen=True)
 class LockstepFlight:
-    """A finished flight with its true end. `miss_m`: from gear to target centre, horizontal;
-    `hanging`: by the magnet; `locked`: by the supervisor."""
+    """A finished flight with its true end.
+
+    `miss_m`: from gear to target centre, horizontal; `hanging`: by the magnet; `locked`: by the
+    supervisor.
+    """
 
     report: FlightReport
     miss_m: float

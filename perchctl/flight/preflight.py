@@ -55,8 +55,11 @@ def refuse_wrong_positions(
     now_s: float,
     rest_check: RestCheck | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world or body. Old data and a
-    tilted or moving vehicle are not checked. `rest_check` keeps the place of earlier turns."""
+    """Raises SafetyAbort for positions in another unit, or of another world or body.
+
+    Old data and a tilted or moving vehicle are not checked. `rest_check` keeps the place of earlier
+    turns.
+    """
     if status is None or telemetry is None:
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:

@@ -104,8 +104,9 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """True if the driver has been stuck for `DEAD_S` and will never take a packet again. To be
-        called repeatedly, and only while the driver takes none.
+        """True if the driver has been stuck for `DEAD_S` and will never take a packet again.
+
+        To be called repeatedly, and only while the driver takes none.
 
         A radio out of reach counts its lost packets, and goes on by itself. A radio whose dongle
         was pulled out counts nothing (cflib retries for ever, too).

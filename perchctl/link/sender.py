@@ -36,8 +36,11 @@ RETRY_S = 0.002
 
 @dataclass(eq=False)
 class _Waiting:
-    """A command from `put` until the library has all of it. `rest` is None until the first
-    attempt, then the pieces that are still to be handed over; `begun` once one has been."""
+    """A command from `put` until the library has all of it.
+
+    `rest` is None until the first attempt, then the pieces that are still to be handed over;
+    `begun` once one has been.
+    """
 
     put_s: float
     command: Command

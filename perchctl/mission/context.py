@@ -129,8 +129,11 @@ class Context:
         return -1.0 if since is None else self.t_s - since
 
     def is_sinking(self, mps: float) -> bool:
-        """True if the vehicle sinks faster than `mps`. A speed that no position corrects counts
-        only while the accelerometer reads less than the weight, too."""
+        """True if the vehicle sinks faster than `mps`.
+
+        A speed that no position corrects counts only while the accelerometer reads less than the
+        weight, too.
+        """
         tel = self.telemetry
         if self.climb_mps >= -mps:
             return False

@@ -360,8 +360,11 @@ class DeadReckoning:
 def advance_reckoning(
     old: DeadReckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
 ) -> DeadReckoning:
-    """The reckoning one tick later. `believed`: the sample's estimated velocity is true; `astray`:
-    that velocity may be in other axes, so the reckoned velocity is kept even after a silence."""
+    """The reckoning one tick later.
+
+    `believed`: the sample's estimated velocity is true; `astray`: that velocity may be in other
+    axes, so the reckoned velocity is kept even after a silence.
+    """
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
         carried = not old.imu.t_s < imu.silent_s <= blow.t_s

@@ -34,8 +34,10 @@ _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 @dataclass(frozen=True)
 class MountSample:
-    """Positions of vehicle and target at `t_s`, as world x + iy in m. `lean_m`: from
-    the vehicle to where its upward axis meets the target's plane."""
+    """Positions of vehicle and target at `t_s`, as world x + iy in m.
+
+    `lean_m`: from the vehicle to where its upward axis meets the target's plane.
+    """
 
     t_s: float
     vehicle_m: complex

@@ -183,8 +183,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class EnergyState:
-    """The battery as fitted so far. Shares are of the full charge, loads of full thrust.
-    `fit_sums`, of least squares: sag^2, sag * hunger, hunger^2, and the two right sides."""
+    """The battery as fitted so far.
+
+    Shares are of the full charge, loads of full thrust. `fit_sums`, of least squares: sag^2, sag *
+    hunger, hunger^2, and the two right sides.
+    """
 
     ground_v: float | None = None  # at rest; from the first reading where that was under load
     used_share: float = 0.0  # by the count of the thrust, for a battery as assumed

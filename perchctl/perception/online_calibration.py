@@ -205,8 +205,10 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """The sums with one more frame, given by its `consistency_rows`. After a gap, or a jump,
-    the level starts anew; what was learned of delay and turn is kept."""
+    """The sums with one more frame, given by its `consistency_rows`.
+
+    After a gap, or a jump, the level starts anew; what was learned of delay and turn is kept.
+    """
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
     gap_s = t_s - old.t_s

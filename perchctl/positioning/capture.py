@@ -39,7 +39,9 @@ _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
 @dataclass(frozen=True)
 class CaptureSetup:
     """The child process's connection: the library's name of the system, and options for it.
-    `skip_empty`: drop frames without a body, which the library returns without any arrival."""
+
+    `skip_empty`: drop frames without a body, which the library returns without any arrival.
+    """
 
     kind: str
     options: dict[str, str] = field(default_factory=dict)

@@ -118,8 +118,11 @@ class SendingRate:
 
 
 class PositionFeed:
-    """Hands on the positions of a capture. `poll_and_send` is called every `PERIOD_S`: by a
-    thread from `start` until `close`, or in lockstep; `status` from any thread."""
+    """Hands on the positions of a capture.
+
+    `poll_and_send` is called every `PERIOD_S`: by a thread from `start` until `close`, or in
+    lockstep; `status` from any thread.
+    """
 
     PERIOD_S = 0.01
 
@@ -179,8 +182,10 @@ class PositionFeed:
         self._stopped = True
 
     def poll_and_send(self, now_s: float) -> None:
-        """Poll the source, and send its position if it is plausible and due. Raises nothing: after
-        a failure the age in `status` grows, with the cause."""
+        """Poll the source, and send its position if it is plausible and due.
+
+        Raises nothing: after a failure the age in `status` grows, with the cause.
+        """
         try:
             problem = STOPPED if self._stopped else self._one(now_s)
         except Exception as error:  # of a source or a link: the flight is ended by the age

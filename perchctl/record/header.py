@@ -98,8 +98,10 @@ _SIDES = (2, 3, 4, 6, 8, 12)
 
 @cache
 def arithmetic_fingerprint() -> str:
-    """Return eight hexadecimal digits for the processor's arithmetic. If they and the libraries
-    are the same, single-threaded results are bit-identical."""
+    """Return eight hexadecimal digits for the processor's arithmetic.
+
+    If they and the libraries are the same, single-threaded results are bit-identical.
+    """
     bits = zlib.crc32(repr((_kernels(), cv2.getCPUFeaturesLine())).encode())
     for part in (_libm_probe(), *_numpy_probes(), *_opencv_probes()):
         bits = zlib.crc32(np.ascontiguousarray(part).tobytes(), bits)

@@ -45,8 +45,9 @@ Truth = tuple[tuple[float, float, float], float]
 
 
 class LogWatcher:
-    """Writes the log of one flight, and its recording if wanted. Only opening it raises; later
-    failures are in `problem`, those of the recording in `remarks`.
+    """Writes the log of one flight, and its recording if wanted.
+
+    Only opening it raises; later failures are in `problem`, those of the recording in `remarks`.
 
     Attributes:
         path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.

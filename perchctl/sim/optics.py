@@ -30,8 +30,9 @@ LEAST_RISE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class RayGrid:
-    """Undistorted rays (x, y, 1) at nodes `stride` px apart. With a stride above 1 px, a margin
-    of one node surrounds the picture.
+    """Undistorted rays (x, y, 1) at nodes `stride` px apart.
+
+    With a stride above 1 px, a margin of one node surrounds the picture.
 
     Node (j, i) then sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
     cv2.resize by `stride` puts its sample centres.

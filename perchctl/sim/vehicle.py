@@ -21,8 +21,10 @@ _PAST = 128  # control periods: longer than any exposure with its read-out
 
 
 class SimulatedVehicle:
-    """One simulated Crazyflie. Without a camera model it has no camera, without capture settings no
-    motion capture."""
+    """One simulated Crazyflie.
+
+    Without a camera model it has no camera, without capture settings no motion capture.
+    """
 
     def __init__(
         self,

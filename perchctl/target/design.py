@@ -29,8 +29,10 @@ from perchctl.vision import MARKERS, CameraModel
 
 @dataclass(frozen=True)
 class TargetDesign:
-    """The ranges in which a camera detects a target, for a profile. Ranges are from the camera's
-    centre to a target on its axis, facing it, m; None where the marker is never detected.
+    """The ranges in which a camera detects a target, for a profile.
+
+    Ranges are from the camera's centre to a target on its axis, facing it, m; None where the marker
+    is never detected.
 
     Attributes:
         blur_px: sigma of the picture's blur.

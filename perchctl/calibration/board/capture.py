@@ -170,8 +170,10 @@ class GuidedCapture:
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 
     def update(self, view_or_reason: BoardView | str) -> bool:
-        """Process the next picture: its view of the board, or why it has none. Return True if the
-        view was taken, as it is new, sharp and still."""
+        """Process the next picture: its view of the board, or why it has none.
+
+        Return True if the view was taken, as it is new, sharp and still.
+        """
         before, seen = self._last, view_or_reason
         self._last = seen if isinstance(seen, BoardView) else None
         if isinstance(seen, str):

@@ -379,8 +379,11 @@ def weight_residuals(
     prior: Array,
     delay_jacobian: Array | None = None,
 ) -> PoseResiduals:
-    """Weight the residuals of poses by their covariances (n, 3, 3), times an estimated factor. With
-    `delay_jacobian` (n, 3), misfit per second of delay, timestamp jitter is estimated and added."""
+    """Weight the residuals of poses by their covariances (n, 3, 3), times an estimated factor.
+
+    With `delay_jacobian` (n, 3), misfit per second of delay, timestamp jitter is estimated and
+    added.
+    """
     best_cost, best, late = np.inf, cov, delay_jacobian
     for jitter_s in (0.0,) if late is None else _JITTERS_S:
         spread = cov

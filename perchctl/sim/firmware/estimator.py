@@ -86,8 +86,10 @@ class Estimator:
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """The variance of a state, in the order of `Covariance`. With a deck all states have
-        the same variance, which falls after a reset."""
+        """The variance of a state, in the order of `Covariance`.
+
+        With a deck all states have the same variance, which falls after a reset.
+        """
         if self.outside is not None:
             return float(self.outside.covariance[state, state])
         age_s = t_s - self._reset_s

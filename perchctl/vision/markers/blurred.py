@@ -203,8 +203,11 @@ def align_marker(
 
 
 def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
-    """True if the picture looks like the drawing. Without the marker the pattern's
-    correlation stays below 0.72 at the right strength; with the marker it is above 0.95."""
+    """True if the picture looks like the drawing.
+
+    Without the marker the pattern's correlation stays below 0.72 at the right strength; with the
+    marker it is above 0.95.
+    """
     return (
         found.pattern > _MIN_PATTERN
         and found.likeness > _MIN_LIKENESS

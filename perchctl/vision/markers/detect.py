@@ -175,8 +175,11 @@ def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array
 
 
 def _refined(picture: Picture, found: FoundMarkers) -> _Found:
-    """What the search found with better corners. Those without four lines for sides are
-    measured by what of these is seen: a search takes the picture's edge for a side."""
+    """What the search found with better corners.
+
+    Those without four lines for sides are measured by what of these is seen: a search takes the
+    picture's edge for a side.
+    """
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(picture, raw) if setup.fits_lines else {}
@@ -367,8 +370,10 @@ def add_partly_visible(
     seen: _Found,
     shift: EdgeShift | None = None,
 ) -> _Found:
-    """The `seen` markers of `follow_markers` plus those fitted to their visible part. If
-    the small marker was seen, the large one is expected around it."""
+    """The `seen` markers of `follow_markers` plus those fitted to their visible part.
+
+    If the small marker was seen, the large one is expected around it.
+    """
     places, seen = dict(expected), dict(seen)
     if "small" in seen and "large" not in seen:
         places["large"] = picture.other_corners(seen["small"].corners_px, "large")

@@ -112,8 +112,10 @@ def align_drawing(
     camera: CameraModel,
     blur_px: float = 1.0,
 ) -> Alignment | None:
-    """Fit the drawing to the picture, starting at `start_px` (4, 2) and `blur_px`. None if
-    the marker leaves the picture, looks different, or the fit diverges."""
+    """Fit the drawing to the picture, starting at `start_px` (4, 2) and `blur_px`.
+
+    None if the marker leaves the picture, looks different, or the fit diverges.
+    """
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all():
         return None

@@ -193,8 +193,10 @@ def choose_markers(
 def _nearest_first(
     candidates: Mapping[MarkerName, list[Array]], own: OwnOffset
 ) -> Mapping[MarkerName, list[Array]]:
-    """The candidates that are least far aside first, without those that are too far. A lone
-    one is left to the pipeline, which says why it is not taken."""
+    """The candidates that are least far aside first, without those that are too far.
+
+    A lone one is left to the pipeline, which says why it is not taken.
+    """
     if sum(map(len, candidates.values())) < 2:
         return candidates
     kept: dict[MarkerName, list[Array]] = {}
