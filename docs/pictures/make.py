@@ -303,7 +303,7 @@ def sheet_drawing(flown: Flight, file: Path) -> None:
         z = -flown.profile.vehicle.gear_body_m[2]
         ax.add_patch(Rectangle((x, z + up - 0.022), width, height, color=colour))
     _label(ax, "ceiling or shelf", (-0.14, 0.05), (-0.165, 0.058))
-    _label(ax, "spacers, two or more", (0.083, 0.024), (0.1, 0.03))
+    _label(ax, "spacers, three or more", (0.083, 0.024), (0.1, 0.03))
     _label(ax, "stiff board, flat", (-0.09, 0.004), (-0.168, 0.016))
     _label(ax, "magnet, 50 mm, glued on the back", (0.02, 0.008), (-0.058, 0.03))
     _label(ax, "printed side, faces down", (0.06, 0.0), (0.07, -0.02))

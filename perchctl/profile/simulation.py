@@ -60,7 +60,7 @@ class SimulationConfig(Section):
     )
     mount_error_deg: float = key(1.0, "largest rotation error of the profile's mount", ge=0, le=20)
     mount_error_m: float = key(
-        0.001, "largest position error of the profile's mount", ge=0, le=0.05
+        0.001, "farthest that the true mount lies from the profile's", ge=0, le=0.05
     )
     estimate_noise_m: ClassVar[float] = 0.002
     """Noise of the state estimate."""

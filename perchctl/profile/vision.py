@@ -132,7 +132,7 @@ class CameraConfig(Section):
 
     format: str | None = key(
         None,
-        "requested from `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
+        "pixel format asked of `camera:` sources, such as `MJPG`; none: the driver's",
         pattern="^[A-Z0-9]{3,4}$",
     )
     rate_hz: float | None = key(
