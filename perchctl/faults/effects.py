@@ -88,8 +88,8 @@ def external_positions(
 
 
 def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:
-    """Stop the absolute positions of the vehicle's deck, which until then corrected an
-    accelerometer that reads `acc_z_mps2` too much along z, because the motors shake it."""
+    """Stop the deck's absolute positions for `for_s`. They corrected the accelerometer, which the
+    motors' shaking makes read `acc_z_mps2` too much along z in the whole flight."""
     rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
 

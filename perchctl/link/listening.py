@@ -46,7 +46,7 @@ class ReadOnlyLink(CflibLink):
     end: the vehicle may fly for another program."""
 
     def close(self) -> None:
-        """Leave at once and without cflib's farewell."""
+        """Close at once, without the setpoint that cflib sends as it closes."""
         self._leave(farewell=False)
 
     def _may_say_farewell(self) -> bool:

@@ -36,12 +36,11 @@ class Neighbour:
 class Scenario:
     """Everything that differs between two simulated flights; SI, world frame.
 
-    World origin: the floor under the place where the vehicle starts; its state
-    estimate starts there with heading zero *in the estimate's frame*, so
-    `start_yaw_rad` turns the target instead: target_* are given in that frame.
+    The world's origin is the floor under the vehicle's start, its x axis the vehicle's heading
+    there.
 
-    A field named as a key of `perchctl.profile.SimulationConfig` has the key's meaning, with one
-    number of its range.
+    A field named as a key of `perchctl.profile.SimulationConfig` is the value drawn from the key's
+    range.
 
     Attributes:
         target_xy_m, target_yaw_rad: centre and heading of the target.
