@@ -109,7 +109,7 @@ class FlightAnalysis:
     # --- holds and notes
 
     @cached_property
-    def holds(self) -> tuple[Hold, ...]:
+    def position_holds(self) -> tuple[Hold, ...]:
         """Stretches of turns held in one phase for one reason: the last turn's, as the numbers in a
         reason may change."""
         found: list[Hold] = []

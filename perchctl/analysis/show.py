@@ -33,7 +33,7 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
         "log_problem": end.log_problem,
         **asdict(flight.measures),
         "phases": [_times(stay) for stay in log.phases],
-        "holds": [_times(hold) for hold in flight.holds],
+        "holds": [_times(hold) for hold in flight.position_holds],
         "sent": [_times(go) for go in flight.takeovers],
         "notes": [{"t_s": round(t_s, 6), "note": note} for t_s, note in flight.notes],
     }
@@ -51,7 +51,7 @@ def show_text(flight: FlightAnalysis) -> str:
     phases = flight.log.phases
     for head, rows in (
         ("phase     why", [(stay, stay.phase, _why(stay)) for stay in phases]),
-        ("held in   because", [(hold, hold.phase, hold.reason) for hold in flight.holds]),
+        ("held in   because", [(hold, hold.phase, hold.reason) for hold in flight.position_holds]),
         ("sent by   in the loop's place", [(go, go.by, go.text) for go in flight.takeovers]),
     ):
         if rows:

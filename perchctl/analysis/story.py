@@ -102,7 +102,7 @@ def _loss(loss: TargetLoss) -> Sentence:
 
 
 def _holds(flight: FlightAnalysis) -> Iterator[Sentence]:
-    for hold in flight.holds:
+    for hold in flight.position_holds:
         if hold.duration_s >= HELD_LEAST_S:
             text = f"Held in place for {hold.duration_s:.1f} s: {hold.reason}"
             yield Sentence(hold.start_s, text, "warn")

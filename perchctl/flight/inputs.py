@@ -341,7 +341,7 @@ class TurnReporter:
         """Note that the planner has decided: a later failure is not the planner's."""
         self._open = obs, (state, command, feed)
 
-    def report_redone_turn(
+    def report_discarded_turn(
         self, inputs: FlightInputs, obs: Observation, state: PlannerState, command: Command
     ) -> None:
         """Report a turn whose command is not sent, since the next turn decides again."""

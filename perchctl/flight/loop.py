@@ -197,7 +197,7 @@ def _mission(
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
-            turns.report_redone_turn(inputs, obs, new, command)
+            turns.report_discarded_turn(inputs, obs, new, command)
             continue
         state, redone = new, False
         if not isinstance(command, Idle):

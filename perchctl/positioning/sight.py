@@ -95,8 +95,8 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, attitude: Attitude) -> TargetEstimate:
-        """`seen` with the target where the feed knows it to be, in the state estimate's world as the
-        vehicle with this `attitude` has it; unchanged until the feed knows the place."""
+        """`seen` with the target where the feed knows it to be, in the state estimate's world as
+        the vehicle with this `attitude` has it; unchanged until the feed knows the place."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m

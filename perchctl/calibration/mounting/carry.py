@@ -113,7 +113,7 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
         scale = scale + step[SCALE]
         latency_s = float(np.clip(latency_s + step[LATENCY], -0.5, 1.5))
         walk = walk + step[KNOTS:].reshape(-1, 3)
-    cov = rows.covariance()
+    cov = rows.parameter_covariance()
     _check(rows, latency_s, cov)
     return RotationSolution(
         R_body_cam, cov[TURN, TURN], latency_s, math.sqrt(cov[LATENCY, LATENCY])
@@ -363,7 +363,7 @@ class PoseResiduals:
             self, misfit=misfit, robust_weights=_weights(_distance2(misfit, self.inverse_cov))
         )
 
-    def covariance(self) -> Array:
+    def parameter_covariance(self) -> Array:
         """The parameters' covariance (p, p), by a block jackknife, as errors of consecutive
         pictures may correlate."""
         blocks = [

@@ -70,7 +70,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
         found = found + rows.step()
         cov = _misfit_covariance(poses, found[3:])
     tip_m = found[:3]
-    cov_m2 = rows.covariance()[:3, :3]
+    cov_m2 = rows.parameter_covariance()[:3, :3]
     _check_slip(poses, rows)
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
     if rows.rejected_share > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
