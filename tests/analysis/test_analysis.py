@@ -54,7 +54,7 @@ def test_a_hold_whose_numbers_grow_is_one() -> None:
         (0.7, "ASCEND", None),
     ]
     log = log_of([{"t_s": t_s, "phase": phase, "hold": hold} for t_s, phase, hold in holds])
-    found = [(h.start_s, h.end_s, h.phase, h.reason) for h in FlightAnalysis(log).holds]
+    found = [(h.start_s, h.end_s, h.phase, h.reason) for h in FlightAnalysis(log).position_holds]
     assert found == [
         (0.1, 0.3, "ALIGN", "no picture for 0.6 s"),
         (0.3, 0.4, "ALIGN", "telemetry is old"),
