@@ -294,6 +294,8 @@ def draw_sheet_over(below: Picture, view: SheetView, maps: Array, rays: RayGrid)
     """Draw the sheet over `below`; `maps` (n, 3, 3): rays to plane at moments of the exposure."""
     texels = [trace_rays(rays, view.to_texels @ each)[0] for each in maps]
     seen = mean_picture([sample_texture(view.texture.value, each) for each in texels])
+    if view.covers_all:
+        return seen
     alpha = mean_picture([sample_texture(view.texture.alpha, each) for each in texels])
     rest: Any = cv2.multiply(below, ~alpha, scale=1.0 / 255.0)
     return np.asarray(cv2.add(rest, seen), np.uint8)
@@ -301,6 +303,8 @@ def draw_sheet_over(below: Picture, view: SheetView, maps: Array, rays: RayGrid)
 
 def mean_picture(pictures: Sequence[Picture]) -> Picture:
     """The mean of the pictures, rounded once."""
+    if len(pictures) == 1:
+        return pictures[0]
     total: Any = pictures[0].astype(np.uint16)
     for picture in pictures[1:]:
         total = cv2.add(total, picture, dtype=cv2.CV_16U)

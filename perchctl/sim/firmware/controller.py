@@ -100,14 +100,15 @@ class Pid:
         error, change = desired - measured, measured - self._measured
         if is_angle:
             error, change = wrap_deg(error), wrap_deg(change)
-        bound = self._i_limit
-        integral = max(-bound, min(bound, self._integral + error * self._period))
+        integral = self._integral + error * self._period
+        if abs(integral) > self._i_limit:
+            integral = math.copysign(self._i_limit, integral)
         self._integral = integral
         self._measured = measured
         output = self._kp * error + self._ki * integral
         if self._kd != 0.0:
             output -= self._kd * change / self._period
-        return max(-self._limit, min(self._limit, output))
+        return output if abs(output) <= self._limit else math.copysign(self._limit, output)
 
 
 def wrap_deg(angle: float) -> float:
