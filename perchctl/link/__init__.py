@@ -1,4 +1,4 @@
-"""The link to a vehicle, by cflib or in lockstep."""
+"""The link to a vehicle: by cflib, or to the simulated one in lockstep."""
 
 import lazy_loader
 

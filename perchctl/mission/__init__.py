@@ -1,4 +1,4 @@
-"""The mission as a pure function of state and observation: seven phases, the way down, no clock."""
+"""The mission's seven phases and its descent, a pure function of state and observation."""
 
 import lazy_loader
 

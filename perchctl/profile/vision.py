@@ -199,7 +199,7 @@ class TargetConfig(Section):
     )
     curl_per_m: float = key(
         0.03,
-        "at r from its centre, the sheet may leave its plane by this times r^2",
+        "greatest distance of the sheet from its plane, over r^2 from its centre",
         ge=0,
         le=10,
     )
