@@ -35,7 +35,7 @@ _READ_BYTES = 4096
 
 
 def file_kind(path: Path) -> str:
-    """What a file seems to be, as in ``a picture``; ``another kind of file`` if unknown.
+    """Return what a file seems to be, as in ``a picture``; ``another kind of file`` if unknown.
 
     For messages about a file of the wrong kind; never raises.
     """

@@ -55,7 +55,7 @@ class WorkerRequirements:
 
 
 def flight_environment(profiles: Sequence[Profile], threads: int) -> dict[str, str]:
-    """What a flight's result depends on, by name: versions of perchctl and its libraries,
+    """Return what a flight's result depends on, by name: versions of perchctl and its libraries,
     hashes of the `profiles`, and the number of `threads`."""
     return {
         "perchctl": f"{perchctl.__version__} ({source_sha256()[:8]})",

@@ -336,7 +336,7 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
 
 
 def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | None:
-    """What is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
+    """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
     if off_deg > UPRIGHT_DEG:

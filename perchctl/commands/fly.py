@@ -158,19 +158,18 @@ def resolve_options(
 def with_positioning(profile: Profile, method: str | None) -> Profile:
     """Return the profile with the `--positioning` method; unchanged for None. Errors:
     InvalidValue."""
-    by = method
-    if by is None:
+    if method is None:
         return profile
-    if by not in POSITIONINGS:
+    if method not in POSITIONINGS:
         raise InvalidValue(
-            f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
+            f"--positioning {method!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
         )
     own = profile.positioning
-    if by == own.by:
+    if method == own.by:
         return profile
     # Keys of the kind that is left would puzzle; but beside a deck a profile may name a capture.
-    kept = own.model_dump() if (own.by, by) == ("deck", "mocap") else {"decks": own.decks}
-    config = PositioningConfig.model_validate({**kept, "by": by})
+    kept = own.model_dump() if (own.by, method) == ("deck", "mocap") else {"decks": own.decks}
+    config = PositioningConfig.model_validate({**kept, "by": method})
     return profile.model_copy(update={"positioning": config})
 
 

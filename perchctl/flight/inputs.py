@@ -204,7 +204,7 @@ class FlightInputs:
         return target
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
-        """Why this frame is no measurement: of another size, frozen, no picture at all, or
+        """Return why this frame is no measurement: of another size, frozen, no picture at all, or
         too old."""
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):

@@ -170,7 +170,7 @@ class ProbeLink(ReadOnlyLink):
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
     def lost(self) -> str | None:
-        """Why the link is lost; None while it works."""
+        """Return why the link is lost; None while it works."""
         return "it was closed" if self.connection is None else self.connection.lost
 
     def round_trips_s(self, duration_s: float) -> list[float]:

@@ -143,7 +143,7 @@ def _towards(value: float, goal: float, part: float) -> float:
 
 
 def battery_outlook(c: Context) -> BatteryOutlook:
-    """How long the battery still lasts, and for how many attempts. An unknown charge counts
+    """Return how long the battery still lasts, and for how many attempts. An unknown charge counts
     for at most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.state.energy
     used_mah = energy.used_share * c.profile.vehicle.battery_mah

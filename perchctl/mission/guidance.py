@@ -269,7 +269,7 @@ def stop_motors(c: Context) -> Action:
 
 
 def catch_goal_above_m(hover_thrust: float, thrust: float) -> float:
-    """How far above the vehicle the setpoint must be to stop its fall, by its present `thrust`."""
+    """Return how far above a falling vehicle its setpoint must be, by its present `thrust`."""
     turning = thrust > 0.5 * hover_thrust
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
 

@@ -294,7 +294,7 @@ def _struck(
 def _misled(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """How far corrections have turned roll and pitch, and the own rates."""
+    """Return how far corrections have turned roll and pitch, and the own rates."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S

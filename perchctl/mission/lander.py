@@ -210,8 +210,8 @@ def is_motor_borne(c: Context) -> bool:
 
 
 def find_rest_state(c: Context) -> RestState:
-    """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
-    above, or by the falls measured since the vehicle came into the magnet's reach."""
+    """Return where the vehicle is, once its motors are off: by a position, by the picture of a
+    target far above, or by the falls measured since the vehicle came into the magnet's reach."""
     tel, state = c.telemetry, c.state
     if _is_held_elsewhere(c):
         return RestState.HELD
@@ -240,8 +240,8 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 
 def _by_fall(c: Context, since_s: float | None) -> RestState:
-    """Where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the falls
-    since, and the silences that could hide one."""
+    """Return where a vehicle is that came within the magnet's reach at `since_s`, if ever: by the
+    falls since, and the silences that could hide one."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
     unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight ends the doubt

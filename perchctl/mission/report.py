@@ -144,8 +144,8 @@ class FlightReport:
 
 
 def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
-    """Where the vehicle is, in words without a full stop, with its touchdown if that was hard; None
-    until its motors have been seen off for `off_s`."""
+    """Return where the vehicle is, in words without a full stop, with its touchdown if that was
+    hard; None until its motors have been seen off for `off_s`."""
     c = Context(state, obs, profile)
     if c.held_s(Condition.DOWN) < off_s:
         return None

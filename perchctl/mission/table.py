@@ -294,7 +294,7 @@ def rests_as(state: RestState) -> Predicate:
 
 
 def hold_reason(c: Context) -> str:
-    """Why the vehicle must stay where it is in this tick, or the empty string."""
+    """Return why the vehicle must stay where it is in this tick, or the empty string."""
     phase = c.state.phase
     if phase in IN_THE_OPEN and c.position_is_stale:
         return position_loss_text(c)

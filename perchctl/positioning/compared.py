@@ -42,7 +42,7 @@ class CaptureComparison(BaseModel):
     found: str = ""
 
     def objection_and_advice(self, now: datetime) -> tuple[str, str] | None:
-        """Why no flight may rely on this comparison, and what to do; None if it passed, at
+        """Return why no flight may rely on this comparison, and what to do; None if it passed, at
         most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
             return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"

@@ -113,7 +113,7 @@ class SendingRate:
         return now_s - self._times_s[-1] if self._times_s else math.inf
 
     def sent_hz(self, now_s: float) -> float:
-        """How many positions were sent in the last second."""
+        """Return how many positions were sent in the last second."""
         return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
 
 

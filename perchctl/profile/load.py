@@ -146,7 +146,7 @@ def find_mask(name: str) -> Path:
 
 
 def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where the vehicle covers a picture of that width and height: booleans (height, width),
+    """Return where the vehicle covers a picture of that width and height: booleans (height, width),
     true where the file is white. Errors: NotFound, InvalidValue."""
     path = find_mask(name)
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -182,7 +182,7 @@ def _choices() -> str:
 
 
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
-    """What the file at `path` holds itself, on top of what it extends."""
+    """Return what the file at `path` holds itself, on top of what it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _without_constants(own, path)

@@ -34,7 +34,7 @@ def aruco_dictionary(name: str) -> Any:
 
 
 def dictionary_size(name: str) -> int:
-    """How many ids the dictionary holds (0 .. count - 1)."""
+    """Return how many ids the dictionary holds (0 .. count - 1)."""
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 

@@ -160,7 +160,7 @@ class Renderer:
         return picture
 
     def _exposed(self, shot: Exposure, defocus_px: float | None) -> Picture:
-        """What falls onto the sensor in one shot, before noise."""
+        """Return what falls onto the sensor in one shot, before noise."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.row_poses]
         motion_px = self._paths_px(rows[len(rows) // 2])
         length_px = longest_path_px(motion_px)
@@ -365,7 +365,7 @@ def longest_path_px(motion_px: Array) -> float:
 
 
 def blur_sample_count(length_px: float) -> int:
-    """How many poses the blur of a path of that length needs; 1 for a sharp frame."""
+    """Return how many poses the blur of a path of that length needs; 1 for a sharp frame."""
     if length_px < SHARP_MOTION_PX:
         return 1
     return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)

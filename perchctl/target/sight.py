@@ -124,8 +124,8 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
 def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
-    """How far off the axis of a camera, `height_m` below, a marker of `side_m` is wholly in the
-    picture in any rotation; None if not even on the axis, or if the camera does not look up."""
+    """Return how far off the axis of a camera, `height_m` below, a marker of `side_m` is wholly in
+    the picture in any rotation; None if not even on the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -177,7 +177,7 @@ def view_from(
     camera: CameraModel,
     mount: Mounting,
 ) -> TargetView:
-    """How a level vehicle sees a level target; positions (3,) in one world, z up."""
+    """Return how a level vehicle sees a level target; positions (3,) in one world, z up."""
     T = mount.T_body_cam
     field = FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]

@@ -145,7 +145,7 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
 
 
 def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
-    """What a second adds to the rates of yaw, x, y and z, (4, 4)."""
+    """Return what a second adds to the rates of yaw, x, y and z, (4, 4)."""
     if noise.turn_radps2 == 0.0:
         return noise.rate_variance
     turned2 = noise.turn_radps2**2 * _PUSH_S

@@ -318,7 +318,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
 
 
 def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
-    """What each kind of curl does to the whitened errors."""
+    """Return what each kind of curl does to the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.curl_lift_m

@@ -96,7 +96,7 @@ def _vector(pose: MarkerPose | None) -> Array | None:
 
 
 def position_fault(readings: list[MarkerReading]) -> str | None:
-    """Why a position must be taken again, in one sentence; None if the position is good."""
+    """Return why a position must be taken again, in one sentence; None if the position is good."""
     count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames came"

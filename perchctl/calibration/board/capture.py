@@ -76,7 +76,7 @@ _TILT_GAIN = 2.0
 
 
 def view_signature(view: BoardView, board: Board) -> Array:
-    """How a view shows the board, (5,): the corners' centre x, y and the board's size,
+    """Return how a view shows the board, (5,): the corners' centre x, y and the board's size,
     relative to the picture, and the tilts: how much farther away the right side is than the left,
     and the lower side than the upper."""
     w, h = view.size_px
@@ -220,8 +220,8 @@ def _moved_px(before: BoardView, now: BoardView) -> float:
 
 
 def next_advice(signatures: Sequence[Array]) -> str:
-    """How to move or tilt the board next, in directions of the picture: towards what the view
-    `signatures` cover least."""
+    """Return how to move or tilt the board next, in directions of the picture: towards what the
+    view `signatures` cover least."""
     done = covered_shares(signatures)
     least = min(AXES, key=lambda axis: done[axis])
     if done[least] >= 1.0:

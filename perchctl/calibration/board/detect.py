@@ -133,7 +133,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
 
 
 def _without_board(image: Grey) -> str:
-    """Why a picture shows no board: the target is the other print that lies about."""
+    """Return why a picture shows no board: the target is the other print that lies about."""
     marker = TargetConfig().large
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(marker.dictionary))
     _, ids, _ = detector.detectMarkers(image)

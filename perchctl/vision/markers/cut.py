@@ -572,7 +572,7 @@ def _in_view(
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """How far along its normal each place's edge is (n,) px, if it is."""
+    """Return how far along its normal each place's edge is (n,) px, if it is."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample_profiles(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)

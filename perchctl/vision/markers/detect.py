@@ -133,7 +133,7 @@ def detect_markers(
 
 
 def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
-    """How to search this frame. After a loss the ways take turns."""
+    """Return how to search this frame. After a loss the ways take turns."""
     if empty_frames is None:
         return "all"
     if not fits_lines or (expected and empty_frames % 2):
@@ -150,7 +150,7 @@ def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
 def _followed(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
 ) -> tuple[_Found, FoundMarkers]:
-    """What is where both are expected, or nearby: where no side was met, a near target has
+    """Return what is where both are expected, or nearby: where no side was met, a near target has
     most often moved on further than a side is looked for."""
     seen = follow_markers(picture, expected, shift)
     if not seen:
@@ -175,7 +175,7 @@ def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array
 
 
 def _refined(picture: Picture, found: FoundMarkers) -> _Found:
-    """What the search found with better corners.
+    """Return what the search found with better corners.
 
     Those without four lines for sides are measured by what of these is seen: a search takes the
     picture's edge for a side.

@@ -243,7 +243,7 @@ def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
 
 
 def _intersect(lines: Array) -> Array:
-    """Where side i - 1 of each marker meets side i: (m, 4, 2)."""
+    """Return where side i - 1 of each marker meets side i: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -269,7 +269,7 @@ def _measured_shift(
     residual_px: Array,
     corners: Array,
 ) -> EdgeShift | None:
-    """How far white has grown over black, by the width of a border, of which `corners` (m,
+    """Return how far white has grown over black, by the width of a border, of which `corners` (m,
     4, 2) are the outer edge's; None where no inner edge was sampled.
 
     Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
@@ -312,7 +312,7 @@ def _measured_shift(
 
 
 def _bow_px(markers: Sides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
-    """How far the ends of the widest marker's sides lie further out than their middles, as
+    """Return how far the ends of the widest marker's sides lie further out than their middles, as
     far as noise does not explain it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]

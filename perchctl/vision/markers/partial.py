@@ -236,14 +236,14 @@ def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array
 
 
 def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.bool_]:
-    """Which points (n, 2) are in the picture, or no farther outside."""
+    """Return which points (n, 2) are in the picture, or no farther outside."""
     h, w = shape[:2]
     inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
     return np.asarray(inside.all(axis=1))
 
 
 def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
-    """Which cells (cells,) show half of their spots (n,) or more."""
+    """Return which cells (cells,) show half of their spots (n,) or more."""
     known: NDArray[np.bool_] = (
         np.bincount(pattern.spot_cells, weights=seen) >= 0.5 * pattern.spots_per_cell
     )
@@ -366,7 +366,7 @@ def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> 
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Which profiles (rows, n) go from black to white, and how white the paper is."""
+    """Return which profiles (rows, n) go from black to white, and how white the paper is."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

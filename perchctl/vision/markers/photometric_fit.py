@@ -257,7 +257,7 @@ def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[f
 
 
 def _repeated(error: Array) -> float:
-    """How many neighbouring nodes measure the same."""
+    """Return how many neighbouring nodes measure the same."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
     for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
