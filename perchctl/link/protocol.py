@@ -29,7 +29,7 @@ out."""
 class Link(Protocol):
     """A vehicle: simulated in lockstep, or behind cflib.
 
-    All methods are called from the flight loop's thread. Errors are
+    All methods but `send_external` are called from the flight loop's thread. Errors are
     `perchctl.errors.ConnectionFailed`, `NotFound` or `TimedOut`.
     """
 
@@ -47,7 +47,7 @@ class Link(Protocol):
 
     def send_external(self, place: ExternalPosition) -> bool:
         """Hand an external position to the vehicle, at once or not at all: never queued, raises
-        nothing. Returns True if it went out. Called from a thread of its own."""
+        nothing. Returns True if it went out. Called from the thread of the position feed."""
 
     def problem(self, now_s: float) -> str | None:
         """Return None while the link works, otherwise one sentence with the cause."""

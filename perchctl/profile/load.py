@@ -1,6 +1,6 @@
 """From a profile's name or path to a checked, frozen `Profile`.
 
-`load_profile(name_or_path)` reads the file, follows `extends`, and checks the whole.
+`load_profile(name)` reads the file, follows `extends`, and checks the whole.
 Every fault is one `InvalidValue` sentence of the form ``file: key: what is wrong``.
 """
 
