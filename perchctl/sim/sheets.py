@@ -210,7 +210,6 @@ class PlacedSheet:
         clear = np.maximum(np.abs(at - inside).max(axis=-1), texture.uniform_texels[v, u])
         value, alpha = texture.value[v, u], texture.alpha[v, u]
         is_uniform = clear > reach_m[rows, cols] * scale + _LOOK_UP_TEXELS
-        is_uniform &= (alpha == 0) | (alpha == 255)
         covers_all = bool((off_m + reach_m < half_m - 2.0 / scale).all())
         return SheetView(texture, (rows, cols), to_texels, covers_all, is_uniform, value, alpha)
 
