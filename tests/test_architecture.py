@@ -82,7 +82,7 @@ MOST_NAMES = {
     "commands": 2,
     "display": 6,
     "faults": 6,
-    "flight": 15,
+    "flight": 16,
     "link": 11,
     "record": 12,
     "mission": 26,

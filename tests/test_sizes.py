@@ -25,7 +25,7 @@ MOST_LINES = {
     "commands": 3780,
     "display": 730,
     "faults": 2660,
-    "flight": 2130,
+    "flight": 2220,
     "link": 2200,
     "record": 2160,
     "mission": 4230,

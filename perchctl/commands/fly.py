@@ -29,7 +29,7 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.interrupt import ignore_signals, interruptible, operator_signals
+from perchctl.commands.interrupt import ignore_signals, interruptible
 from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
 from perchctl.commands.profile import front_left_edges
 from perchctl.display import (
@@ -53,6 +53,7 @@ from perchctl.flight import (
     OperatorSwitch,
     check_options,
     fly_session,
+    operator_signals,
 )
 from perchctl.mission import FlightReport, Outcome, Phase, Watcher
 from perchctl.profile import (

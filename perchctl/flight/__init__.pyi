@@ -8,6 +8,7 @@ from .lockstep import lockstep_source as lockstep_source
 from .loop import FlightParts as FlightParts
 from .loop import fly as fly
 from .operator import OperatorSwitch as OperatorSwitch
+from .operator import operator_signals as operator_signals
 from .preflight import view_problem as view_problem
 from .session import FlyOptions as FlyOptions
 from .session import check_options as check_options

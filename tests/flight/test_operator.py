@@ -114,7 +114,7 @@ def test_before_the_flight_a_signal_leaves() -> None:
 
 HANGING = """
 import hashlib, sys, time
-from perchctl.commands.interrupt import operator_signals
+from perchctl.flight import operator_signals
 from perchctl.commands.output import say
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.watchdog import Watchdog
@@ -211,7 +211,7 @@ def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPat
         raise UsageError("not confirmed: nothing was started")
 
     link = SimpleNamespace(connect=noted("connected"), close=noted("closed"))
-    camera = SimpleNamespace(close=noted("camera closed"))
+    camera = SimpleNamespace(close=noted("camera closed"), live=True)
     monkeypatch.setattr(session, "CflibLink", lambda *_, **__: link)
     monkeypatch.setattr(session, "open_camera", lambda *_, **__: camera)
     monkeypatch.setattr(session, "fly", noted("flew"))
