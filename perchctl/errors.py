@@ -118,6 +118,13 @@ class Interrupted(PerchError):
     meaning = "Ctrl-C, landed (in the air) or left (on the ground, at the ceiling)"
 
 
+def require_type(name: str, value: object, *kinds: type) -> None:
+    """Raise InvalidValue, which names the argument, unless the value is of one of these types."""
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        allowed = " or ".join(kind.__name__ for kind in kinds)
+        raise InvalidValue(f"{name} must be {allowed}, found {type(value).__name__}: {value!r:.80}")
+
+
 class Note(UserWarning):
     """One sentence for people; the command line prints each once."""
 

@@ -31,7 +31,7 @@ MOST_LINES = {
     "mission": 4230,
     "perception": 730,
     "positioning": 950,
-    "profile": 1870,
+    "profile": 1905,
     "sim": 4690,
     "target": 1680,
     "vision": 6370,

@@ -165,13 +165,7 @@ def with_positioning(profile: Profile, method: str | None) -> Profile:
         raise InvalidValue(
             f"--positioning {method!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
         )
-    own = profile.positioning
-    if method == own.by:
-        return profile
-    # Keys of the kind that is left would puzzle; but beside a deck a profile may name a capture.
-    kept = own.model_dump() if (own.by, method) == ("deck", "mocap") else {"decks": own.decks}
-    config = PositioningConfig.model_validate({**kept, "by": method})
-    return profile.model_copy(update={"positioning": config})
+    return profile.with_({"positioning.by": method})
 
 
 def ask_before_arming(uri: str) -> None:

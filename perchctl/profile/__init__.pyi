@@ -9,7 +9,6 @@ from .limits import DOUBTFUL as DOUBTFUL
 from .load import find_calibration as find_calibration
 from .load import find_mask as find_mask
 from .load import find_profile as find_profile
-from .load import key_and_reason as key_and_reason
 from .load import load_profile as load_profile
 from .load import read_mask as read_mask
 from .mission import PlannerConfig as PlannerConfig
@@ -17,6 +16,7 @@ from .mission import SafetyConfig as SafetyConfig
 from .positioning import PositioningConfig as PositioningConfig
 from .schema import LinkConfig as LinkConfig
 from .schema import Profile as Profile
+from .schema import key_and_reason as key_and_reason
 from .simulation import SimulationConfig as SimulationConfig
 from .vision import USED_LATENCY_S as USED_LATENCY_S
 from .vision import CameraConfig as CameraConfig

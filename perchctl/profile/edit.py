@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import YAMLError
@@ -22,8 +21,7 @@ from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_writable, file_mode, write_files
 from perchctl.places import data_folder
 from perchctl.plain_yaml import clip_text, parse_yaml
-from perchctl.profile.base import split_constant_keys
-from perchctl.profile.load import check_profile, find_profile, key_and_reason
+from perchctl.profile.load import check_profile, find_profile
 from perchctl.profile.schema import Profile
 
 # --- Keys of a loaded profile ---
@@ -37,21 +35,16 @@ def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--s
         UsageError: a setting is not ``key=value``.
         InvalidValue: the key is unknown, or its value not allowed.
     """
-    values = profile.model_dump(mode="json")
-    pairs = [_parsed(setting, option) for setting in settings]
-    for key, text in pairs:
+    values: dict[str, Any] = {}
+    for key, text in [_parsed(setting, option) for setting in settings]:
         try:
-            _put(values, key, parse_yaml(text))
+            values[key] = parse_yaml(text)
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
-        _, notes, lost = split_constant_keys(values, Profile)
-        if notes or lost:
-            raise InvalidValue(f"{option}: {(notes + lost)[0]}")
-        return Profile.model_validate(values)
-    except ValidationError as error:
-        key, why = key_and_reason(error)
-        raise InvalidValue(f"{option}: {key or 'profile'}: {why}") from None
+        return profile.with_(values)
+    except InvalidValue as error:
+        raise InvalidValue(f"{option}: {error}") from None
 
 
 def _parsed(setting: str, option: str) -> tuple[str, str]:
@@ -70,19 +63,6 @@ def profile_value(profile: Profile, key: str) -> Any:
     for name in key.split("."):
         value = value.get(name) if isinstance(value, dict) else None
     return value
-
-
-def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
-    """Set a key that has to be there; below a mapping that a profile may fill, such as
-    `link.parameters`, any key is. What is unknown there, the schema says."""
-    *sections, key = dotted.split(".")
-    for section in sections:
-        inner = values.get(section)
-        if not isinstance(inner, dict):
-            what = "unknown" if section not in values else "no section"
-            raise ValueError(f"{section} is {what}; allowed here are {', '.join(values)}")
-        values = inner
-    values[key] = value
 
 
 # --- Numbers in a profile's file ---

@@ -6,7 +6,6 @@ Every fault is one `InvalidValue` sentence of the form ``file: key: what is wron
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_texts
+from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_texts, require_type
 from perchctl.files import file_kind
 from perchctl.places import data_file, data_folder, file_names
-from perchctl.plain_yaml import clip_text, parse_yaml
+from perchctl.plain_yaml import parse_yaml
 from perchctl.profile.base import split_constant_keys
-from perchctl.profile.schema import Profile
+from perchctl.profile.schema import Profile, key_and_reason
 from perchctl.profile.vision import MergeConfig, WeightsConfig
 
 _NAMED_FILES = (
@@ -51,15 +50,18 @@ def find_profile(name: str) -> Path:
     return found
 
 
-def load_profile(name: str, *, with_weights: bool = True) -> Profile:
-    """The profile with path or name `name`, its `extends` resolved, checked.
+def load_profile(name: str | Path | Profile, *, with_weights: bool = True) -> Profile:
+    """The profile with path or name `name`, its `extends` resolved, checked; a `Profile` as it is.
 
     `with_weights`: `merge.weights` are read from `merge.weights_file`. Keys that have become
     constants are dropped with a `ProfileNote` as warning.
 
     Errors: NotFound, InvalidValue.
     """
-    path = find_profile(name)
+    if isinstance(name, Profile):
+        return name
+    require_type("profile", name, str, Path, Profile)
+    path = find_profile(str(name))
     profile = _checked(path, _read_yaml(path))
     if profile.merge.weights_file is None or not with_weights:
         return profile
@@ -261,42 +263,7 @@ def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-_MOST_OF_A_FAULT = 1000
-_BOUNDS = ("less_than_equal", "greater_than_equal")
-
-
 def _one_sentence(path: Path, error: ValidationError) -> str:
     key, text = key_and_reason(error)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return f"{path}: {key or 'profile'}: {text}{more}"
-
-
-def key_and_reason(error: ValidationError) -> tuple[str, str]:
-    """The key of the first error, empty if it concerns several keys, and its reason."""
-    first = error.errors(include_url=False)[0]
-    key = clip_text(".".join(str(part) for part in first["loc"]))
-    if first["type"] == "extra_forbidden":
-        above = first["loc"][:-1]
-        keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
-        close = difflib.get_close_matches(str(first["loc"][-1]), keys, 1)
-        meant = f"did you mean {close[0]}? " if close else ""
-        text = f"this key is unknown; {meant}allowed here are {', '.join(keys)}"
-    elif first["type"] == "value_error":
-        text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
-    elif first["type"] == "model_type":
-        found = clip_text(repr(first["input"]))
-        text = f"must hold keys and values, found {found}; give some, or remove it"
-    else:
-        found = clip_text(repr(first["input"]))
-        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
-        names = [part for part in first["loc"] if isinstance(part, str)]
-        if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
-            text += " (metres: were millimetres or centimetres meant?)"
-    return key, text
-
-
-def _keys_at(loc: tuple[int | str, ...]) -> list[str]:
-    model: Any = Profile
-    for part in loc:
-        model = model.model_fields[part].annotation
-    return list(model.model_fields)

@@ -67,6 +67,14 @@ class PositioningConfig(Section):
             return "the sight of the target"
         return f"motion capture at {self.system}:{self.host}"
 
+    def with_method(self, by: str) -> dict[str, Any]:
+        """The values with another `by`. Keys of the method that is left are dropped; but beside a
+        deck a profile may name a capture, whose keys are kept."""
+        if by == self.by:
+            return self.model_dump()
+        kept = self.model_dump() if (self.by, by) == ("deck", "mocap") else {"decks": self.decks}
+        return {**kept, "by": by}
+
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:

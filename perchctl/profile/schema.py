@@ -8,10 +8,14 @@ larger sections.
 from __future__ import annotations
 
 import datetime
+import difflib
+from collections.abc import Collection, Mapping
 from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from perchctl.errors import InvalidValue, require_type
+from perchctl.plain_yaml import clip_text
 from perchctl.profile.base import Section, key, split_constant_keys
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
@@ -72,6 +76,39 @@ class Profile(Section):
     simulation: SimulationConfig = SimulationConfig()
     log: LogConfig = LogConfig()
 
+    def with_(self, changes: Mapping[str, Any]) -> Profile:
+        """A copy with other values of some keys, checked as a profile's file is.
+
+        `changes`: values by dotted key, as in ``{"camera.latency_s": 0.03}``. Another
+        `positioning.by` drops the keys of the method before. Raises InvalidValue
+        for an unknown key, a section instead of a key, or a value that is not allowed or does not
+        fit the other keys.
+        """
+        require_type("changes", changes, Mapping)
+        values = self.model_dump(mode="json")
+        if "positioning.by" in changes:
+            values["positioning"] = self.positioning.with_method(changes["positioning.by"])
+        for dotted, value in changes.items():
+            require_type("a key", dotted, str)
+            *sections, key = dotted.split(".")
+            inner: Any = values
+            for name in sections:
+                if not isinstance(inner.get(name), dict):
+                    what = "no section" if name in inner else f"unknown; {_meant(name, inner)}"
+                    raise InvalidValue(f"{dotted}: {name} is {what}")
+                inner = inner[name]
+            if isinstance(inner.get(key), dict) and dotted != "link.parameters":
+                raise InvalidValue(f"{dotted} is a section: give its keys one by one")
+            inner[key] = value
+        try:
+            _, notes, lost = split_constant_keys(values, Profile)
+            if notes or lost:
+                raise InvalidValue((notes + lost)[0])
+            return Profile.model_validate(values)
+        except ValidationError as error:
+            key, why = key_and_reason(error)
+            raise InvalidValue(f"{key or 'profile'}: {why}") from None
+
     @classmethod
     def constant_key_errors(cls, values: dict[str, Any]) -> list[str]:
         """An error sentence for each value that differs from the constant its key has become."""
@@ -95,3 +132,44 @@ class Profile(Section):
             if not limit.holds(self):
                 raise ValueError(limit.violation_text(self))
         return self
+
+
+# --- What is wrong with a value ---
+
+
+_MOST_OF_A_FAULT = 1000
+_BOUNDS = ("less_than_equal", "greater_than_equal")
+
+
+def key_and_reason(error: ValidationError) -> tuple[str, str]:
+    """The key of the first error, empty if it concerns several keys, and its reason."""
+    first = error.errors(include_url=False)[0]
+    key = clip_text(".".join(str(part) for part in first["loc"]))
+    if first["type"] == "extra_forbidden":
+        above = first["loc"][:-1]
+        keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
+        text = f"this key is unknown; {_meant(str(first['loc'][-1]), keys)}"
+    elif first["type"] == "value_error":
+        text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
+    elif first["type"] == "model_type":
+        found = clip_text(repr(first["input"]))
+        text = f"must hold keys and values, found {found}; give some, or remove it"
+    else:
+        found = clip_text(repr(first["input"]))
+        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
+        names = [part for part in first["loc"] if isinstance(part, str)]
+        if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
+            text += " (metres: were millimetres or centimetres meant?)"
+    return key, text
+
+
+def _meant(name: str, allowed: Collection[str]) -> str:
+    close = difflib.get_close_matches(name, allowed, 1)
+    return f"{f'did you mean {close[0]}? ' if close else ''}allowed here are {', '.join(allowed)}"
+
+
+def _keys_at(loc: tuple[int | str, ...]) -> list[str]:
+    model: Any = Profile
+    for part in loc:
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)

@@ -17,6 +17,7 @@ from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, Note, NotFound, ProfileNote
 from perchctl.places import file_names
 from perchctl.profile import (
+    PositioningConfig,
     Profile,
     SimulationConfig,
     apply_settings,
@@ -197,6 +198,30 @@ def test_another_value_of_a_constant_is_refused(
         load_profile(str(tmp_path / "old.yaml"))
     with pytest.raises(InvalidValue, match=rf"--set: {re.escape(key)} is no longer"):
         apply_settings(load_profile("sim"), [f"{key}={value}"])
+
+
+@pytest.mark.parametrize(("key", "value", "words"), [
+    ("planner.attemps", 2, "did you mean attempts"),
+    ("planer.attempts", 2, "planer is unknown; did you mean planner"),
+    ("camera.latency_s.x", 2, "latency_s is no section"),
+    ("planner.attempts", -1, "planner.attempts: .*found -1"),
+    ("planner", {"attempts": 2}, "planner is a section"),
+    ("planner.search.max_height_m", 9, "the search would climb"),
+])  # fmt: skip
+def test_other_values_are_checked_as_the_file_s_are(key: str, value: object, words: str) -> None:
+    sim = load_profile("sim")
+    assert sim.with_({"planner.attempts": 2, "link.parameters": {"a.b": 1}}) == apply_settings(
+        sim, ["planner.attempts=2", "link.parameters={a.b: 1}"]
+    )
+    with pytest.raises(InvalidValue, match=words):
+        sim.with_({key: value})
+
+
+def test_another_positioning_brings_its_own_defaults() -> None:
+    sim = load_profile("sim")
+    by_target = sim.with_({"positioning.by": "target", "positioning.rate_hz": 25.0})
+    assert by_target.positioning == PositioningConfig(by="target", rate_hz=25.0)
+    assert by_target.with_({"positioning.by": "deck"}).positioning == PositioningConfig()
 
 
 def test_a_profile_in_an_old_log_is_read() -> None:
