@@ -24,7 +24,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.output import add_problem, ask, print_result, say
 from perchctl.commands.progress import count_bar
-from perchctl.errors import PerchError, UsageError, no_simulator
+from perchctl.errors import PerchError, UsageError
 from perchctl.files import check_output, same_file
 from perchctl.positioning import open_capture
 from perchctl.profile import Profile, load_profile
@@ -152,10 +152,7 @@ def _open_session(path: Path, frames: int) -> SessionFile:
 def _collect_simulated(
     path: Path, profile: Profile, camera: CameraModel, positions: int, frames: int, seed: int
 ) -> None:
-    try:
-        from perchctl.weights import SimulatedStand
-    except ImportError as error:
-        raise no_simulator(error.name) from None
+    from perchctl.weights import SimulatedStand
 
     session = _open_session(path, frames)
     with count_bar("frames", max(0, positions - session.done) * frames) as advance:

@@ -39,7 +39,6 @@ from perchctl.errors import (
     PerchError,
     UsageError,
     no_cluster,
-    no_simulator,
 )
 from perchctl.profile import Profile, load_profile
 
@@ -111,7 +110,6 @@ def run(
     force: ForceOption = False,
 ) -> int:
     """Fly many seeded scenarios in lockstep, faster than real time, and count."""
-    _require_simulator()
     if faults == "list":
         return _list_faults(as_json)
     if record and log_dir is None:
@@ -204,7 +202,6 @@ def compare(
     as_json: JsonOption = False,
 ) -> int:
     """Fly each seed by two profiles: what differs, and what of it is proven."""
-    _require_simulator()
     names = (profile_a, profile_b)
     profiles = [with_positioning(load_profile(name), positioning) for name in names]
     keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
@@ -246,7 +243,6 @@ def sweep(
     as_json: JsonOption = False,
 ) -> int:
     """Fly the same seeds with several values of a profile's key: which is the best."""
-    _require_simulator()
     asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
 
     def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:
@@ -270,11 +266,6 @@ def _fly_by_each(
             len(profiles) * len(seeds),
             make_executor(jobs, cluster, profiles, len(profiles) * len(seeds)),
         )
-
-
-def _require_simulator() -> None:
-    if find_spec("mujoco") is None:
-        raise no_simulator()
 
 
 # --- Who flies, and how it may end ---

@@ -28,14 +28,18 @@ from typing import Any
 
 import numpy as np
 
-# Nothing is drawn with it; its window library would start a process with each import.
-os.environ.setdefault("MUJOCO_GL", "disable")
-
-import mujoco
-
+from perchctl.errors import no_simulator
 from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
 from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+
+# Nothing is drawn with it; its window library would start a process with each import.
+os.environ.setdefault("MUJOCO_GL", "disable")
+
+try:
+    import mujoco
+except ModuleNotFoundError as error:
+    raise no_simulator(error.name) from None
 
 ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
