@@ -24,18 +24,24 @@ html_theme = "furo"
 html_title = f"perchctl {release}"
 
 PAGE = re.compile(r"^- \[[^\]]*\]\(([\w-]+)\.md\): ", re.MULTILINE)
+EXAMPLE = re.compile(r"\]\(\.\./examples/(\w+)\.py\)")
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\(\.\./[^)]*\)")
 
 
 def adapt(app: Any, name: str, source: list[str]) -> None:
-    """Read the order of the pages from the index, and unlink what is not on the site.
+    """Read the order of the pages from the index, put the examples behind the API, and unlink what
+    is not on the site.
 
     The pages are written to be read in the repository, too, where they link to the code.
     """
     if name == root_doc:
         pages = "\n".join([*PAGE.findall(source[0]), "api"])
         source[0] += f"\n```{{toctree}}\n:hidden:\n\n{pages}\n```\n"
-    source[0] = OUTSIDE.sub(r"\1", source[0])
+    if name == "api":
+        for path in sorted(Path(app.srcdir).parent.glob("examples/*.py")):
+            source[0] += f"\n({path.stem})=\n## {path.name}\n\n"
+            source[0] += f"```{{literalinclude}} ../examples/{path.name}\n```\n"
+    source[0] = OUTSIDE.sub(r"\1", EXAMPLE.sub(r"](#\1)", source[0]))
 
 
 def write_start_page(app: Any, error: Exception | None) -> None:

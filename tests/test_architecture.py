@@ -32,6 +32,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "foxglove_schemas_protobuf": ("perchctl.record",),
     "google": ("perchctl.record.messages", "perchctl.record.recorder"),
     "distributed": ("perchctl.campaign",),
+    "pandas": ("perchctl.analysis",),
     "av": ("perchctl.camera.network", "perchctl.analysis.film"),
 }
 
@@ -51,6 +52,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "perchctl.vehicle",
         "perchctl.values",
         "perchctl.children",
+        "perchctl.extensions",
     ),
     ("perchctl.plot",),
     ("perchctl.profile",),
@@ -60,12 +62,12 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.camera", "perchctl.positioning"),
     ("perchctl.perception",),
     ("perchctl.calibration",),
-    ("perchctl.link",),
+    ("perchctl.link", "perchctl.sighting"),
     ("perchctl.sim", "perchctl.record"),
     ("perchctl.flight",),
     ("perchctl.campaign",),
     ("perchctl.weights", "perchctl.faults", "perchctl.check", "perchctl.analysis"),
-    ("perchctl.display",),
+    ("perchctl.display", "perchctl.real_time"),
     ("perchctl.commands",),
     ("perchctl.__main__",),
 )
@@ -74,24 +76,24 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # Packages with a face: the others take its names, and nothing from behind it. The number is how
 # many names it has at most.
 MOST_NAMES = {
-    "analysis": 10,
+    "analysis": 11,
     "calibration": 16,
     "camera": 17,
-    "campaign": 20,
+    "campaign": 21,
     "check": 8,
     "commands": 2,
     "display": 6,
     "faults": 6,
     "flight": 16,
-    "link": 11,
+    "link": 13,
     "record": 12,
-    "mission": 26,
+    "mission": 31,
     "perception": 5,
     "positioning": 10,
     "profile": 33,
     "sim": 12,
     "target": 14,
-    "vision": 26,
+    "vision": 31,
     "weights": 9,
 }
 

@@ -9,21 +9,16 @@ import runpy
 import shlex
 import shutil
 import sys
-import threading
-import time
 from functools import cache
-from http.server import HTTPServer
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import MountingRecording, load_calibration
-from perchctl.camera import open_camera
 from perchctl.commands import app
 from perchctl.commands.command_line import COMMANDS
 from perchctl.flight import fly_lockstep
@@ -260,18 +255,6 @@ def test_every_example_runs(
     quick = source.replace('load_profile("sim"), seed', 'load_profile("quick.yaml"), seed')
     exec(compile(quick, f"docs/python.md, example {number + 1}", "exec"), {})
     assert capsys.readouterr().out.strip()
-
-
-def test_a_program_s_own_pictures_are_a_source() -> None:
-    own: dict[str, Any] = {"pictures": lambda: [np.full((48, 64, 3), 90, np.uint8)] * 5}
-    exec(blocks(TEXT[DOCS / "python.md"], "py")[0].rpartition("\n\n")[0], own)
-    with HTTPServer(("127.0.0.1", 0), own["Camera"]) as server:
-        threading.Thread(target=server.handle_request, daemon=True).start()
-        camera = open_camera(f"http://127.0.0.1:{server.server_port}/", time.monotonic)
-        frame = camera.poll(time.monotonic())
-        camera.close()
-    assert frame is not None
-    assert frame.image.shape == (48, 64)
 
 
 def test_every_public_name_is_explained() -> None:

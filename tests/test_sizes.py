@@ -16,19 +16,19 @@ SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob(
 # Package -> lines at most; "." are the modules beside the packages. What needs more raises the
 # bound in its own change, and says why there.
 MOST_LINES = {
-    ".": 1040,
+    ".": 1535,
     "analysis": 2340,
     "calibration": 2920,
-    "camera": 1530,
-    "campaign": 1070,
+    "camera": 1585,
+    "campaign": 1095,
     "check": 1660,
-    "commands": 3780,
+    "commands": 3650,
     "display": 730,
     "faults": 2660,
     "flight": 2220,
-    "link": 2200,
+    "link": 2305,
     "record": 2160,
-    "mission": 4230,
+    "mission": 4285,
     "perception": 730,
     "positioning": 950,
     "profile": 1905,
@@ -39,8 +39,9 @@ MOST_LINES = {
 }
 MOST_FILES = 220
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
-CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 37.8, 0.106, 0.05
+CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 35.06, 0.106, 0.05
 MOST_MEDIAN_LINES = 15  # of a function
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def lines_of(package: str) -> int:
@@ -66,24 +67,27 @@ def test_files_are_few() -> None:
 
 
 def test_no_line_is_packed() -> None:
+    """Measured on the code alone: sentences fill their lines, so docstrings have a share."""
     lines = [line for source in SOURCES.values() for line in source.splitlines()]
-    characters = sum(map(len, lines)) / len(lines)
     trees = [ast.parse(source) for source in SOURCES.values()]
     nodes = [node for tree in trees for node in ast.walk(tree)]
-    share = sum(map(_docstring_lines, nodes)) / len(lines)
+    docstrings = [line for source in SOURCES.values() for line in _docstring_lines(source)]
+    share = len(docstrings) / len(lines)
+    code = sum(map(len, lines)) - sum(map(len, docstrings))
+    characters = code / (len(lines) - len(docstrings))
     functions = [n for n in nodes if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
     median = statistics.median((n.end_lineno or n.lineno) - n.lineno + 1 for n in functions)
     print(
-        f"{characters:.1f} characters a line, {share:.1%} docstrings, {median:g} lines a function"
+        f"{characters:.2f} characters a line, {share:.1%} docstrings, {median:g} lines a function"
     )
     assert characters <= (1.0 + WITHIN) * CHARACTERS_A_LINE
     assert share >= (1.0 - WITHIN) * DOCSTRING_SHARE
     assert median <= MOST_MEDIAN_LINES
 
 
-def _docstring_lines(node: ast.AST) -> int:
-    if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-        return 0
-    if ast.get_docstring(node, clean=False) is None:
-        return 0
-    return (node.body[0].end_lineno or 0) - node.body[0].lineno + 1
+def _docstring_lines(source: str) -> list[str]:
+    lines, found = source.splitlines(), list[str]()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            found += lines[node.body[0].lineno - 1 : node.body[0].end_lineno]
+    return found

@@ -2,6 +2,7 @@ from .compare import FlightComparison as FlightComparison
 from .compare import profile_differences as profile_differences
 from .film import write_film as write_film
 from .flight import FlightAnalysis as FlightAnalysis
+from .flight import read_log as read_log
 from .plot import plot_flight as plot_flight
 from .replayer import replay as replay
 from .report import write_report as write_report

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.errors import InvalidValue
-from perchctl.mission import Observation, PlannerState, Turn, step_mission
+from perchctl.mission import Observation, PlannerState, Turn, step_mission, table_of
 from perchctl.profile import Profile
 from perchctl.record import FlightLog, to_exact_json
 from perchctl.vehicle import Command
@@ -69,13 +69,13 @@ def replay_decisions(
     planner raises, as a flight does.
     """
     state: PlannerState | None = None
-    tick = 0
+    table, tick = table_of(profile.planner.rows), 0
     for turn in turns:
         obs = observation_of(turn)
         if obs is None or turn.role == "waiting":
             continue
         try:
-            new, command = step_mission(state, obs, profile)
+            new, command = step_mission(state, obs, profile, table)
         except Exception as error:
             name = type(error).__name__
             yield ReplayedDecision(tick, turn, field_difference("error", turn.error, name), name)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perchctl.analysis.sight import Frames, TargetLoss, percentile, read_frames, target_losses
+from perchctl.errors import UsageError
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand
 from perchctl.record import FlightLog, FlightSummary, PhaseSpan
+from perchctl.record import read_log as read_records
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 SETTLED_S = 1.0
@@ -93,13 +97,28 @@ class Measures:
 class FlightAnalysis:
     """Analysis of one flight's log; each property is computed once, on first use.
 
+    `records` are the ticks, each with every field, `events` the flight's events, and
+    `column(field)` one field of all ticks, (n,), NaN where it is missing.
+
     Times count from the flight's first turn. A property that meets an invalid value in the log
     raises InvalidValue, TypeError, ValueError, LookupError or AttributeError; within
     `perchctl.record.wrap_log_errors` all of these become InvalidValue.
     """
 
     def __init__(self, log: FlightLog) -> None:
-        self.log = log
+        self.log, self.records, self.events = log, log.records, log.events
+        self.column = log.column
+
+    def to_pandas(self) -> Any:
+        """Return the ticks as a `pandas.DataFrame`: a column a field, and as index `t_s`, seconds
+        since the first tick. Raises UsageError without pandas."""
+        try:
+            import pandas
+        except ImportError:
+            how = f"{sys.executable} -m pip install pandas"
+            raise UsageError(f"to_pandas needs pandas; install it with: {how}") from None
+        index = pandas.Index(self.log.t_s, name="t_s")
+        return pandas.DataFrame(self.records).drop(columns="t_s").set_index(index)
 
     @cached_property
     def summary(self) -> FlightSummary:
@@ -215,6 +234,16 @@ class FlightAnalysis:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return math.nan
         return float(value)
+
+
+def read_log(path: Path | str) -> FlightAnalysis:
+    """Read a flight log, gzipped or not, and return its analysis: the ticks by `records`,
+    `column(field)` and `to_pandas()`, and `events`, `summary`, `measures`.
+
+    Raises:
+        NotFound: no such file. InvalidValue: it is no flight log, or damaged.
+    """
+    return FlightAnalysis(read_records(path))
 
 
 def contact_ascent(spans: Sequence[PhaseSpan]) -> PhaseSpan | None:

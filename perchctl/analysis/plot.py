@@ -54,14 +54,15 @@ TRACKS = (
 )
 
 
-def plot_flight(log: FlightLog, path: Path | str) -> None:
+def plot_flight(log: FlightLog | FlightAnalysis, path: Path | str) -> None:
     """Draw the flight into a .png, .pdf or .svg.
 
     Raises InvalidValue for a log without ticks or a file that cannot be written.
     """
-    if not log.records:
-        raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to plot")
-    save_figure(flight_figure(FlightAnalysis(log)), Path(path))
+    flight = log if isinstance(log, FlightAnalysis) else FlightAnalysis(log)
+    if not flight.records:
+        raise InvalidValue(f"{flight.log.path}: the log holds no ticks, there is nothing to plot")
+    save_figure(flight_figure(flight), Path(path))
 
 
 def flight_png(flight: FlightAnalysis) -> bytes:

@@ -1,5 +1,3 @@
-from .credentials import profile_record as profile_record
-from .credentials import without_password as without_password
 from .device import find_cameras as find_cameras
 from .files import RecordedSource as RecordedSource
 from .files import decode_picture as decode_picture
@@ -14,4 +12,6 @@ from .source import NewestSlot as NewestSlot
 from .source import WrappedSource as WrappedSource
 from .source import check_size as check_size
 from .source import mirrored_note as mirrored_note
+from .source import profile_record as profile_record
 from .source import unmirror_frame as unmirror_frame
+from .source import without_password as without_password

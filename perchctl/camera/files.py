@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.camera.credentials import without_password
 from perchctl.camera.jpeg import decode_grey, jpeg_end_and_size
-from perchctl.camera.source import to_grey
+from perchctl.camera.source import without_password
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.vision import Frame
+from perchctl.vision import Frame, to_grey
 
 DEFAULT_RATE_HZ = 30.0
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})

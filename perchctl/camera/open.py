@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -9,12 +10,20 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import AiDeckSource
-from perchctl.camera.credentials import without_password
 from perchctl.camera.device import DeviceSource, open_video_capture
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.network import MjpegSource, RtspSource
-from perchctl.camera.source import Clock, FrameSource, LiveSource, WrappedSource, unmirror_frame
+from perchctl.camera.source import (
+    Clock,
+    FrameSource,
+    GuardedSource,
+    LiveSource,
+    WrappedSource,
+    unmirror_frame,
+    without_password,
+)
 from perchctl.errors import InvalidValue, NotFound, TimedOut
+from perchctl.extensions import is_extension, make_extension
 from perchctl.profile import CameraConfig
 
 REAL = (
@@ -54,8 +63,8 @@ class SourceName:
 
 
 def parse_source(text: str) -> SourceName:
-    """The source of a text: a scheme in either case and its place, or a bare path of video,
-    picture, pattern or folder. Nothing is opened.
+    """The source of a text: a scheme in either case and its place, a bare path of video, picture,
+    pattern or folder, or a camera of your own, ``my_module:MyCamera``. Nothing is opened.
 
     Errors: InvalidValue for an unknown scheme or a stream without a host; NotFound for a bare path
     that does not exist.
@@ -71,8 +80,13 @@ def parse_source(text: str) -> SourceName:
         return SourceName("images", text)
     if path.is_file():
         return SourceName("images" if path.suffix.lower() in IMAGE_SUFFIXES else "video", text)
+    if is_extension(text):
+        return SourceName(scheme, place)
     if name.scheme:
-        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {REAL}, sim:")
+        raise InvalidValue(
+            f"camera source {shown!r} is unknown; allowed are {REAL}, sim:, or my_module:MyCamera "
+            f"with my_module in {Path.cwd()}"
+        )
     raise NotFound(
         f"{shown} does not exist; a source is a video, picture or folder of pictures, or one of "
         f"{REAL}"
@@ -96,7 +110,7 @@ def _check_address(name: SourceName) -> None:
 
 def open_camera(
     source: str | Sequence[Path],
-    clock: Clock,
+    clock: Clock = time.monotonic,
     config: CameraConfig | None = None,
     *,
     size_px: tuple[int, int] | None = None,
@@ -108,8 +122,9 @@ def open_camera(
 
     Args:
         source: a text that `parse_source` takes, or picture files one by one. ``sim:`` belongs
-            to the simulated vehicle, whose stream's address the caller gives instead.
-        clock: the loop's clock, s.
+            to the simulated vehicle, whose stream's address the caller gives instead. Of
+            ``my_module:MyCamera`` the class is called with `clock` and `config`.
+        clock: of the frames' times, s.
         config: the profile's camera. Its latency is taken off live frames' times, its format
             and rate are asked of ``camera:``, and mirrored pictures are turned right.
         size_px: wanted width and height (requested of ``camera:`` only).
@@ -134,6 +149,10 @@ def open_camera(
         name = parse_source(source)
         if name.scheme == "video" and name.place:
             opened = VideoSource(Path(name.place).expanduser(), latency_s)
+        elif name.scheme not in SCHEMES:
+            own = make_extension(name.spec, "camera.source", FrameSource, clock, config)
+            opened = checked = GuardedSource(own, name.spec, clock)
+            checked.wait_first_frame(timeout_s)
         elif name.scheme == "images" and name.place:
             opened = ImagesSource(str(Path(name.place).expanduser()), latency_s, pictures_hz)
         else:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
+import re
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 from urllib.error import URLError
 
-import cv2
 import numpy as np
 
-from perchctl.camera.credentials import without_password
 from perchctl.camera.health import Grey, same_bytes
-from perchctl.errors import InvalidValue, PerchError, TimedOut
-from perchctl.profile import CameraConfig
-from perchctl.vision import CameraModel, Frame
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
+from perchctl.extensions import error_at
+from perchctl.profile import CameraConfig, Profile
+from perchctl.vision import CameraModel, Frame, to_grey
 
 
 class NewestSlot:
@@ -53,18 +55,22 @@ Clock = Callable[[], float]
 SILENT_AFTER_S = 1.0
 """A live source without a new frame for so long counts as gone."""
 CLOSE_WITHIN_S = 3.0
+_POLL_S = 0.002
 
 
+@runtime_checkable
 class FrameSource(Protocol):
-    """A source of frames.
+    """A source of frames. Your own class is called with the loop's clock and the profile's section
+    `camera`; an error that it raises counts as a lost camera.
 
-    A live source keeps only the newest frame and stamps it when it arrives; a
-    recorded one gives every frame once, at the pace it is polled, with the times
-    of the recording.
+    A live source gives only the newest frame; its `t_s` is the arrival less
+    `config.start_latency_s`. A recorded source gives every frame once, at the pace it is polled,
+    with the times of the recording. perchctl converts colour to grey, and unmirrors frames.
     """
 
     @property
-    def live(self) -> bool: ...
+    def live(self) -> bool:
+        """True for a camera, which runs in real time; False for a recording."""
 
     @property
     def finished(self) -> bool:
@@ -75,26 +81,18 @@ class FrameSource(Protocol):
         """Width and height of the frames, once the first has come."""
 
     def poll(self, now_s: float) -> Frame | None:
-        """The newest frame (recorded: the next); None if none came since the last call."""
+        """The newest frame (recorded: the next); None if none came since the last call. The flight
+        loop calls it about 50 times a second, so it must not wait: a camera that blocks needs a
+        thread."""
 
     def problem(self, now_s: float) -> str | None:
-        """A sentence if the source is lost at `now_s`, else None."""
+        """A sentence if the source is broken at `now_s`, else None; at -inf, only for a permanent
+        failure. perchctl itself notices that no frames come."""
 
-    def describe(self) -> str: ...
+    def describe(self) -> str:
+        """Name and size in a sentence: ``camera:0 (640x480 px)``."""
 
     def close(self) -> None: ...
-
-
-def to_grey(image: Any) -> Grey:
-    """A contiguous 8-bit grey picture of grey, BGR or BGRA, 8 or 16 bits."""
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    if image.ndim == 3 and image.shape[2] == 1:
-        image = image[:, :, 0]
-    if image.ndim == 3:
-        code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
-        image = cv2.cvtColor(image, code)
-    return np.ascontiguousarray(image, np.uint8)
 
 
 def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str) -> None:
@@ -280,6 +278,80 @@ class WrappedSource:
         self._source.close()
 
 
+class GuardedSource:
+    """Checks your own camera. An error that it raises, or an invalid frame, counts as a lost
+    camera; a live frame that is not newer than the last one is left out."""
+
+    def __init__(self, source: FrameSource, name: str, clock: Clock) -> None:
+        self._source, self._name, self._clock = source, name, clock
+        self._first: Frame | None = None
+        self._newest_s, self._count = -math.inf, 0
+        self._empty_since_s: float | None = None  # the first poll without a frame since the last
+        self._failure: str | None = None
+        self.live, self.size_px = bool(source.live), source.size_px
+
+    def wait_first_frame(self, timeout_s: float) -> None:
+        """Wait for the first frame of a camera. Raises ConnectionFailed, TimedOut."""
+        end_s = time.monotonic() + timeout_s
+        while self.live and (frame := self.poll(self._clock())) is None:
+            if self._failure is not None:
+                raise ConnectionFailed(self._failure)
+            if time.monotonic() > end_s:
+                raise TimedOut(f"{self._name}: no first frame within {timeout_s:g} s")
+            time.sleep(_POLL_S)
+        self._first = frame if self.live else None
+
+    @property
+    def finished(self) -> bool:
+        return self._source.finished
+
+    def poll(self, now_s: float) -> Frame | None:
+        frame, self._first = self._first, None
+        if frame is None and self._failure is None:
+            try:
+                frame = self._checked(self._source.poll(now_s))
+            except Exception as error:
+                self._fail(error)
+        empty_s = now_s if self._empty_since_s is None else self._empty_since_s
+        self._empty_since_s = empty_s if frame is None else None
+        return frame
+
+    def _checked(self, frame: object) -> Frame | None:
+        if frame is None:
+            return None
+        if not isinstance(frame, Frame):
+            raise TypeError(f"poll must return a Frame or None, not {type(frame).__name__}")
+        now_s = self._clock()
+        if self.live and not frame.t_s <= now_s:
+            raise ValueError(f"a frame's t_s must be a past time, not {frame.t_s} at {now_s}")
+        if self.live and frame.t_s <= self._newest_s:
+            return None
+        self._newest_s, self._count = frame.t_s, self._count + 1
+        grey = to_grey(frame.image)
+        self.size_px = (grey.shape[1], grey.shape[0])
+        arrival_s = frame.t_arrival_s or now_s
+        return replace(frame, index=self._count - 1, image=grey, t_arrival_s=arrival_s)
+
+    def problem(self, now_s: float) -> str | None:
+        problem, since_s = self._failure, self._empty_since_s
+        try:
+            problem = problem or self._source.problem(now_s)
+        except Exception as error:
+            self._fail(error)
+        silent_s = 0.0 if since_s is None or not self.live else now_s - since_s
+        silent = f"{self._name} has given no frame for {silent_s:.1f} s"
+        return self._failure or problem or (silent if silent_s > SILENT_AFTER_S else None)
+
+    def _fail(self, error: Exception) -> None:
+        self._failure = without_password(f"{self._name}: {error_at(error)}")
+
+    def describe(self) -> str:
+        return self._source.describe()
+
+    def close(self) -> None:
+        self._source.close()
+
+
 def mirrored_note(config: CameraConfig) -> str:
     """A sentence: the picture is mirrored, and how to correct the profile with `config`."""
     advice = "switch that off in the camera, or set camera.mirrored in the profile"
@@ -291,3 +363,40 @@ def mirrored_note(config: CameraConfig) -> str:
 def unmirror_frame(frame: Frame) -> Frame:
     """The frame flipped left to right, without its original JPEG bytes."""
     return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)
+
+
+# --- Name and password of a stream's URL: shown nowhere ---
+
+
+_START = r"(?:[a-z][a-z0-9+.-]*://|(?:https?|rtsps?):/?)"
+_URL = re.compile(_START, re.IGNORECASE)
+_URL_AMID = re.compile(rf"({_START})(\S*)", re.IGNORECASE)
+_SECRET = re.compile(
+    r"""((?:password|passwd|pwd|pass|user-pw)=)(?:"[^"]*"|'[^']*'|[^&#\s]*)""", re.IGNORECASE
+)
+
+
+def without_password(text: str) -> str:
+    """The text without user names and passwords in URLs, and without the values of
+    ``password=`` and similar keys. In doubt too much is removed."""
+    if start := _URL.match(text):  # all of it is one URL, spaces in the password too
+        text = start.group() + _without_name(text[start.end() :])
+    else:
+        text = _URL_AMID.sub(lambda found: found.group(1) + _without_name(found.group(2)), text)
+    return _SECRET.sub(r"\1***", text)
+
+
+def _without_name(rest: str) -> str:
+    host, slash, path = rest.partition("/")
+    if "@" in host:
+        return f"{host.rpartition('@')[2]}{slash}{path}"
+    before, _, after = rest.rpartition("@")
+    return after if ":" in before else rest  # a slash within the password
+
+
+def profile_record(profile: Profile) -> dict[str, Any]:
+    """All keys of the profile for JSON, with passwords removed: a profile read back from it
+    cannot open a camera that needs one."""
+    record = profile.model_dump(mode="json")
+    record["camera"]["source"] = without_password(profile.camera.source)
+    return record | {"description": without_password(profile.description)}

@@ -7,6 +7,7 @@ from .flights import fly_all as fly_all
 from .flights import fly_in_folder as fly_in_folder
 from .flights import fly_measured as fly_measured
 from .flights import seed_log_path as seed_log_path
+from .flights import simulate as simulate
 from .pool import defer_interrupts as defer_interrupts
 from .pool import flight_processes as flight_processes
 from .results import CampaignFlight as CampaignFlight

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import time
 from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
 
+from perchctl.campaign.pool import flight_processes
 from perchctl.campaign.results import FlightEnd, FlightResult
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, SafetyAbort, TimedOut
+from perchctl.errors import (
+    ConnectionFailed,
+    InvalidValue,
+    PerchError,
+    SafetyAbort,
+    TimedOut,
+    require_type,
+)
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Phase
-from perchctl.profile import Profile
+from perchctl.profile import Profile, load_profile
 from perchctl.record import LogWatcher
 from perchctl.sim import Scenario, draw_scenario
 
@@ -72,8 +82,6 @@ def fly_seed(
         try:
             flight = fly_lockstep(profile, seed, log)
         except (SafetyAbort, TimedOut) as error:
-            if log is not None:
-                log.abandon(str(error))
             return FlightResult(seed, "refused", str(error), None, 0.0, 0, False, False)
         summary = None if log is None else flight.close_log(log)
         return FlightResult(
@@ -133,6 +141,41 @@ def fly_all(
         by_seed[seed] = _result(future, seed, lost)
         on_result(by_seed[seed])
     return [by_seed[seed] for seed in seeds]
+
+
+def simulate(
+    profile: Profile | Path | str,
+    seeds: Iterable[int],
+    jobs: int = 1,
+    executor: Executor | None = None,
+    *,
+    log_dir: Path | str | None = None,
+) -> list[FlightResult]:
+    """Fly each distinct seed of the scenario in lockstep; return the results in their order.
+
+    Args:
+        profile: a profile, its name or its file.
+        seeds: integers from 0; a seed always gives the same flight.
+        jobs: processes; with more than one a script needs ``if __name__ == "__main__":``.
+        executor: flies instead of `jobs`: any of `concurrent.futures`' kind, such as dask's.
+        log_dir: folder for the flight logs; none are written without it.
+
+    A result has `seed`, `outcome` (perched, landed, aborted, refused), `reason`, `miss_m` (None if
+    it did not perch), `time_s`, `attempts`, `fell`, `locked`, `log` and the drawn `scenario`.
+
+    Raises:
+        NotFound, InvalidValue: profile or seeds. UsageError: no simulator is installed.
+    """
+    profile, seeds = load_profile(profile), list(seeds)
+    for value in (*seeds, jobs):
+        require_type("a seed, or jobs,", value, int)
+    if min([*seeds, jobs - 1]) < 0:
+        raise InvalidValue(f"seeds begin at 0, jobs at 1; found {seeds}, {jobs}")
+    one = partial(fly_in_folder, profile, None if log_dir is None else Path(log_dir), False)
+    with contextlib.ExitStack() as stack:
+        if executor is None and jobs > 1:
+            executor = stack.enter_context(flight_processes(jobs))
+        return fly_all(one, seeds, executor)
 
 
 def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ...]) -> R:

@@ -50,6 +50,11 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     """Run all checks, and yield each row as it is known. Errors, before anything is opened:
     InvalidValue, NotFound (files of the profile), UsageError (a library that does not load)."""
     check_options(options)
+    if options.has_own_link:
+        raise UsageError(
+            f"check asks the vehicle through cflib, not through your own link "
+            f"{options.uri}: name a vehicle with --uri"
+        )
     calibrated = profile_camera(options.profile.camera)
     pipeline = make_pipeline(options.profile, calibrated)
     with contextlib.ExitStack() as stack:

@@ -173,7 +173,8 @@ UriOption = Annotated[
         "--uri",
         "-u",
         envvar="CFLIB_URI",
-        help="Vehicle: sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT.",
+        help="Vehicle: sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT, "
+        "my_module:MyLink.",
     ),
 ]
 SourceOption = Annotated[
@@ -181,14 +182,14 @@ SourceOption = Annotated[
     typer.Option(
         "--source",
         help="Camera: camera:N or camera:NAME, rtsp://..., http://..., aideck://HOST, video:FILE, "
-        "images:DIR, sim:.",
+        "images:DIR, sim:, my_module:MyCamera.",
     ),
 ]
 SourceArgument = Annotated[
     str,
     typer.Argument(
         help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-        "http://..., aideck://HOST, or a path.",
+        "http://..., aideck://HOST, my_module:MyCamera, or a path.",
     ),
 ]
 PositioningOption = Annotated[

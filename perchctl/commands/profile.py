@@ -27,6 +27,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.output import ask, print_lines, print_result, say
 from perchctl.errors import InvalidValue, PerchError, UsageError
+from perchctl.extensions import is_extension
 from perchctl.files import check_output, write_files
 from perchctl.geometry import Array
 from perchctl.link import check_uri
@@ -318,7 +319,7 @@ def profile_and_keys(answers: Answers, name: str) -> tuple[Profile, set[str]]:
         texts["camera.calibration"] = str(path.resolve()) if path.is_file() else calibration
         load_calibration(find_calibration(texts["camera.calibration"]))
     for key, check in (("link.uri", check_uri), ("camera.source", parse_source)):
-        if key in texts:
+        if key in texts and not is_extension(texts[key]):
             check(texts[key])
     if texts.get("camera.source") == "camera:":
         raise InvalidValue("camera.source: found camera:; write camera:N or camera:NAME")

@@ -21,12 +21,10 @@ import typer
 
 from perchctl.calibration import load_calibration
 from perchctl.camera import (
-    VERDICT_TEXTS,
     FrameSource,
     RecordedSource,
     WrappedSource,
     check_size,
-    mirrored_note,
     open_camera,
     parse_source,
     without_password,
@@ -45,24 +43,15 @@ from perchctl.commands.progress import count_bar
 from perchctl.display import live_page, make_sketch
 from perchctl.errors import Interrupted, NotFound
 from perchctl.geometry import Array, rot_z, yaw_of
-from perchctl.perception import Perception
 from perchctl.places import is_shipped_example
-from perchctl.profile import Profile, find_calibration, load_profile
+from perchctl.profile import find_calibration, load_profile
+from perchctl.sighting import POLL_S, Tracker
 from perchctl.vision import (
     MARKERS,
-    CameraModel,
     Frame,
     MarkerPose,
     PipelineOutput,
-    camera_profile,
-    make_pipeline,
 )
-
-POLL_S = 0.002
-# A live picture that stands still or is noise is no measurement; the others are searched.
-_NO_PICTURE = ("frozen", "snow")
-INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
-_DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
 
 app = new_app()
 
@@ -114,6 +103,7 @@ def track(
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
         # Files of pictures need not belong together.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
+        target: TargetInCamera | None = None
         stack.enter_context(stop.as_handler())  # until here Ctrl-C ends at once
         title = f"perchctl track {without_password(source)}"
         page = stack.enter_context(live_page(camera, title, view, say))
@@ -123,7 +113,11 @@ def track(
             place = str(paths[frame.index]) if paths else opened.describe()
             check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
             name = paths[frame.index].name if paths else frame.index
-            for tracked in tracker.process(frame, name):
+            for picture, output, notes in tracker.process(frame):
+                tracked = TrackResult(name, picture, notes=notes)
+                if output is not None:
+                    target = target_in_camera(output, target)
+                    tracked = TrackResult(name, picture, output, target, notes)
                 summary.add(tracked)
                 if lines:
                     line = json.dumps(track_record(tracked)) if as_json else text_line(tracked)
@@ -198,50 +192,12 @@ class TrackResult:
     picture: Frame
     output: PipelineOutput | None = None
     target: TargetInCamera | None = None
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
     @property
     def stage(self) -> str:
         """The detected markers: large, small, both or none."""
         return "none" if self.output is None else self.output.stage.value
-
-
-class Tracker:
-    """Runs the profile's pipeline on frames, for poses relative to the camera instead of the gear;
-    with `stills` each picture is searched thoroughly and by itself."""
-
-    def __init__(self, profile: Profile, camera: CameraModel, *, live: bool, stills: bool) -> None:
-        pipeline = make_pipeline(camera_profile(profile), camera)
-        self._perception = Perception(pipeline, stills=stills)
-        self._config, self._live, self._stills = profile.camera, live, stills
-        self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
-        self._target: TargetInCamera | None = None
-
-    def process(self, frame: Frame, name: str | int) -> list[TrackResult]:
-        """Return the results of a frame: one, two if it is interlaced (one for each field), or none
-        for a repeated picture of a live source."""
-        judged = self._perception.health.assess(frame, self._live or not self._stills)
-        if self._live and judged == "repeated":
-            return []
-        about = () if judged in ("ok", "repeated") else (VERDICT_TEXTS[judged],)
-        if self._live and judged in _NO_PICTURE:
-            return [TrackResult(name, frame, notes=about)]
-        results = []
-        for picture, output in self._perception.process_fields(frame):
-            self._target = target_in_camera(output, self._target)
-            notes = (*about, *self._notes(output))
-            results.append(TrackResult(name, picture, output, self._target, notes))
-        return results
-
-    def _notes(self, output: PipelineOutput) -> Iterator[str]:
-        if output.fields != "whole":
-            yield INTERLACED
-        if output.lock_note:
-            yield output.lock_note
-        if output.detections.mirrored:
-            yield mirrored_note(self._config)
-        if output.disagreeing_frames >= self._disagreement_frames:
-            yield _DISAGREE
 
 
 def target_in_camera(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,16 @@ from perchctl.camera import FrameSource, NewestSlot, WrappedSource, unmirror_fra
 from perchctl.errors import ConnectionFailed
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
-from perchctl.mission import FlightReport, Operator, Phase, Tick, Watcher
+from perchctl.mission import (
+    FlightReport,
+    Operator,
+    Phase,
+    Tick,
+    Transition,
+    Watcher,
+    add_rows,
+    table_of,
+)
 from perchctl.positioning import PositionFeed, VehiclePose
 from perchctl.profile import Profile
 from perchctl.record import FlightSummary, LogWatcher
@@ -26,7 +35,7 @@ from perchctl.sim import (
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import Frame, make_pipeline
+from perchctl.vision import Frame, Step, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2  # pictures that wait; a newer one replaces the oldest
@@ -156,27 +165,35 @@ def fly_lockstep(
     capture: CaptureSettings | None = None,
     operator: Callable[[], Operator] = lambda: Operator.NONE,
     watchers: tuple[Watcher, ...] = (),
+    rows: Sequence[Transition] = (),
+    camera: Callable[[FrameSource], FrameSource] = lambda source: source,
+    perception: Step | None = None,
 ) -> LockstepFlight:
     """Fly one seed of the profile's scenario to its end, faster than real time.
 
     Args:
-        log: a file to log to, or a watcher that is left open.
+        log: a file to log to, or a watcher that is left open unless the flight raises.
         scenario, capture: used in place of the seed's own.
         operator: the operator's command.
         watchers: further watchers of the flight.
+        rows: your own transitions, besides those of the profile.
+        camera: gets the simulated camera, and returns the source that is flown with.
+        perception: your own estimator: called instead of `perchctl.step`, with its arguments. The
+            returned state's `target` is what the planner flies to.
 
-    Errors: NotFound, InvalidValue (calibration, log file).
+    Errors: NotFound, InvalidValue (calibration, log file, rows).
     """
+    table = add_rows(rows, table_of(profile.planner.rows))
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
     opened: LogWatcher | None = None
     if isinstance(log, (Path, str)):
         log = opened = LogWatcher.open_lockstep(Path(log), profile, scenario.seed)
-    camera = profile_camera(profile.camera)
+    model = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
-    vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
+    vehicle = SimulatedVehicle(scenario, model, profile.target, capture)
     link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
     positions = lockstep_feed(link, profile)
-    source = lockstep_source(vehicle, profile)
+    source = camera(lockstep_source(vehicle, profile))
     truth = TruthWatcher(vehicle)
     watchers = (truth, *watchers)
     if log is not None:
@@ -188,14 +205,20 @@ def fly_lockstep(
         source,
         LockstepClock(link),
         profile,
-        make_pipeline(profile, camera),
+        replace(make_pipeline(profile, model), own_step=perception),
         watchers,
         operator,
         positions,
         tuple if log is None else log.remarks,
+        table,
     )
-    link.connect()
-    report = fly(parts)
+    try:
+        link.connect()
+        report = fly(parts)
+    except BaseException as error:
+        if log is not None:
+            log.abandon(str(error) or type(error).__name__)
+        raise
     vehicle.watched = False
     link.close()
     link.advance_to(link.now_s + 1.0)

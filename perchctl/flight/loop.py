@@ -36,8 +36,10 @@ from perchctl.mission import (
     PlannerState,
     SentCommand,
     Tick,
+    Transition,
     Watcher,
     step_mission,
+    table_of,
 )
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
@@ -62,7 +64,8 @@ class FlightParts:
     """The parts that the flight loop works with.
 
     `positions` sends the external positions, None where decks measure them; `remarks` returns new
-    notes on things that do not matter to safety, such as a recording."""
+    notes on things that do not matter to safety, such as a recording; `table` is flown instead of
+    the profile's."""
 
     link: Link
     source: FrameSource
@@ -73,6 +76,7 @@ class FlightParts:
     operator: Callable[[], Operator] = lambda: Operator.NONE
     positions: PositionSource | None = None
     remarks: Callable[[], Sequence[str]] = tuple
+    table: tuple[Transition, ...] = table_of(None)
 
     def position_age_s(self, now_s: float) -> float:
         """Age of the newest position by motion capture; 0 if positions come from elsewhere."""
@@ -192,7 +196,7 @@ def _mission(
         obs = _observe(parts, inputs, now_s, late_s, feed)
         turns.note_observation(obs)
         before = state
-        new, command = step_mission(before, obs, parts.profile)
+        new, command = step_mission(before, obs, parts.profile, parts.table)
         turns.note_decision(obs, new, command, feed)
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):

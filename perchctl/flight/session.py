@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -21,11 +22,12 @@ from perchctl.errors import (
     no_motion_capture,
     no_simulator,
 )
+from perchctl.extensions import PATTERN, is_extension, load_extension, make_extension
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.link import CflibLink, check_uri, vehicle_uri
-from perchctl.mission import FlightReport, Watcher
+from perchctl.link import CflibLink, GuardedLink, VehicleLink, check_uri, vehicle_uri
+from perchctl.mission import FlightReport, Transition, Watcher, add_rows, table_of
 from perchctl.positioning import PositionFeed, load_comparison, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import CameraModel, make_pipeline
@@ -51,18 +53,32 @@ class FlyOptions:
         """True if the URI is that of the simulated vehicle."""
         return self.uri.startswith("sim://")
 
+    @property
+    def has_own_link(self) -> bool:
+        """True if the URI names your own link, as ``my_module:MyLink``."""
+        return re.match(PATTERN, self.uri) is not None
+
     def require_lift_check(self) -> None:
         require_lift_check(self.profile.positioning, self.uri, simulated=self.simulated)
 
 
 def check_options(options: FlyOptions) -> None:
     """Check the options before anything is opened. Errors: InvalidValue, UsageError."""
-    check_uri(options.uri)
+    table_of(options.profile.planner.rows)
+    if not options.has_own_link:
+        check_uri(options.uri)
+    elif load_extension(options.uri, "link.uri") and options.profile.positioning.by != "deck":
+        raise UsageError(
+            f"a link of your own, as {options.uri}, sends no positions: set positioning: deck, "
+            f"not {options.profile.positioning.by}"
+        )
     if options.profile.positioning.by == "mocap" and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
     elif options.profile.positioning.by == "mocap" and find_spec("motioncapture") is None:
         raise no_motion_capture()  # the simulated room has a capture of its own
     source = parse_source(options.source)
+    if is_extension(options.source):
+        load_extension(options.source, "camera.source")
     if source.scheme == "sim" and not options.simulated:
         raise UsageError(
             f"source {source} belongs to the simulated vehicle, but the URI is "
@@ -84,6 +100,7 @@ def fly_session(
     watch_source: Callable[[FrameSource], FrameSource] = lambda source: source,
     remarks: Callable[[], Sequence[str]] = tuple,
     before_arming: Callable[[], None] | None = None,
+    rows: Sequence[Transition] = (),
 ) -> tuple[FlightReport, float | None]:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
@@ -92,12 +109,14 @@ def fly_session(
 
     `switch` carries the operator's commands. `watch_source` may wrap the camera's source.
     `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera have
-    answered; what it raises ends the session on the ground.
+    answered; what it raises ends the session on the ground. `rows` are added to the profile's
+    table.
     """
     options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()
     camera = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, camera)
+    table = add_rows(rows, table_of(profile.planner.rows))
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()
@@ -108,19 +127,28 @@ def fly_session(
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         source = open_camera(spec, clock.now, profile.camera, size_px=camera.size_px)
         stack.callback(source.close)
+        if not (options.simulated or source.live):
+            raise UsageError(f"{source.describe()} is no live camera: a real vehicle needs one")
         source = watch_source(source)
         positioning = profile.positioning
         if simulated is not None and simulated.capture is not None:
             system, host = simulated.capture
             positioning = positioning.model_copy(update={"system": system, "host": host})
-        link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
+        link: CflibLink | GuardedLink
+        if options.has_own_link:
+            own = make_extension(uri, "link.uri", VehicleLink, clock.now, profile.link)
+            link = GuardedLink(own, clock.now)
+        else:
+            link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
             link.connect()
             if before_arming is not None:
                 before_arming()
-            positions = start_position_feed(
-                stack, link, positioning, clock, profile.safety.ground_z_m
-            )
+            positions = None
+            if isinstance(link, CflibLink):
+                positions = start_position_feed(
+                    stack, link, positioning, clock, profile.safety.ground_z_m
+                )
             switch.listening = True
             parts = FlightParts(
                 link,
@@ -132,6 +160,7 @@ def fly_session(
                 switch.read,
                 positions,
                 remarks,
+                table,
             )
             with contextlib.ExitStack() as waiting:
                 if isinstance(clock, SimulatedClock):

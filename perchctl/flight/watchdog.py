@@ -258,12 +258,15 @@ def rescue(
             return RestState.UNSEEN.value
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
+        problem: str | None = "the link fails"
+        with suppress(Exception):
+            problem = link.problem(now_s)
         newest = history.newest
         if newest is not None:
             obs = Observation(
                 t_s=now_s,
                 telemetry=newest,
-                link_problem=link.problem(now_s),
+                link_problem=problem,
                 jumped=history.jumped,
                 turned_rad=history.turned_rad,
                 position_age_s=math.inf if by_target else position_age_s(now_s),

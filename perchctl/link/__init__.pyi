@@ -6,6 +6,8 @@ from .listening import ProbeLink as ProbeLink
 from .listening import find_uris_and_problem as find_uris_and_problem
 from .mock import MockLink as MockLink
 from .mock import Radio as Radio
+from .own_link import GuardedLink as GuardedLink
 from .protocol import Link as Link
+from .protocol import VehicleLink as VehicleLink
 from .protocol import check_uri as check_uri
 from .protocol import vehicle_uri as vehicle_uri

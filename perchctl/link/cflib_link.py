@@ -24,7 +24,13 @@ from perchctl.link.crtp import (
 )
 from perchctl.link.external_position import StandingFeed, estimator_parameters, settle_estimator
 from perchctl.link.firmware import check_firmware, detected_decks, read_parameters, set_parameters
-from perchctl.link.protocol import Guard, SentCallback, check_uri, ignore_sent
+from perchctl.link.protocol import (
+    LANDING_WAIT_S,
+    Guard,
+    SentCallback,
+    check_uri,
+    ignore_sent,
+)
 from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.telemetry import LogBlocks
 from perchctl.mission import SentCommand
@@ -44,7 +50,6 @@ from perchctl.vehicle import (
 
 SILENCE_S = 1.5
 DRAIN_S = 1.0
-LANDING_WAIT_S = 6.0
 UNHEARD_S = 0.5
 """What went out so long before the vehicle was last heard is taken for lost with the link."""
 FAREWELL = RawThrust(0)
@@ -125,12 +130,8 @@ class CflibLink:
     def problem(self, now_s: float) -> str | None:
         if self.connection is not None and self.connection.lost is not None:
             return self.connection.lost
-        sender = self._sender
-        if sender is not None:
-            if sender.problem is not None:
-                return sender.problem
-            if (stuck_s := sender.stuck_s()) > HANGS_S:
-                return f"no command has gone out for {stuck_s:.1f} s"
+        if self._sender is not None and (trouble := self._sender.trouble()) is not None:
+            return trouble
         silent_s = now_s - self._blocks.last_arrival_s
         if silent_s > SILENCE_S:
             return f"nothing heard for {silent_s:.1f} s"

@@ -10,6 +10,8 @@ from perchctl.errors import InvalidValue
 from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
+LANDING_WAIT_S = 6.0
+"""How long a link that is closed waits for a vehicle that still flies."""
 SentCallback = Callable[[SentCommand], None]
 """Called with what a link sends in the loop's place; neither waits nor raises."""
 
@@ -62,6 +64,37 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Close the link, after a bounded wait until the vehicle no longer flies."""
+
+
+class VehicleLink(Protocol):
+    """Your own link. Its class is called with the loop's clock, which returns seconds, and the
+    profile's section `link`.
+
+    `telemetry` and `problem` are called in one thread, 200 times a second, `send` in another one
+    (after a hang in a new one). An error that they raise, or a call longer than 0.5 s, counts as a
+    lost link: perchctl goes on sending, and lands the vehicle.
+    """
+
+    def connect(self) -> None:
+        """Connect to a vehicle on the ground, and make it ready to fly; bounded in time. Raises
+        one of `perchctl.errors`, such as ConnectionFailed."""
+
+    def decks(self) -> tuple[str, ...]:
+        """Decks that measure the vehicle's position, by the firmware's names (bcFlow2, ...)."""
+
+    def telemetry(self) -> list[Telemetry]:
+        """The samples (`perchctl.vehicle.Telemetry`: SI, right-handed, `t_s` on the loop's clock)
+        that arrived since the last call, oldest first; at best 100 a second."""
+
+    def send(self, command: Command) -> None:
+        """Hand one command of `perchctl.vehicle` to the vehicle, about 50 times a second.
+        Without a next one it must level out by itself after 0.5 s, and stop after 2 s."""
+
+    def problem(self, now_s: float) -> str | None:
+        """None while the link works, otherwise one sentence with the cause."""
+
+    def close(self) -> None:
+        """Disconnect; called when nothing flies any more, at the latest after 6 s."""
 
 
 # --- The forms of a vehicle's URI ---

@@ -123,6 +123,12 @@ class Sender:
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
+    def trouble(self) -> str | None:
+        """A sentence on why no command goes out, else None."""
+        stuck = self.stuck_s() > HANGS_S
+        text = f"no command has gone out for {self.stuck_s():.1f} s" if stuck else None
+        return self.problem or text
+
     def drain(self, timeout_s: float) -> bool:
         """Wait until all commands are handed over; return False after `timeout_s`."""
         end_s = time.monotonic() + timeout_s

@@ -1,3 +1,4 @@
+from .context import Context as Context
 from .imu import ImuMotion as ImuMotion
 from .lander import RestState as RestState
 from .lander import step_landing as step_landing
@@ -23,4 +24,8 @@ from .state import Operator as Operator
 from .state import Outcome as Outcome
 from .state import Phase as Phase
 from .state import PlannerState as PlannerState
+from .state import Severity as Severity
 from .state import VisualInertialMotion as VisualInertialMotion
+from .table import Transition as Transition
+from .table import add_rows as add_rows
+from .table import table_of as table_of

@@ -21,6 +21,10 @@ class Context:
     """State, observation and profile of one tick: the argument of all predicates and actions.
 
     Attributes:
+        state, obs, profile: `PlannerState`, `Observation` and `Profile`; `telemetry` is the newest
+            sample, `t_s` the time on the loop's clock.
+        in_phase_s: time since the phase began; `speed_mps`: of the vehicle, in three dimensions;
+            `tilt_rad`: between its vertical axis and the world's.
         by_sight: the target itself is the positioning system.
         mismatch: error of latency or mounting that makes the target seem to move; else zero.
         height_m: above the ground that the flight started from.

@@ -69,7 +69,7 @@ class RestState(Enum):
     HELD = "something holds the vehicle away from the target; the motors are off"
     STANDS = "the vehicle stands on the floor, its motors are off"
     UNKNOWN = "the motors are off; it is not known whether the vehicle hangs or stands"
-    UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"  # they may turn
+    UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"
 
 
 LOOKED_S = 2.0  # a target far above has so long to show

@@ -84,7 +84,12 @@ def step_mission(
     """Fly one tick of the mission; `state` is None in the first tick, on the ground."""
     c = _remember(Context(state or PlannerState.on_ground(obs), obs, profile))
     row = first_transition(c, table)
-    if row is not None:
+    if row is None:
+        c = c.evolve(waits="") if c.state.waits else c
+    elif row.waits_in(c.state.phase):
+        waited_s = c.state.waited_s + c.t_s - c.state.t_s
+        c = c.evolve(waits=row.reason_text(c), waited_s=waited_s)
+    else:
         c = _enter(c, row)
         c = c.evolve(hold=hold_reason(c))
     new, command = act(c)
@@ -151,7 +156,7 @@ def _enter(c: Context, row: Transition) -> Context:
     new = c.evolve(
         phase=row.to,
         entered_s=c.t_s,
-        reason=row.reason if isinstance(row.reason, str) else row.reason(c),
+        reason=row.reason_text(c),
         row=row.name,
         severity=state.severity.escalate(row.severity),
         stop=row.stop,
@@ -160,6 +165,8 @@ def _enter(c: Context, row: Transition) -> Context:
         attempts=state.attempts + int(row.severity is Severity.BACK_OFF),
         entry_m=c.telemetry.position_m,
         entry_yaw_rad=c.telemetry.yaw_rad,
+        waits="",
+        waited_s=0.0,
         search_step_s=c.t_s,
         confirmed=0,
         pressed=pressed,

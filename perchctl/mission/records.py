@@ -67,8 +67,8 @@ class Event:
         if state.phase is not before.phase:
             entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
             events.append(cls(obs.t_s, *entered))
-        elif state.hold and not before.hold:
-            held = EventKind.HOLD, state.hold, state.phase
+        elif state.pause and not before.pause:
+            held = EventKind.HOLD, state.pause, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
             text = position_loss_text(Context(state, obs, profile))

@@ -159,26 +159,26 @@ class Observation:
     """The planner's input in one tick. Times are on the loop's clock; ages are in seconds."""
 
     t_s: float
-    telemetry: Telemetry  # the newest sample; its age is `t_s - telemetry.t_s`
-    target: TargetEstimate | None = None  # the pipeline's, at `t_s`; None before the first
-    new_frame: bool = False  # a good frame was processed in this tick
-    camera_age_s: float = 0.0  # since the last good frame arrived
-    camera_problem: str | None = None  # None, or one sentence
-    link_problem: str | None = None  # None, or one sentence
+    telemetry: Telemetry  #: the newest sample; its age is `t_s - telemetry.t_s`
+    target: TargetEstimate | None = None  #: the pipeline's, at `t_s`; None before the first
+    new_frame: bool = False  #: a good frame was processed in this tick
+    camera_age_s: float = 0.0  #: since the last good frame arrived
+    camera_problem: str | None = None  #: None, or one sentence
+    link_problem: str | None = None  #: None, or one sentence
     battery_age_s: float = 0.0
-    jumped: bool = False  # the state estimate moved farther than any flight could
-    turned_rad: float = 0.0  # step of the estimated heading beyond what a vehicle can turn
-    loop_late_s: float = 0.0  # how late this tick began
-    disagreeing_frames: int = 0  # in a row, in which the markers contradicted each other
+    jumped: bool = False  #: the state estimate moved farther than any flight could
+    turned_rad: float = 0.0  #: step of the estimated heading beyond what a vehicle can turn
+    loop_late_s: float = 0.0  #: how late this tick began
+    disagreeing_frames: int = 0  #: in a row, in which the markers contradicted each other
     operator: Operator = Operator.NONE
-    log_problem: str | None = None  # the flight log cannot be written
-    delay_s: float = 0.0  # off the frames' times beyond the profile's latency (`measured`)
-    target_refused: str | None = None  # why the last target seen is another vehicle's
-    position_age_s: float = 0.0  # of the newest external position sent; 0 where decks measure
-    position_problem: str | None = None  # why none is sent; None while they are
-    imu: ImuMotion = field(default_factory=ImuMotion)  # by all samples up to `telemetry`
-    felt: VisualInertialMotion | None = None  # sideways, as pictures and accelerometer agreed
-    mismatch: Mismatch | None = None  # between the pictures and `imu`; None while they agree
+    log_problem: str | None = None  #: the flight log cannot be written
+    delay_s: float = 0.0  #: off the frames' times beyond the profile's latency (`measured`)
+    target_refused: str | None = None  #: why the last target seen is another vehicle's
+    position_age_s: float = 0.0  #: of the newest external position sent; 0 where decks measure
+    position_problem: str | None = None  #: why none is sent; None while they are
+    imu: ImuMotion = field(default_factory=ImuMotion)  #: by all samples up to `telemetry`
+    felt: VisualInertialMotion | None = None  #: sideways, as pictures and accelerometer agreed
+    mismatch: Mismatch | None = None  #: between the pictures and `imu`; None while they agree
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ class PlannerState:
     """The planner's whole memory; `since`: from when each named condition held without a break."""
 
     phase: Phase = Phase.APPROACH
-    entered_s: float = 0.0
-    started_s: float = 0.0
+    entered_s: float = 0.0  #: begin of the phase
+    started_s: float = 0.0  #: begin of the flight
     t_s: float = 0.0
     reason: str = "start"
     row: str = ""
@@ -223,13 +223,13 @@ class PlannerState:
     stop: EmergencyStop | StopMotors | None = None  # what aborts the flight sends it
     outcome: Outcome | None = None
     since: dict[Condition, float] = field(default_factory=dict)
-    attempts: int = 0
+    attempts: int = 0  #: that have failed
     searches: int = 0
     search_step_s: float = 0.0
     confirmed: int = 0
     target_m: Array | None = None  # in the world, at the last frame that measured it
     target_spread_m: float = 0.0  # by which successive frames' targets differ
-    mount: MountingMonitor = field(default_factory=MountingMonitor)  # does the target stand still
+    mount: MountingMonitor = field(default_factory=MountingMonitor)
     ground_m: tuple[float, float, float] | None = None
     entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_yaw_rad: float = 0.0
@@ -250,10 +250,8 @@ class PlannerState:
     stale_s: float | None = None  # when there was no position from outside last
     last: Telemetry | None = None  # the newest sample that was decided on
     energy: EnergyState = field(default_factory=EnergyState)  # fitted to the battery
-    battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
-    reckoning: DeadReckoning = field(
-        default_factory=DeadReckoning
-    )  # speed and place by the accelerometer
+    battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # remaining
+    reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     reach_s: float | None = None  # within the magnet's reach since
     contact: ContactError | None = None  # as it made contact
     heading_lost: bool = False  # position control would lead away from its setpoint
@@ -269,6 +267,13 @@ class PlannerState:
     unanswered_s: float | None = None  # the thrust that is read is not what is ordered, since
     unread_s: float = -math.inf  # when that last had lasted too long
     hold: str = ""  # why the vehicle is held in place, empty when it is not
+    waits: str = ""  # why your own row keeps it in its phase, empty when none does
+    waited_s: float = 0.0  # in this phase
+
+    @property
+    def pause(self) -> str:
+        """Why the mission does not go on, by a hold or by your own row; else empty."""
+        return self.hold or self.waits
 
     @property
     def ground_z_m(self) -> float:

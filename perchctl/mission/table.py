@@ -6,9 +6,13 @@ The diagram and the table of docs/mission.md are drawn from `TABLE`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Set
+from dataclasses import dataclass, replace
+from inspect import isfunction
+from typing import TypeVar
 
+from perchctl.errors import InvalidValue
+from perchctl.extensions import error_at, load_extension
 from perchctl.mission.battery import battery_shortfall, is_short_of_charge
 from perchctl.mission.conditions import (
     SATURATED,
@@ -46,9 +50,10 @@ Reason = str | Callable[[Context], str]
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """A row of the table: from any of `phases`, when `when` holds, to the phase `to`.
+    """A row of the table: from any of `phases`, if `when` returns True, to the phase `to`.
 
-    `reason` is shown to the user; `stop` is what a transition into ABORTED sends at once.
+    `when` gets a `Context`. `reason`, a text or a function of it, is shown to the
+    user; `stop` is what a transition into ABORTED sends at once.
     """
 
     name: str
@@ -60,7 +65,14 @@ class Transition:
     outcome: Outcome | None = None
     stop: EmergencyStop | StopMotors | None = None
 
+    def waits_in(self, phase: Phase) -> bool:
+        return self.to is phase and self.severity is Severity.HOLD
 
+    def reason_text(self, c: Context) -> str:
+        return self.reason if isinstance(self.reason, str) else self.reason(c)
+
+
+T = TypeVar("T")
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
 # Where a transition applies.
@@ -578,7 +590,7 @@ TABLE: tuple[Transition, ...] = (
     back_off_row(
         "align-timeout",
         {P.ALIGN},
-        lambda c: c.in_phase_s > c.planner.align.timeout_s,
+        lambda c: c.in_phase_s - c.state.waited_s > c.planner.align.timeout_s,
         "alignment took too long",
     ),
     land_row("too-little-left", {P.ALIGN, P.RECOVER}, lacks_charge_to_begin, battery_shortfall),
@@ -727,10 +739,105 @@ TABLE: tuple[Transition, ...] = (
 
 def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
     """The first transition that applies, or None to stay. Whatever the table says, a transition
-    from a landing to a flying phase is passed over."""
-    landing = c.state.severity >= Severity.LAND
+    from a landing to a flying phase is skipped. Your own waiting row blocks the later `CONTINUE`
+    rows; it is returned if no other row applies."""
+    landing, phase = c.state.severity >= Severity.LAND, c.state.phase
+    waits: Transition | None = None
     for row in table:
         undoes = landing and row.to in FLYING_PHASES
-        if not undoes and c.state.phase in row.phases and row.when(c):
+        goes_on = waits is not None and row.severity is Severity.CONTINUE
+        if undoes or goes_on or phase not in row.phases or not row.when(c):
+            continue
+        if not row.waits_in(phase):
             return row
-    return None
+        waits = waits or row
+    return waits
+
+
+# --- Your own rows ---
+
+
+ALLOWED = frozenset(
+    (phase, row.to, row.severity)
+    for row in TABLE
+    for phase in row.phases & BEFORE_CONTACT - {row.to}
+    if row.severity >= Severity.HOLD and not row.to.is_over
+) | {(P.ALIGN, P.ALIGN, S.HOLD)}
+"""What your own row may do, by phase, next phase and severity: wait in ALIGN, or what the table
+itself does to interrupt a mission. None climbs, stops a motor, or proves a contact."""
+
+
+def add_rows(
+    rows: Iterable[Transition], table: tuple[Transition, ...] = TABLE
+) -> tuple[Transition, ...]:
+    """The table with your own rows, in their order, behind all safety rows and before the
+    mission's. Each waits in ALIGN, or leads back, to RECOVER or down, by `ALLOWED`; in COMPLETE and
+    LANDING none applies.
+
+    Raises InvalidValue for a row that may do more, is no valid `Transition`, or whose name is
+    taken; in flight, for a row whose functions raise, whereupon the vehicle lands.
+    """
+    names, own = {row.name for row in table}, list[Transition]()
+    for row in rows if isinstance(rows, Iterable) else (rows,):
+        _check_types(row)
+        if row.name in names:
+            raise InvalidValue(f"row {row.name!r}: another row has that name; rename it")
+        names.add(row.name)
+        for phase in row.phases:
+            if (phase, row.to, row.severity) not in ALLOWED:
+                may = sorted(f"{to.name} ({how.name})" for at, to, how in ALLOWED if at is phase)
+                raise InvalidValue(
+                    f"row {row.name!r} leads from {phase.name} to {row.to.name} "
+                    f"({row.severity.name}); allowed there are {', '.join(may) or 'none'}"
+                )
+        if row.stop is not None or row.outcome is not None:
+            raise InvalidValue(f"row {row.name!r} may have neither a stop nor an outcome")
+        outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
+        when, reason = _named(row.name, row.when), _named(row.name, row.reason_text)
+        phases = frozenset(row.phases)  # which cannot change in flight
+        own.append(replace(row, phases=phases, when=when, reason=reason, outcome=outcome))
+    at = next(i for i, row in enumerate(table) if row.name == "approached")
+    return (*table[:at], *own, *table[at:])
+
+
+def _check_types(row: object) -> None:
+    """Raise InvalidValue for what is no valid `Transition`."""
+    if not (
+        isinstance(row, Transition)
+        and isinstance(row.phases, Set)
+        and row.phases
+        and all(isinstance(phase, Phase) for phase in (*row.phases, row.to))
+        and isinstance(row.severity, Severity)
+        and callable(row.when)
+        and (isinstance(row.reason, str) or callable(row.reason))
+    ):
+        raise InvalidValue(
+            f"row {getattr(row, 'name', row)!r} must be a Transition: phases a set of Phase, to a "
+            f"Phase, severity a Severity, when a function, reason a text"
+        )
+
+
+def _named(name: str, function: Callable[[Context], T]) -> Callable[[Context], T]:
+    """The function of your own row; its errors name the row. Raises InvalidValue."""
+
+    def call(c: Context) -> T:
+        try:
+            return function(c)
+        except Exception as error:
+            raise InvalidValue(f"your own row {name!r} raised {error_at(error)}") from error
+
+    return call
+
+
+def table_of(name: str | None) -> tuple[Transition, ...]:
+    """The table of one flight, with the rows that a profile's `planner.rows` names: some, or a
+    function that returns some. Errors: as `add_rows`, NotFound."""
+    if name is None:
+        return TABLE
+    own = load_extension(name, "planner.rows")
+    try:
+        # A log's profile may name anything.
+        own = own() if isfunction(own) else own
+    except Exception as error:
+        raise InvalidValue(f"planner.rows: {name} raised {error_at(error)}") from error
+    return add_rows(own)

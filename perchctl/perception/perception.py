@@ -8,7 +8,7 @@ through the pipeline of `perchctl.vision` and keeps the memory that this needs.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from perchctl.camera import FrameHealth
@@ -25,6 +25,7 @@ from perchctl.perception.visual_inertial import (
 )
 from perchctl.profile import Profile
 from perchctl.vision import (
+    Attitude,
     CameraErrors,
     Frame,
     Pipeline,
@@ -46,6 +47,7 @@ class Perception:
     Attributes:
         stills: each frame is searched thoroughly, without memory of others.
         history: the vehicle's telemetry; empty where there is no vehicle.
+        attitude: the vehicle's attitude by time, instead of the history's.
         state: the pipeline's memory.
         calibration, motion: estimates, from pictures and telemetry, of latency and mounting, and
             of the vehicle's motion.
@@ -62,6 +64,7 @@ class Perception:
     motion: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     refused: str | None = None
     health: FrameHealth = field(default_factory=FrameHealth)
+    attitude: Callable[[float], Attitude | None] | None = None
     _mirrored: int = 0  # frames with the target's mirror image since one showed the target
 
     def process_fields(
@@ -75,8 +78,10 @@ class Perception:
         else:
             self.state, found = pictures(self.state, frame, self.pipeline)
         for picture in found:
-            attitude = attitude_at(self.history, picture.t_s)
-            self.state, output = step(self.state, picture, attitude, self.pipeline)
+            at = picture.t_s
+            attitude = self.attitude(at) if self.attitude else attitude_at(self.history, at)
+            run = self.pipeline.own_step or step
+            self.state, output = run(self.state, picture, attitude, self.pipeline)
             if output.detections.mirrored:
                 self._mirrored += 1
             elif output.detections.markers:

@@ -22,7 +22,8 @@ from typing import Any
 
 from perchctl.children import Channel, connect_to_parent, spawn, wait_or_kill
 from perchctl.errors import ConnectionFailed, broken_motion_capture
-from perchctl.positioning.feed import BodyPose, CaptureFrame, PositionFeed
+from perchctl.extensions import make_extension
+from perchctl.positioning.feed import BodyPose, CaptureFrame, CaptureSource, PositionFeed
 from perchctl.profile import PositioningConfig
 
 SILENT_S = 0.3
@@ -69,13 +70,19 @@ def capture_setup(config: PositioningConfig) -> CaptureSetup:
 
 def open_capture(
     config: PositioningConfig, clock: Callable[[], float] = time.monotonic
-) -> MotionCapture:
-    """The motion capture once it is connected and its first frame has come.
+) -> CaptureSource:
+    """The motion capture once it is connected and its first frame has come. Your own source,
+    ``my_module:MySource``, is called with `clock` and `config`.
 
     Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
     without an answer in `config.connect_timeout_s`.
     """
     PositionFeed.check_config(config)
+    if ":" in config.system:
+        own: CaptureSource = make_extension(
+            config.system, "positioning.system", CaptureSource, clock, config
+        )
+        return own
     return MotionCapture(capture_setup(config), config.label, config.body, clock)
 
 
@@ -231,8 +238,8 @@ def serve_parent() -> None:
         faulthandler.cancel_dump_traceback_later()
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.skip_empty)
-    except Exception as error:  # whatever the library, or the loading of its own modules, raises
-        with contextlib.suppress(OSError):  # the parent may be gone, and have caused it
+    except Exception as error:  # of the library, or of its imports
+        with contextlib.suppress(OSError):  # the parent may be gone
             channel.send(CaptureFailure(str(error) or type(error).__name__, is_loaded))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
+from perchctl.extensions import PATTERN
 from perchctl.profile.base import Section, key
 
 
@@ -186,6 +187,7 @@ class PlannerConfig(Section):
     complete: CompleteConfig = CompleteConfig()
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
+    rows: str | None = key(None, "your own transitions: `my_module:ROWS`", pattern=PATTERN)
     attempts: int = key(5, "perching attempts in all", ge=1, le=50)
     perching_time_s: float = key(120.0, "time for all attempts; then it lands", gt=0, le=1200)
     integral_per_s: float = key(0.4, "gain of the integral of the horizontal error", ge=0, le=5)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+import re
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import model_validator
+from pydantic import AfterValidator, WithJsonSchema, model_validator
 
+from perchctl.extensions import PATTERN
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 SPARE_S = 0.02
@@ -16,6 +18,18 @@ it may swing for a minute and be landed (tests/flight/test_capture_flights.py)."
 _HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"
 
 
+def _known_system(system: str) -> str:
+    if system not in SYSTEMS and re.match(PATTERN, system) is None:
+        raise ValueError(f"{system!r} is none of {', '.join(SYSTEMS)}, nor my_module:MySource")
+    return system
+
+
+SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
+System = Annotated[
+    str,
+    AfterValidator(_known_system),
+    WithJsonSchema({"anyOf": [{"enum": list(SYSTEMS)}, {"type": "string", "pattern": PATTERN}]}),
+]
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
 """Other defaults, for places that come by pictures, late and with gaps."""
 
@@ -32,8 +46,8 @@ class PositioningConfig(Section):
     """
 
     by: Literal["deck", "mocap", "target"] = key("deck", "what measures the position")
-    system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = key(
-        "vicon", "kind of motion capture"
+    system: System = key(
+        "vicon", "kind of motion capture, or your own source: `my_module:MySource`"
     )
     host: str = key("", "the capture's computer, or `NAME:PORT`", pattern=_HOST)
     body: str = key("crazyflie", "name of the vehicle's rigid body", min_length=1)
@@ -65,7 +79,7 @@ class PositioningConfig(Section):
         """Name of the position source in messages."""
         if self.by == "target":
             return "the sight of the target"
-        return f"motion capture at {self.system}:{self.host}"
+        return f"motion capture at {self.system}:{self.host}".rstrip(":")
 
     def with_method(self, by: str) -> dict[str, Any]:
         """The values with another `by`. Keys of the method that is left are dropped; but beside a

@@ -36,7 +36,9 @@ from perchctl.profile.vision import (
 class LinkConfig(Section):
     """The profile's `link`: URI, telemetry and firmware parameters."""
 
-    uri: str = key("sim://", "`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
+    uri: str = key(
+        "sim://", "`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`, `my_module:MyLink`"
+    )
     connect_timeout_s: float = key(15.0, "time limit for both tries to connect", gt=0, le=120)
     parameters: dict[str, int | float] = Field(
         default_factory=dict, description="firmware parameters, set and read back before the flight"

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from perchctl.extensions import PATTERN
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
@@ -112,7 +113,7 @@ class CameraConfig(Section):
     source: str = key(
         "sim:",
         "`camera:N`, `camera:NAME`, `rtsp://...`, `http://...`, `aideck://HOST`, "
-        "`video:FILE`, `images:DIR`, `sim:`",
+        "`video:FILE`, `images:DIR`, `sim:`, `my_module:MyCamera`",
     )
     calibration: str = key(
         "example_640x480.yaml", "file beside the profile or in `calib/`, or a full path"
@@ -248,6 +249,7 @@ class DetectorConfig(Section):
     refinement: Literal["subpix", "line"] = key(
         "line", "corners by edge lines (even if blurred or cut), or OpenCV's sub-pixel"
     )
+    own: str | None = key(None, "your own detector instead: `my_module:corners`", pattern=PATTERN)
     blurred: ClassVar[bool] = True  # with lines: looked for where blur may hide the target
     blurred_every: ClassVar[int] = 4  # ... in so many pictures of a stream without it
     cut: ClassVar[bool] = True  # with lines: measured where the picture cuts both markers

@@ -8,13 +8,16 @@ Matrices of a few numbers are multiplied by `dot`: `@` takes twice as long.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.errors import InvalidValue
+from perchctl.extensions import error_at, load_extension
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import classify_fields, separate_fields
@@ -35,27 +38,46 @@ from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
     expected_corners,
-    update_sighting,
+    update_last_pose,
     update_tracks,
 )
 from perchctl.vision.types import (
+    MARKERS,
     Attitude,
     CameraModel,
+    Detection,
     Detections,
     Frame,
+    MarkerName,
     PictureKind,
     PipelineOutput,
     PipelineState,
     Stage,
     TargetEstimate,
+    to_grey,
 )
 
 SEVERAL = "more than one target in view: the one that was tracked is followed"
 
 
+class Detector(Protocol):
+    """A function that ``detector.own`` of a profile names. It gets a grey picture (height, width),
+    and returns a dict with ``large`` and ``small``, if seen: the marker's corners (4, 2) px, top
+    left, top right, bottom right, bottom left on the paper; or a tuple of these and their standard
+    deviation, px (by default 0.5). (0, 0) is the centre of the top-left pixel."""
+
+    def __call__(self, image: NDArray[np.uint8], /) -> Mapping[str, Any]: ...
+
+
+Step = Callable[
+    [PipelineState, Frame, Attitude | None, "Pipeline"], tuple[PipelineState, PipelineOutput]
+]
+"""The signature of `step`."""
+
+
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """The pipeline's constants, made by `make_pipeline`."""
+    """The pipeline's constants, made by `make_pipeline`. `own_step` is called instead of `step`."""
 
     detector: DetectorSetup
     pose: PoseSetup
@@ -63,6 +85,8 @@ class Pipeline:
     tracks: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
+    own_detector: Detector | None = None
+    own_step: Step | None = None
 
 
 def make_pipeline(
@@ -104,6 +128,9 @@ def make_pipeline(
         ),
         kalman=profile.kalman,
         camera=camera,
+        own_detector=None
+        if profile.detector.own is None
+        else load_extension(profile.detector.own, "detector.own"),
     )
 
 
@@ -124,21 +151,26 @@ def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """The new state, and the frames to give to `step` one by one: the frame itself, or its two
-    fields in time order if the camera is interlaced."""
-    fields, found = separate_fields(state.fields, frame)
+    fields in time order if the camera is interlaced. Errors: as `step`."""
+    fields, found = separate_fields(state.fields, _grey_frame(frame, pipeline.camera))
     return replace(state, fields=fields), found
 
 
 def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Process a frame; return the new state and the frame's output.
+    """Process a frame, in grey or colour; return the new state and the frame's output. Raises
+    InvalidValue for an image that is none, or not of the calibration's size.
 
     If `attitude`, the vehicle's at the frame's time, is None, the vehicle counts as level and at
     rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
-    frame = classify_fields(frame)
-    expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
+    frame = classify_fields(_grey_frame(frame, pipeline.camera))
+    if pipeline.own_detector is not None:
+        _, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
+        detections = _own_detections(frame, pipeline.own_detector)
+        return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
+    expected, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
     # A first picture is searched by all means.
     first = state.last is None and state.rival is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
@@ -147,6 +179,39 @@ def step(
         frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
     )
     return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
+
+
+def _grey_frame(frame: Frame, camera: CameraModel) -> Frame:
+    """The frame in grey. Raises InvalidValue."""
+    grey, size_px = to_grey(frame.image), camera.size_px
+    if grey is not frame.image:
+        frame = replace(frame, image=grey, encoded=None)
+    height, width = grey.shape
+    if (width, height) != size_px:
+        raise InvalidValue(
+            f"the picture has {width}x{height} px, but the calibration was made at "
+            f"{size_px[0]}x{size_px[1]} px: calibrate the camera at this size"
+        )
+    return frame
+
+
+def _own_detections(frame: Frame, detect: Detector) -> Detections:
+    """The detections of `detect`. Raises InvalidValue for values that cannot be corners."""
+    found: dict[MarkerName, Detection] = {}
+    try:
+        for name, value in dict(detect(frame.image) or {}).items():
+            corners, sigma_px = value if isinstance(value, tuple) else (value, 0.5)
+            corners_px, sigma_px = np.asarray(corners, dtype=np.float64), float(sigma_px)
+            if name not in MARKERS or corners_px.shape != (4, 2) or not 1e-3 <= sigma_px <= 1e3:
+                raise ValueError(f"{name!r}, {corners_px.shape}, sigma {sigma_px}")
+            if np.isfinite(corners_px).all():
+                found[name] = Detection(name, corners_px, sigma_px, refined=True)
+    except Exception as error:
+        raise InvalidValue(
+            f"detector.own gave {error_at(error)}; allowed are large and small, each "
+            f"(4, 2) px, or with a sigma of 0.001 to 1000 px"
+        ) from error
+    return Detections(frame.index, frame.t_s, found.get("large"), found.get("small"))
 
 
 def step_detections(
@@ -159,8 +224,8 @@ def step_detections(
 ) -> tuple[PipelineState, PipelineOutput]:
     """Run the part of `step` after detection; `near` is the target's expected pose, `fields`
     the picture's kind."""
-    sighting, t_s = state.sighting, detections.t_s
-    normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
+    last_pose, t_s = state.last_pose, detections.t_s
+    normal = normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
     measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
 
     in_world = pipeline.kalman.frame == "world" and attitude is not None
@@ -175,7 +240,7 @@ def step_detections(
     surest = measured.surest
     sees = surest is not None and verdict.accepted
     if surest is not None and sees:
-        sighting = update_sighting(sighting, surest, attitude, pipeline.pose)
+        last_pose = update_last_pose(last_pose, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     last = state.last
     if anything and verdict.accepted:
@@ -188,7 +253,7 @@ def step_detections(
         measured=measured,
         target=target or state.target,
         last=last,
-        sighting=sighting if sees or followed.tracks else None,
+        last_pose=last_pose if sees or followed.tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
         lock=followed.lock,

@@ -162,6 +162,17 @@ def _level_pose(
     )
 
 
+def camera_covariance(pose: MarkerPose) -> Array:
+    """Return a pose's covariance (6, 6) as small turns (rad) about and shifts (m) along the
+    camera's x, y, z, without the print's errors."""
+    assert pose.camera_cov is not None
+    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
+    turns = dR.reshape(3, 3, 3) @ R.T  # of each component of the rotation vector, skew-symmetric
+    J = np.eye(6)
+    J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
+    return np.asarray(J @ pose.camera_cov @ J.T)
+
+
 def rotation_matrix(rvec: Array) -> Array:
     """The rotation matrix (3, 3) of a rotation vector (3,) rad."""
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)

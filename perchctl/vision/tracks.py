@@ -26,6 +26,7 @@ from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rota
 from perchctl.vision.target_selection import OwnTargetPlace, refusal_text, track_measurement
 from perchctl.vision.types import (
     Attitude,
+    LastPose,
     Lock,
     MarkerName,
     MarkerPose,
@@ -33,7 +34,6 @@ from perchctl.vision.types import (
     MeasuredMarkers,
     PipelineState,
     RivalTrack,
-    Sighting,
 )
 
 
@@ -358,12 +358,12 @@ _FORGOTTEN = 0.1  # of what was learned, with each picture
 
 
 def expected_corners(
-    sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
+    sight: LastPose | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Both markers' expected corners, (4, 2) px, and the target's expected pose: the last
-    sighting, moved by the vehicle's motion.
+    """Both markers' expected corners, (4, 2) px, and the target's expected pose: the last pose,
+    moved by the vehicle's motion.
 
-    Without both attitudes: None and the unmoved pose; without a recent sighting: both None."""
+    Without both attitudes: None and the unmoved pose; without a recent pose: both None."""
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude
@@ -386,15 +386,15 @@ def expected_corners(
     return {"large": corners[:4], "small": corners[4:]}, moved
 
 
-def update_sighting(
-    before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
-) -> Sighting:
-    """The sighting of a new pose, with the errors of the estimated motion since `before`."""
+def update_last_pose(
+    before: LastPose | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
+) -> LastPose:
+    """The record of a new pose, with the errors of the estimated motion since `before`."""
     if before is None:
-        return Sighting(pose, attitude)
+        return LastPose(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
     if attitude is None or then is None or not 0.0 < passed_s <= MAX_TRACK_GAP_S:
-        return Sighting(pose, attitude, before.error_rad2)
+        return LastPose(pose, attitude, before.error_rad2)
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the view: along it a far target's own distance is vague.
@@ -406,7 +406,7 @@ def update_sighting(
         old + _FORGOTTEN * (float(new.dot(new)) - old)
         for old, new in zip(before.error_rad2, off, strict=True)
     )
-    return Sighting(pose, attitude, (by_place, by_speed))
+    return LastPose(pose, attitude, (by_place, by_speed))
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 
 MarkerName = Literal["large", "small"]
@@ -54,7 +56,7 @@ class Frame:
     """One picture. `t_s` is the time of exposure on the loop's clock, as far as
     known: time of arrival less the profile's `camera.latency_s`.
 
-    `image` is grey, uint8, shape (height, width).
+    `image` is grey, uint8, shape (height, width); `step` also takes BGR, (height, width, 3).
 
     `fields` is the picture's kind: ``whole``, of one moment; ``woven`` of two fields; a woven
     picture's ``top`` or ``bottom`` field at full height; None: not classified yet
@@ -70,6 +72,29 @@ class Frame:
     fields: PictureKind | None = None
     repeated: bool = False
     encoded: bytes | None = None
+
+
+def to_grey(image: Any) -> NDArray[np.uint8]:
+    """A contiguous 8-bit grey picture, (height, width), of an array in grey, BGR or BGRA, 8 or 16
+    bits. Raises InvalidValue for anything else."""
+    if image is None:
+        raise InvalidValue("the picture is None: cv2.imread returns it for what is no picture")
+    shape: tuple[int, ...] = getattr(image, "shape", ())
+    kind = getattr(image, "dtype", None)
+    is_picture = len(shape) == 2 or (len(shape) == 3 and shape[2] in (1, 3, 4))
+    is_array = isinstance(image, np.ndarray) and kind in (np.uint8, np.uint16)
+    if not (is_array and is_picture) or 0 in shape:
+        found = type(image).__name__ if kind is None else f"{kind} of shape {shape}"
+        raise InvalidValue(
+            f"a picture must be a numpy array of uint8, (height, width) in grey or (height, width, "
+            f"3) in BGR; found {found}"
+        )
+    if kind == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    if len(shape) == 3:
+        codes = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+        image = cv2.cvtColor(image, codes[shape[2]]) if shape[2] in codes else image[:, :, 0]
+    return np.ascontiguousarray(image, np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +281,7 @@ class TargetEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class LastPose:
     """A pose of the target and the vehicle's attitude at that time, if it was known.
 
     `error_rad2` holds recent mean square errors of the vehicle's estimated motion, as angles seen
@@ -335,7 +360,7 @@ class PipelineState:
     measured: MeasuredMarkers = MeasuredMarkers()  # of the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last: Detections | None = None
-    sighting: Sighting | None = None  # the last
+    last_pose: LastPose | None = None  # the last
     disagreeing_frames: int = 0
     empty_frames: int = 0  # in a row, without either marker
     lock: Lock | None = None

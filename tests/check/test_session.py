@@ -41,6 +41,12 @@ def test_a_library_that_does_not_load_ends_the_check_as_it_ends_a_flight() -> No
     assert refused.value.exit_code == 2
 
 
+def test_a_link_of_your_own_is_not_asked_by_cflib(tmp_path: Path) -> None:
+    (tmp_path / "my_link.py").write_text("Link = object\n")
+    with pytest.raises(UsageError, match="not through your own link my_link:Link"):
+        next(check(options("my_link:Link"), CheckScope(**QUICK)))
+
+
 # --- What goes out ----------------------------------------------------------------------
 
 

@@ -188,6 +188,14 @@ def test_a_vehicle_that_may_not_fly_or_is_not_ready_in_time_is_refused(
         (Vehicle(lambda sample: None), Camera(), TimedOut, "telemetry", 10.0),
         (Vehicle(), NO_PICTURE, TimedOut, "picture .none has come", 8.0),
         (Vehicle(), Camera(lambda f: replace(f, t_s=f.t_s - 5.0)), TimedOut, "5.* s late", 8.0),
+        (Vehicle(), Camera(lambda f: replace(f, t_s=f.t_s + 0.2)), TimedOut, "is not past", 8.0),
+        (
+            Vehicle(),
+            Camera(lambda f: replace(f, t_s=math.nan)),
+            TimedOut,
+            "nan s, is not past",
+            8.0,
+        ),
         # Against the ceiling the camera is dark.
         (Vehicle(lambda s: replace(s, position_m=HANGS)), NO_PICTURE, SafetyAbort, "hangs", 0.0),
         (Vehicle(), Camera(size_px=(320, 240)), InvalidValue, "320x240.*64x48", 0.0),

@@ -81,10 +81,10 @@ def test_each_turn_is_told_once_and_in_order(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the landing; a replay demands that deciding on it raises again."""
 
-    def fails(state: PlannerState, obs: Observation, profile: Profile) -> Any:
+    def fails(state: PlannerState, obs: Observation, profile: Profile, *table: Any) -> Any:
         if obs.t_s > BREAKS_S:
             raise ZeroDivisionError("by the test")
-        return step_mission(state, obs, profile)
+        return step_mission(state, obs, profile, *table)
 
     plan_by(monkeypatch, fails)
     rig = Rig()

@@ -20,7 +20,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
 from perchctl.link import CflibLink, ProbeLink
-from perchctl.link.cflib_link import LANDING_WAIT_S
+from perchctl.link.protocol import LANDING_WAIT_S
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario, SimProcess

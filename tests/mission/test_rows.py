@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from perchctl.errors import InvalidValue, PerchError
 from perchctl.mission import (
     ContactError,
     ImuMotion,
@@ -19,8 +23,15 @@ from perchctl.mission import (
     planner,
 )
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountingMonitor
-from perchctl.mission.state import FLYING_PHASES, Severity
-from perchctl.mission.table import TABLE, Transition, first_transition
+from perchctl.mission.state import FLYING_PHASES, Condition, Severity
+from perchctl.mission.table import (
+    ALLOWED,
+    TABLE,
+    Transition,
+    add_rows,
+    first_transition,
+    table_of,
+)
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -343,6 +354,105 @@ def test_no_row_undoes_a_landing() -> None:
     assert first_transition(context, (ROGUE,)) is None
     flying = planner.Context(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
     assert first_transition(flying, (ROGUE,)) is ROGUE
+
+
+# --- Your own rows ------------------------------------------------
+
+
+MINE = Transition("mine", {P.ALIGN}, lambda c: True, P.LANDING, "enough", Severity.LAND)
+
+
+def test_a_row_of_your_own_comes_after_every_safety_row() -> None:
+    back = Transition("back", {P.PERCH}, bool, P.RECOVER, "", Severity.BACK_OFF)
+    table = add_rows([MINE, back])
+    at = table.index(next(row for row in table if row.name == "mine"))
+    names = [row.name for row in table[at - 1 : at + 3]]
+    assert names == ["too-weak", "mine", "back", "approached"]
+    assert tuple(row for row in table if row.name not in ("mine", "back")) == TABLE
+    assert table[at].outcome is Outcome.SAFETY
+    stopped = replace(observation(BEGIN_S), operator=Operator.LAND)
+    for obs, name in ((observation(BEGIN_S), "mine"), (stopped, "operator-land")):
+        row = first_transition(planner.Context(state_in(P.ALIGN), obs, PROFILE), table)
+        assert row is not None
+        assert row.name == name
+
+
+def test_the_phases_of_a_row_cannot_grow_in_flight() -> None:
+    phases = {P.ALIGN}
+    table = add_rows([replace(MINE, phases=phases)])
+    phases.add(P.COMPLETE)
+    assert next(row for row in table if row.name == "mine").phases == {P.ALIGN}
+
+
+def test_no_row_of_your_own_may_climb_stop_or_prove() -> None:
+    assert {to for _, to, _ in ALLOWED} == {P.SEARCH, P.ALIGN, P.RECOVER, P.LANDING}
+    assert all(how >= Severity.HOLD for *_, how in ALLOWED)
+    assert [at for at, to, _ in ALLOWED if at is to] == [P.ALIGN]  # where it waits
+    assert {at for at, _, _ in ALLOWED} == FLYING_PHASES - {P.COMPLETE}
+
+
+@pytest.mark.parametrize("change", [
+    {"to": P.PERCH}, {"to": P.ASCEND}, {"to": P.PERCHED}, {"to": P.ABORTED}, {"to": P.SEARCH},
+    {"severity": Severity.CONTINUE}, {"severity": Severity.STOP}, {"phases": {P.COMPLETE}},
+    {"phases": {P.LANDING}}, {"stop": StopMotors()}, {"outcome": Outcome.PERCHED},
+    {"outcome": Outcome.OPERATOR}, {"phases": set()}, {"phases": iter([P.ALIGN])}, {"reason": None},
+    {"name": "fence"}, {"phases": {"ALIGN"}}, {"phases": P.ALIGN}, {"to": "LANDING"},
+    {"severity": 3}, {"when": True},
+])  # fmt: skip
+def test_a_row_of_your_own_that_may_do_more_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(InvalidValue, match=r"row '(mine|fence)'"):
+        add_rows([replace(MINE, **change)])
+
+
+def test_two_rows_of_your_own_have_two_names() -> None:
+    for rows in ([MINE, MINE], 3, ["mine"]):
+        with pytest.raises(InvalidValue, match="row"):
+            add_rows(rows)  # type: ignore[arg-type]
+
+
+WAIT = Transition("wait", {P.ALIGN}, lambda c: c.t_s < 50.0, P.ALIGN, "mine", Severity.HOLD)
+
+
+def test_a_row_of_your_own_waits_in_the_alignment() -> None:
+    """It stays aligned and does not go on, the wait does not count, and other rows still act."""
+    table = add_rows([WAIT])
+    state = waiting = replace(state_in(P.ALIGN), since={Condition.ALIGNED: 10.0})
+    for t_s in range(11, 50):
+        waiting, command = planner.step_mission(waiting, observation(t_s), PROFILE, table)
+    assert (waiting.phase, waiting.pause, waiting.hold) == (P.ALIGN, "mine", "")
+    assert isinstance(command, PositionSetpoint)
+    assert waiting.waited_s == 39.0 > PROFILE.planner.align.timeout_s
+    after = waiting
+    for tick in range(25):
+        after, _ = planner.step_mission(after, observation(50.0 + TICK_S * tick), PROFILE, table)
+    assert (after.phase, after.pause, after.waited_s) == (P.ASCEND, "", 0.0)
+    lost = observation(11.0, target=None)
+    assert planner.step_mission(state, lost, PROFILE, table)[0].phase is P.SEARCH
+    stopped = observation(11.0, operator=Operator.LAND)
+    assert planner.step_mission(state, stopped, PROFILE, table)[0].phase is P.LANDING
+
+
+def test_a_profile_names_rows_or_a_function_that_makes_them_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    module: Any = ModuleType("my_rows")
+    module.ROWS, module.make, module.fails, module.clock = [MINE], lambda: [MINE], bool, time.time
+    monkeypatch.setitem(sys.modules, "my_rows", module)
+    for name in ("ROWS", "make"):
+        assert [row.name for row in table_of(f"my_rows:{name}") if row.name == "mine"] == ["mine"]
+    module.fails = lambda: 1 / 0
+    for name, words in (("fails", "ZeroDivisionError"), ("clock", "must be"), ("none", "no none")):
+        with pytest.raises(PerchError, match=words):
+            table_of(f"my_rows:{name}")
+
+
+@pytest.mark.parametrize("change", [
+    {"when": lambda c: 1 / 0}, {"when": lambda c: True, "reason": lambda c: 1 / 0},
+])  # fmt: skip
+def test_an_error_of_a_row_of_your_own_names_the_row(change: dict[str, Any]) -> None:
+    table = add_rows([replace(MINE, **change)])
+    with pytest.raises(InvalidValue, match="your own row 'mine' raised ZeroDivisionError"):
+        planner.step_mission(state_in(P.ALIGN), observation(BEGIN_S), PROFILE, table)
 
 
 @pytest.mark.parametrize("below_m", [0.1, 0.0])

@@ -225,6 +225,35 @@ def test_the_real_library_through_its_process() -> None:
     assert places[0].position_m == pytest.approx((1.0, 2.0, 3.0))
 
 
+def test_your_own_source_feeds_the_vehicle_its_positions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As every capture: turned into body axes, and refused once it stands still."""
+    (tmp_path / "my_capture.py").write_text(
+        "from perchctl import BodyPose, CaptureFrame\n"
+        "class Source:\n"
+        "    def __init__(self, clock, config): self.start_s = clock()\n"
+        "    def poll(self, now_s):\n"
+        "        x_m = min(now_s - self.start_s, 1.0)\n"
+        "        pose = BodyPose((x_m, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))\n"
+        "        return CaptureFrame(now_s, {'cf': pose})\n"
+        "    def problem(self, now_s): return None\n"
+        "    def close(self): pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    config = PositioningConfig(by="mocap", system="my_capture:Source", body="cf")
+    places: list[ExternalPosition] = []
+    feed = PositionFeed(open_capture(config, lambda: 5.0), places.append, config)
+    for turn in range(101):
+        feed.poll_and_send(5.0 + 0.01 * turn)
+    assert feed.status(6.0).problem is None
+    assert places[-1].position_m == pytest.approx((1.0, 2.0, 3.0), abs=0.05)
+    for turn in range(101, 301):
+        feed.poll_and_send(5.0 + 0.01 * turn)
+    assert "frozen" in (feed.status(8.0).problem or "")
+    assert places[-1].position_m[0] == pytest.approx(1.0, abs=0.02)
+
+
 # --- The reader's process: it ends with its parent, and not before -----------------------------
 
 

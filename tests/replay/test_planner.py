@@ -74,8 +74,8 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     """And passes a log of version 3, which does not hold it."""
     step = step_mission
 
-    def says_otherwise(state: Any, obs: Any, profile: Any) -> Any:
-        new, command = step(state, obs, profile)
+    def says_otherwise(state: Any, obs: Any, profile: Any, table: Any) -> Any:
+        new, command = step(state, obs, profile, table)
         return replace(new, reason=new.reason.replace("hovering", "hanging")), command
 
     log, old = corpus("hung"), corpus("perched")

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.track import Tracker, TrackSummary, poll_until_stopped
+from perchctl.commands.track import TrackSummary, poll_until_stopped
 from perchctl.errors import InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
+from perchctl.sighting import Tracker
 from perchctl.vision import Frame, project, square_corners
 from tests.helpers.commands import run
 from tests.helpers.interlaced import Pass
@@ -268,16 +269,17 @@ def tracker(profile: Profile | None = None, live: bool = True, stills: bool = Fa
 
 def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     image, live = picture(VIEWS["both"]), tracker()
-    [first] = live.process(Frame(0, 0.0, image), 0)
-    assert first.stage == "both"
-    assert live.process(Frame(1, 0.03, image), 1) == []
-    [frozen] = live.process(Frame(2, 1.0, image), 2)
-    assert (frozen.stage, frozen.target) == ("none", None)
-    assert frozen.notes == ("the picture stands still",)
+    [(_, first, _)] = live.process(Frame(0, 0.0, image))
+    assert first is not None
+    assert first.stage.value == "both"
+    assert list(live.process(Frame(1, 0.03, image))) == []
+    assert [seen[1:] for seen in live.process(Frame(2, 1.0, image))] == [
+        (None, ["the picture stands still"])
+    ]
     noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)
-    [snow] = live.process(Frame(3, 1.1, noise), 3)
-    assert (snow.stage, snow.output) == ("none", None)
-    assert "snow" in snow.notes[0]
+    [(_, output, notes)] = live.process(Frame(3, 1.1, noise))
+    assert output is None
+    assert "snow" in notes[0]
 
 
 def test_markers_that_contradict_are_named() -> None:
@@ -285,8 +287,8 @@ def test_markers_that_contradict_are_named() -> None:
     small = sim.target.small.model_copy(update={"side_m": 0.032})
     target = sim.target.model_copy(update={"small": small})
     doubting = tracker(sim.model_copy(update={"target": target}), live=False, stills=True)
-    [seen] = doubting.process(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))), 0)
-    assert [note.partition(":")[0] for note in seen.notes] == ["the two markers contradict"]
+    [(*_, notes)] = doubting.process(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))))
+    assert [note.partition(":")[0] for note in notes] == ["the two markers contradict"]
 
 
 def test_a_live_source_is_waited_for_and_its_end_is_told(

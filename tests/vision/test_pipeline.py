@@ -42,8 +42,8 @@ from perchctl.vision import (
     estimate,
     step,
 )
-from perchctl.vision.tracks import expected_corners, update_sighting
-from perchctl.vision.types import Sighting, Stage
+from perchctl.vision.tracks import expected_corners, update_last_pose
+from perchctl.vision.types import LastPose, Stage
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Build = Callable[..., Pipeline]
@@ -246,7 +246,7 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
     setup = build(mount=MOUNT, gear_body_m=GEAR)
     then, now = fly(0), fly(6)  # far, and turned, within one gap
     _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
-    sight = Sighting(output.poses["joint"], then)
+    sight = LastPose(output.poses["joint"], then)
     expected, near = expected_corners(sight, now.t_s, now, setup.pose)
     _, later = step(PipelineState(), Frame(1, now.t_s, view(now)), now, setup)
     for name in ("large", "small"):
@@ -301,7 +301,7 @@ class Flight:
 
 def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[float]:
     """By how much the large marker's corners are expected in the wrong place, by frame."""
-    sight: Sighting | None = None
+    sight: LastPose | None = None
     for k in range(frames):
         attitude, pose = flight.at(k * FRAME_S)
         if not told:
@@ -311,7 +311,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
             points = SETUP.corners_m["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())
-        sight = update_sighting(sight, pose, attitude, SETUP)
+        sight = update_last_pose(sight, pose, attitude, SETUP)
 
 
 def rms(values: list[float]) -> float:

@@ -16,6 +16,7 @@ from perchctl.vision import (
     Frame,
     MarkerPose,
     PipelineOutput,
+    camera_covariance,
     camera_profile,
     make_pipeline,
 )
@@ -61,11 +62,8 @@ def _best_pose(output: PipelineOutput, t_s: float) -> TargetPose | None:
     pose = output.poses.get("joint") or min(output.poses.values(), key=_uncertainty, default=None)
     if pose is None or pose.camera_cov is None or not np.isfinite(pose.camera_cov).all():
         return None
-    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
-    turns = dR.reshape(3, 3, 3) @ R.T  # of each component of the rotation vector, skew-symmetric
-    J = np.eye(6)
-    J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
-    return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, J @ pose.camera_cov @ J.T)
+    R = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0], dtype=np.float64)
+    return TargetPose(t_s, R @ R_MARKER_TARGET, pose.tvec_m, camera_covariance(pose))
 
 
 def _uncertainty(pose: MarkerPose) -> float:

@@ -42,7 +42,7 @@ class Firmware:
     def __init__(self, world: World, scenario: Scenario) -> None:
         self.world = world
         self.scenario = scenario
-        self.log_overrides: dict[str, float] = {}  # what a fault makes of log variables
+        self.log_overrides: dict[str, float] = {}  # set by a fault
         self.reboot()
 
     def reboot(self) -> None:

@@ -1,0 +1,93 @@
+"""Your own code that a profile names, as ``my_module:MyCamera``: found, made and checked."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import sys
+import traceback
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from perchctl.errors import InvalidValue, NotFound, PerchError
+
+PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
+"""A module, dotted if it is in a package; a colon; a name in it."""
+_PACKAGE = Path(__file__).parent
+
+
+def is_extension(text: str) -> bool:
+    """True for ``my_module:MyCamera`` whose module is there; nothing is loaded."""
+    if re.match(PATTERN, text) is None:
+        return False
+    _search_here()
+    package = re.split("[.:]", text)[0]
+    return package in sys.modules or find_spec(package) is not None
+
+
+def load_extension(text: str, key: str) -> Any:
+    """The class, function or value that ``my_module:name`` of a profile's `key` names. Modules are
+    searched among the installed ones, then in the current folder.
+
+    Raises:
+        NotFound: no such module, or no such name in it. InvalidValue: its import raised.
+    """
+    module_name, _, name = text.partition(":")
+    _search_here()
+    try:
+        module = import_module(module_name)
+    except Exception as error:
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing and f"{module_name}.".startswith(f"{missing}."):
+            raise NotFound(
+                f"{key}: there is no module {missing}: install it, or start perchctl in its folder "
+                f"(now {Path.cwd()})"
+            ) from None
+        raise InvalidValue(f"{key}: importing {module_name} raised {error_at(error)}") from error
+    if not hasattr(module, name):
+        close = difflib.get_close_matches(name, vars(module), 1)
+        meant = f": did you mean {close[0]}?" if close else ""
+        raise NotFound(f"{key}: module {module_name} has no {name}{meant}")
+    return getattr(module, name)
+
+
+def make_extension(
+    text: str, key: str, protocol: type, clock: Callable[[], float], config: object
+) -> Any:
+    """A new object of the class that ``my_module:MyCamera`` names.
+
+    Raises:
+        NotFound: as `load_extension`. InvalidValue: as `load_extension`; the class raised; or the
+        object lacks something that `protocol` has.
+    """
+    kind = load_extension(text, key)
+    try:
+        made = kind(clock, config)
+    except PerchError:
+        raise
+    except Exception as error:
+        what = f"{text}(clock, {type(config).__name__}) raised {error_at(error)}"
+        raise InvalidValue(f"{key}: {what}") from error
+    lacks = [name for name in vars(protocol) if name[0] != "_" and not hasattr(made, name)]
+    if lacks:
+        needs = f"which a perchctl.{protocol.__name__} has"
+        raise InvalidValue(f"{key}: {text} lacks {', '.join(sorted(lacks))}, {needs}")
+    return made
+
+
+def error_at(error: BaseException) -> str:
+    """Class and text of an error, and the last line outside perchctl that it passed."""
+    frames = traceback.extract_tb(error.__traceback__)
+    yours = [frame for frame in frames if _PACKAGE not in Path(frame.filename).parents]
+    place = f" ({Path(yours[-1].filename).name}, line {yours[-1].lineno})" if yours else ""
+    return f"{type(error).__name__}: {error}{place}"
+
+
+def _search_here() -> None:
+    """Search the current folder for modules, too, but last, so that no library is replaced."""
+    here = str(Path.cwd())
+    if here not in sys.path and "" not in sys.path:
+        sys.path.append(here)

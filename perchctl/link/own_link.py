@@ -1,0 +1,111 @@
+"""Your own link to a vehicle, in threads that keep its errors and hangs away from the flight."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from perchctl.extensions import error_at
+from perchctl.link.protocol import LANDING_WAIT_S, Guard, SentCallback, VehicleLink, ignore_sent
+from perchctl.link.sender import HANGS_S, Sender
+from perchctl.vehicle import Command, ExternalPosition, Idle, Telemetry, may_be_flying
+
+READ_PERIOD_S = 0.005
+AHEAD_S = 0.1
+"""A sample may be so much ahead of the loop's clock; else it is of another clock."""
+
+
+class GuardedLink:
+    """`perchctl.link.protocol.Link` around your own link.
+
+    A reader thread asks it for telemetry and problems, and the `Sender`'s threads hand it commands
+    and ask the watchdog, so nothing waits for a call of it that hangs. An error that it raises, an
+    invalid sample, or a call longer than `HANGS_S` counts as a lost link.
+    """
+
+    def __init__(self, inner: VehicleLink, clock: Callable[[], float]) -> None:
+        self._inner, self._clock, self.decks = inner, clock, inner.decks
+        self._lock = threading.Lock()
+        self._waiting: list[Telemetry] = []  # that the loop has not taken yet
+        self._newest: Telemetry | None = None
+        self._failure: str | None = None  # permanent
+        self._trouble: str | None = None  # the link's own word, of the last round
+        self._answered_s: float | None = None  # end of the reader's last round
+        self._send_error = ""  # of the last command
+        self._closing = threading.Event()
+        self._guard: Guard | None = None
+        self._on_sent: SentCallback = ignore_sent
+        self._sender = Sender(self._hand_over, self._ask, clock, lambda sent: self._on_sent(sent))
+
+    def connect(self) -> None:
+        self._inner.connect()
+        self._answered_s = self._clock()
+        threading.Thread(target=self._read, name="perchctl-own-link", daemon=True).start()
+
+    def telemetry(self) -> list[Telemetry]:
+        with self._lock:
+            samples, self._waiting = self._waiting, []
+        return samples
+
+    def send(self, command: Command) -> None:
+        if not isinstance(command, Idle):
+            self._sender.put(command)
+
+    def send_external(self, place: ExternalPosition) -> bool:
+        return False
+
+    def problem(self, now_s: float) -> str | None:
+        silent_s = 0.0 if self._answered_s is None else now_s - self._answered_s
+        hangs = f"telemetry() has not returned for {silent_s:.1f} s" if silent_s > HANGS_S else None
+        stuck = self._sender.trouble()
+        stuck = stuck and f"{stuck}{self._send_error}"
+        return self._failure or stuck or hangs or self._trouble
+
+    def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
+        self._guard, self._on_sent = guard, on_sent
+
+    def close(self) -> None:
+        """Wait, bounded, until nothing flies, and close the inner link."""
+        self._sender.drain(1.0)
+        end_s = time.monotonic() + (0.0 if self._answered_s is None else LANDING_WAIT_S)
+        while may_be_flying(self._newest, self._clock()) and time.monotonic() < end_s:
+            time.sleep(0.05)
+        self._closing.set()
+        self._sender.stop()
+        with suppress(Exception):  # the flight is over, and its report counts
+            self._inner.close()
+
+    def _hand_over(self, command: Command) -> None:
+        try:
+            self._inner.send(command)
+        except BaseException as error:  # SystemExit would end the sender's thread
+            self._send_error = f": send() raised {error_at(error)}"
+            raise RuntimeError from error  # the sender tries again
+        self._send_error = ""
+
+    def _ask(self) -> Command | None:
+        with self._lock:
+            newest, waiting = self._newest, tuple(self._waiting)
+        return None if self._guard is None else self._guard(self._clock(), newest, waiting)
+
+    def _read(self) -> None:
+        """Ask until the link is closed, after an error too: a landing needs the telemetry."""
+        while not self._closing.wait(READ_PERIOD_S):
+            try:
+                samples = [self._checked(sample) for sample in self._inner.telemetry()]
+                with self._lock:
+                    self._waiting += samples
+                    self._newest = samples[-1] if samples else self._newest
+                self._trouble = self._inner.problem(self._clock())
+            except BaseException as error:
+                self._failure = f"telemetry() or problem() raised {error_at(error)}"
+            self._answered_s = self._clock()
+
+    def _checked(self, sample: object) -> Telemetry:
+        if not isinstance(sample, Telemetry):
+            raise TypeError(f"a sample must be a Telemetry, not {type(sample).__name__}")
+        if not sample.t_s <= self._clock() + AHEAD_S:
+            raise ValueError(f"a sample's t_s must be a past time, not {sample.t_s}")
+        return sample

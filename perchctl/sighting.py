@@ -1,0 +1,273 @@
+"""The target's pose in each picture of any source, without a vehicle."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perchctl.calibration import load_calibration
+from perchctl.camera import (
+    VERDICT_TEXTS,
+    FrameSource,
+    WrappedSource,
+    check_size,
+    mirrored_note,
+    open_camera,
+    parse_source,
+    unmirror_frame,
+)
+from perchctl.errors import ConnectionFailed, InvalidValue, Note, require_type
+from perchctl.geometry import R_MARKER_TARGET, Array, make_T
+from perchctl.perception import Perception
+from perchctl.places import is_shipped_example
+from perchctl.profile import Profile, find_calibration, load_profile
+from perchctl.values import replace
+from perchctl.vision import (
+    Attitude,
+    CameraModel,
+    Detection,
+    Frame,
+    Pipeline,
+    PipelineOutput,
+    PipelineState,
+    camera_covariance,
+    camera_profile,
+    make_pipeline,
+    to_grey,
+)
+
+POLL_S, SILENT_S = 0.002, 2.0
+INTERLACED = "interlaced: each field of a frame is measured separately"
+_DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
+AttitudeAt = Callable[[float], Attitude | None]
+Named = tuple[Frame, str | None]
+"""A frame, and its file's name if it has one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The target in one picture; frames and signs are those of docs/conventions.md.
+
+    Attributes:
+        index: number of the picture in its source, from 0.
+        t_s: time of exposure, s; of a live source by `time.monotonic`.
+        name: the picture's file name, or None.
+        markers: the detected ones of ``large`` and ``small``: `corners_px` (4, 2), top left, top
+            right, bottom right, bottom left on the paper; `sigma_px`, their standard deviation.
+        T_cam_target: pose of the target in the camera frame, (4, 4), m, by this picture alone; None
+            without an accepted pose.
+        covariance: of that pose, (6, 6), in ROS's order: shifts along the camera's x, y, z (m),
+            then small rotations about the camera's x, y, z (rad); None without a pose.
+        T_level_target: pose in the level frame, from the vehicle's centre, (4, 4), m, by
+            `camera.mount`; None without a pose or an attitude.
+        note: what is wrong with the picture or the target; else empty.
+    """
+
+    index: int
+    t_s: float
+    name: str | None
+    markers: Mapping[Any, Detection]
+    T_cam_target: Array | None = None
+    covariance: Array | None = None
+    T_level_target: Array | None = None
+    note: str = ""
+
+
+def track(
+    source: str | Path | FrameSource | Iterable[Any],
+    profile: Profile | Path | str = "sim",
+    calibration: CameraModel | Path | str | None = None,
+    *,
+    attitude: Attitude | AttitudeAt | None = None,
+    rate_hz: float | None = None,
+) -> Iterator[Sighting]:
+    """Yield a `Sighting` for each picture of a source, or for each field of an interlaced one.
+
+    Args:
+        source: a text that `perchctl track` takes, such as ``camera:0``, ``video:flight.mp4`` or
+            ``images:pictures``; an open `FrameSource`; or an iterable of `Frame` or of arrays,
+            uint8, (height, width) in grey or (height, width, 3) in BGR.
+        profile: the target's sizes, and how it is measured; a profile, its name or its file.
+        calibration: the camera's, or its file; that of the profile by default.
+        attitude: the vehicle's attitude, or a function that returns it for a frame's `t_s`; for
+            `T_level_target`.
+        rate_hz: of arrays that are a stream. Without it, and from ``images:``, each picture is
+            searched by itself, thoroughly.
+
+    Raises:
+        NotFound: no such source, profile or calibration. InvalidValue: None instead of a picture, a
+        wrong type, shape, size or number. ConnectionFailed: a live source fell silent.
+    """
+    profile = load_profile(profile)
+    if calibration is None:
+        calibration = find_calibration(profile.camera.calibration)
+        if is_shipped_example(calibration) and source != "sim:":
+            what = f"{calibration.name} is the example calibration: give yours"
+            warnings.warn(what, Note, stacklevel=2)
+    require_type("calibration", calibration, CameraModel, Path, str)
+    camera = calibration if isinstance(calibration, CameraModel) else load_calibration(calibration)
+    if rate_hz is not None and not 0.0 < rate_hz < math.inf:
+        raise InvalidValue(f"rate_hz must be positive, found {rate_hz}")
+    stills = rate_hz is None
+    if isinstance(source, str | Path):
+        source = str(source)
+        stills = parse_source(source).scheme == "images"
+    elif isinstance(source, FrameSource):
+        stills = False
+    elif not isinstance(source, Iterable) or isinstance(source, np.ndarray):
+        raise InvalidValue(
+            f"a source is a text such as camera:0, a FrameSource, or pictures, as in "
+            f"track([picture]); found {type(source).__name__}"
+        )
+    at = None if attitude is None else partial(_attitude_at, attitude)
+    return _sightings(source, profile, camera, at, stills, rate_hz or 1.0)
+
+
+def _attitude_at(attitude: Attitude | AttitudeAt, t_s: float) -> Attitude | None:
+    found = attitude(t_s) if callable(attitude) else attitude
+    if found is None:
+        return None
+    require_type("the attitude", found, Attitude)
+    if not np.isfinite(found.R_level_body).all():
+        raise InvalidValue(f"the attitude at {t_s} s is not finite: {found}")
+    return found
+
+
+def _sightings(
+    source: str | FrameSource | Iterable[Any],
+    profile: Profile,
+    camera: CameraModel,
+    attitude: AttitudeAt | None,
+    stills: bool,
+    rate_hz: float,
+) -> Iterator[Sighting]:
+    with contextlib.ExitStack() as stack:
+        if isinstance(source, str):
+            source = open_camera(source, config=profile.camera, size_px=camera.size_px)
+            stack.callback(source.close)
+        if isinstance(source, FrameSource):
+            live, frames = source.live, _polled(source, camera)
+        else:
+            live, frames = False, _numbered(source, rate_hz)
+        # `open_camera` has turned the pictures already, if it has the profile's section.
+        turns = profile.camera.mirrored and not isinstance(source, WrappedSource)
+        tracker = Tracker(profile, camera, live=live, stills=stills, attitude=attitude)
+        for frame, name in frames:
+            right = unmirror_frame(frame) if turns else frame
+            for picture, output, notes in tracker.process(right):
+                sighting = Sighting(picture.index, picture.t_s, name, {}, note="; ".join(notes))
+                if output is not None and output.detections.markers:
+                    markers = {each.marker: each for each in output.detections.markers}
+                    at = None if attitude is None else attitude(picture.t_s)
+                    sighting = replace(sighting, markers=markers)
+                    sighting = _add_pose(sighting, tracker.state, at, tracker.pipeline)
+                yield sighting
+
+
+def _polled(source: FrameSource, camera: CameraModel) -> Iterator[Named]:
+    """Yield all frames of a recording, the newest of a live source. Raises ConnectionFailed."""
+    paths = getattr(getattr(source, "inner", source), "paths", ())
+    heard_s = time.monotonic()
+    while True:
+        now_s = time.monotonic()
+        frame = source.poll(now_s)
+        if frame is not None:
+            frame = replace(frame, image=to_grey(frame.image))
+            place = str(paths[frame.index]) if paths else source.describe()
+            check_size((frame.image.shape[1], frame.image.shape[0]), camera, place)
+            yield frame, paths[frame.index].name if paths else None
+            heard_s = time.monotonic()
+        elif source.finished:
+            return
+        elif (problem := source.problem(now_s)) is not None:
+            raise ConnectionFailed(problem)
+        elif source.live and now_s - heard_s > SILENT_S:
+            raise ConnectionFailed(f"{source.describe()}: no frame for {SILENT_S:g} s")
+        else:
+            time.sleep(POLL_S)
+
+
+def _numbered(images: Iterable[Any], rate_hz: float) -> Iterator[Named]:
+    for index, image in enumerate(images):
+        frame = image if isinstance(image, Frame) else Frame(index, index / rate_hz, image)
+        yield replace(frame, image=to_grey(frame.image)), None
+
+
+class Tracker:
+    """Runs the profile's pipeline on one source's frames, without a vehicle.
+
+    `live`: the source is a camera. `stills`: each picture is searched thoroughly, and by itself.
+    Without `attitude` poses are relative to the camera instead of the gear.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        camera: CameraModel,
+        *,
+        live: bool,
+        stills: bool,
+        attitude: AttitudeAt | None = None,
+    ) -> None:
+        bare = profile if attitude else camera_profile(profile)
+        self.pipeline = make_pipeline(bare, camera)
+        self._perception = Perception(self.pipeline, stills=stills, attitude=attitude)
+        self._config, self._live, self._stills = profile.camera, live, stills
+        self._disagreement_frames = 1 if stills else profile.merge.disagreement_frames
+
+    @property
+    def state(self) -> PipelineState:
+        return self._perception.state
+
+    def process(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput | None, list[str]]]:
+        """Yield the frame, or both fields of an interlaced one, with the pipeline's output and
+        notes. A live picture that stands still or is noise has no output, a repeated one is left
+        out."""
+        kind = self._perception.health.assess(frame, self._live or not self._stills)
+        if self._live and kind == "repeated":
+            return
+        about = [] if kind in ("ok", "repeated") else [VERDICT_TEXTS[kind]]
+        if self._live and kind in ("frozen", "snow"):
+            yield frame, None, about
+            return
+        for picture, output in self._perception.process_fields(frame):
+            yield picture, output, [*about, *self._notes(output)]
+
+    def _notes(self, output: PipelineOutput) -> Iterator[str]:
+        if output.fields != "whole":
+            yield INTERLACED
+        if output.lock_note:
+            yield output.lock_note
+        if output.detections.mirrored:
+            yield mirrored_note(self._config)
+        if output.disagreeing_frames >= self._disagreement_frames:
+            yield _DISAGREE
+
+
+def _add_pose(
+    seen: Sighting, state: PipelineState, attitude: Attitude | None, pipeline: Pipeline
+) -> Sighting:
+    """The sighting with its pose, if the pipeline accepted one of this picture."""
+    if state.last_pose is None or state.last_pose.pose.t_s != seen.t_s:
+        return seen
+    pose, T_body_cam = state.last_pose.pose, pipeline.pose.T_body_cam
+    R_cam_target = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0]) @ R_MARKER_TARGET
+    T_cam_target = make_T(R_cam_target, pose.tvec_m)
+    R_level_body = np.eye(3) if attitude is None else attitude.R_level_body
+    T_level_cam = make_T(R_level_body, np.zeros(3)) @ T_body_cam
+    order = [3, 4, 5, 0, 1, 2]
+    covariance = camera_covariance(pose)[np.ix_(order, order)]
+    print_m = T_level_cam[:3, :3].T @ pose.print_m
+    covariance[:3, :3] += print_m @ print_m.T
+    level = None if attitude is None else T_level_cam @ T_cam_target
+    return replace(seen, T_cam_target=T_cam_target, covariance=covariance, T_level_target=level)

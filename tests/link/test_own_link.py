@@ -1,0 +1,163 @@
+"""Your own link: whatever it raises, however long it hangs, the watchdog's commands go out."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from perchctl.link import GuardedLink
+from perchctl.link.protocol import LANDING_WAIT_S
+from perchctl.vehicle import FLYING, Command, Idle, Land, PositionSetpoint, Telemetry
+from tests.helpers.waiting import until
+
+LAND, PLACE = Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.0)
+
+
+def sample(t_s: float, bits: int = 0) -> Telemetry:
+    return Telemetry(t_s, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, 0.0, 1.0, 0.0, 4.0, bits)
+
+
+class Vehicle:
+    """A link of somebody's. `act[name]` is called in place of what a method returns."""
+
+    def __init__(self) -> None:
+        self.now_s, self.bits = 10.0, 0
+        self.act: dict[str, Any] = {}
+        self.sent: list[Command] = []
+        self.closed = False
+        self.link = GuardedLink(self, lambda: self.now_s)
+
+    def _call(self, name: str, usual: Any) -> Any:
+        return self.act[name]() if name in self.act else usual
+
+    def connect(self) -> None: ...
+
+    def decks(self) -> tuple[str, ...]:
+        return ("bcFlow2",)
+
+    def telemetry(self) -> list[Any]:
+        return self._call("telemetry", [sample(self.now_s, self.bits)])
+
+    def send(self, command: Command) -> None:
+        self._call("send", None)
+        self.sent.append(command)
+
+    def problem(self, now_s: float) -> str | None:
+        return self._call("problem", None)
+
+    def close(self) -> None:
+        self.closed = True
+        self._call("close", None)
+
+    def trouble(self) -> str:
+        return self.link.problem(self.now_s) or ""
+
+
+@pytest.fixture
+def vehicle() -> Iterator[Vehicle]:
+    vehicle = Vehicle()
+    vehicle.link.connect()
+    yield vehicle
+    vehicle.act.clear()
+    vehicle.link.close()
+
+
+def raises(error: BaseException) -> Any:
+    def call() -> None:
+        raise error
+
+    return call
+
+
+def test_samples_and_commands_pass_and_the_guard_sees_what_waits(vehicle: Vehicle) -> None:
+    asked: list[tuple[Any, int]] = []
+
+    def guard(now_s: float, newest: Any, waiting: Any) -> Command | None:
+        asked.append((newest, len(waiting)))
+        return LAND if asked[-1][1] > 3 else None
+
+    vehicle.link.send(Idle())
+    vehicle.link.send(PLACE)
+    vehicle.link.set_guard(guard)
+    until(lambda: LAND in vehicle.sent)  # the loop hangs: it takes nothing in, and sends nothing
+    assert vehicle.sent[0] == PLACE
+    assert asked[-1][0].t_s == 10.0
+    assert len(vehicle.link.telemetry()) > 3  # nothing is lost for the loop
+    assert vehicle.trouble() == ""
+    assert not vehicle.link.send_external(object())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("of its author"), SystemExit("of its author")])
+@pytest.mark.parametrize("name", ["telemetry", "problem", "send"])
+def test_what_it_raises_is_a_lost_link_that_goes_on_sending(
+    name: str, error: BaseException, vehicle: Vehicle
+) -> None:
+    vehicle.act[name] = raises(error)
+    vehicle.link.send(PLACE)
+
+    def is_lost() -> bool:
+        vehicle.now_s += 0.01
+        return "of its author" in vehicle.trouble()
+
+    until(is_lost)
+    vehicle.act.pop("send", None)
+    vehicle.link.set_guard(lambda *state: LAND)
+    until(lambda: LAND in vehicle.sent)
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("telemetry", "has not returned for 0.6 s"), ("problem", "has not returned for 0.6 s"),
+    ("send", "no command has gone out for 0.6 s"),
+])  # fmt: skip
+def test_what_hangs_in_it_is_a_lost_link_that_goes_on_sending(
+    name: str, words: str, vehicle: Vehicle
+) -> None:
+    free, inside = threading.Event(), threading.Event()
+
+    def hang() -> Any:
+        inside.set()
+        free.wait()
+        return [] if name == "telemetry" else None
+
+    vehicle.act[name] = hang
+    vehicle.link.send(PLACE)
+    assert inside.wait(5.0)
+    vehicle.now_s += 0.6
+    assert words in vehicle.trouble()
+    if name != "send":
+        vehicle.link.set_guard(lambda *state: LAND)
+        until(lambda: LAND in vehicle.sent)
+    free.set()
+    vehicle.act.clear()
+    until(lambda: vehicle.trouble() == "")
+
+
+@pytest.mark.parametrize("wrong", ["x", sample(11.0), sample(float("nan"))])
+def test_a_sample_of_another_type_or_clock_is_a_lost_link(wrong: Any, vehicle: Vehicle) -> None:
+    vehicle.act["telemetry"] = lambda: [wrong]
+    until(lambda: "raised" in vehicle.trouble())
+    assert all(each.t_s == 10.0 for each in vehicle.link.telemetry())
+
+
+def test_its_own_word_is_passed_on_and_taken_back(vehicle: Vehicle) -> None:
+    vehicle.act["problem"] = lambda: "its antenna is off"
+    until(lambda: vehicle.trouble() == "its antenna is off")
+    vehicle.act.clear()
+    until(lambda: vehicle.trouble() == "")
+
+
+def test_closing_sends_what_waits_and_waits_for_a_vehicle_that_flies(vehicle: Vehicle) -> None:
+    vehicle.bits = FLYING
+    until(lambda: any(each.has_bit(FLYING) for each in vehicle.link.telemetry()))
+    vehicle.link.send(LAND)
+    vehicle.act["close"] = raises(ZeroDivisionError())
+    closing = threading.Thread(target=vehicle.link.close)
+    closing.start()
+    until(lambda: LAND in vehicle.sent)
+    assert not vehicle.closed
+    vehicle.bits = 0
+    closing.join(LANDING_WAIT_S / 2)
+    assert vehicle.closed
