@@ -43,7 +43,7 @@ def load_extension(text: str, key: str) -> Any:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing and f"{module_name}.".startswith(f"{missing}."):
             raise NotFound(
-                f"{key}: there is no module {missing}: install it, or start perchctl in its folder "
+                f"{key}: there is no module {missing}: install it, or start in its folder "
                 f"(now {Path.cwd()})"
             ) from None
         raise InvalidValue(f"{key}: importing {module_name} raised {error_at(error)}") from error

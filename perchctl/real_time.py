@@ -74,8 +74,9 @@ def fly(
     profile = load_profile(profile)
     uri = profile.link.uri if uri is None else uri
     source = profile.camera.source if source is None else source
-    for name, value, kind in (("uri", uri, str), ("source", source, str), ("seed", seed, int)):
-        require_type(name, value, kind)
+    require_type("uri", uri, str)
+    require_type("source", source, str)
+    require_type("seed", seed, int)
     log_dir = Path(profile.log.directory if log_dir is None else log_dir)
     options = FlyOptions(profile, Path(profile.name), uri, source, seed, log_dir)
     check_options(options)

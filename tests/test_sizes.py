@@ -25,7 +25,7 @@ MOST_LINES = {
     "commands": 3650,
     "display": 730,
     "faults": 2660,
-    "flight": 2220,
+    "flight": 2225,
     "link": 2305,
     "record": 2160,
     "mission": 4285,

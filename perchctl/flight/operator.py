@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import socket
 import threading
@@ -18,6 +19,7 @@ AGAIN_S = 0.5  # a second press counts this long after the first
 HELD_S = 0.3  # faster presses are one: a key held down repeats at 5 to 33 Hz
 DELAY_S = 1.0  # a keyboard waits no longer before it repeats a key; 0.25 to 0.66 s are usual
 INSIST_S = 2.0  # who presses on for so long wants the motors stopped
+HUNG_S = 10.0  # a stopped flight that has not ended by then hangs
 _EPS_S = 1e-9
 
 
@@ -32,7 +34,8 @@ class OperatorSwitch:
     the signals that ask a program to end: it lands however often it comes, and never stops the
     motors. All methods may be called from any thread.
 
-    Until the flight loop listens there is nothing to land: `interrupt` raises `Interrupted`.
+    Until the flight loop listens there is nothing to land, and `HUNG_S` after a stop nothing is
+    left to do: then `interrupt` raises `Interrupted`.
     """
 
     listening: bool = False
@@ -42,12 +45,12 @@ class OperatorSwitch:
     _first_s: float | None = None
     _last_s: float = 0.0
     _second_s: float | None = None
-    _stopped: bool = False
+    _stopped_s: float = math.inf
 
     def read(self) -> Operator:
         with self._lock:
             self._confirm(self.clock())
-            if self._stopped:
+            if self._stopped_s < math.inf:
                 return Operator.STOP
             pressed = self._first_s is not None or self.landing_requested
             return Operator.LAND if pressed else Operator.NONE
@@ -64,21 +67,25 @@ class OperatorSwitch:
                 self._first_s = now_s
             elif silent_s < HELD_S - _EPS_S:  # a key has begun to repeat, or it is hammered
                 self._second_s = None
-                self._stopped |= now_s - self._first_s >= INSIST_S - _EPS_S
+                self._confirm(now_s, now_s - self._first_s >= INSIST_S - _EPS_S)
             elif now_s - self._first_s >= AGAIN_S - _EPS_S:
                 self._second_s = now_s
-                self._stopped |= silent_s > DELAY_S + _EPS_S
+                self._confirm(now_s, silent_s > DELAY_S + _EPS_S)
             self._last_s = now_s
 
     def interrupt(self) -> None:
-        """Raises `Interrupted` on a signal before the loop listens; called in the main thread."""
+        """Raises `Interrupted` on a signal where the loop does not listen; called in the main
+        thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
+        if self.clock() - self._stopped_s >= HUNG_S:
+            raise Interrupted("the stopped flight hung: left by Ctrl-C")
 
-    def _confirm(self, now_s: float) -> None:
+    def _confirm(self, now_s: float, insists: bool = False) -> None:
         second_s = self._second_s
-        if second_s is not None and now_s - second_s >= HELD_S - _EPS_S:
-            self._stopped = True
+        alone = second_s is not None and now_s - second_s >= HELD_S - _EPS_S
+        if alone or insists:
+            self._stopped_s = min(self._stopped_s, now_s)
 
 
 # --- Signals that end a flight ---

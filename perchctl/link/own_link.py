@@ -58,7 +58,7 @@ class GuardedLink:
 
     def problem(self, now_s: float) -> str | None:
         silent_s = 0.0 if self._answered_s is None else now_s - self._answered_s
-        hangs = f"telemetry() has not returned for {silent_s:.1f} s" if silent_s > HANGS_S else None
+        hangs = f"telemetry() hangs for {silent_s:.1f} s" if silent_s > HANGS_S else None
         stuck = self._sender.trouble()
         stuck = stuck and f"{stuck}{self._send_error}"
         return self._failure or stuck or hangs or self._trouble

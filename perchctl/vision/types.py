@@ -86,7 +86,7 @@ def to_grey(image: Any) -> NDArray[np.uint8]:
     if not (is_array and is_picture) or 0 in shape:
         found = type(image).__name__ if kind is None else f"{kind} of shape {shape}"
         raise InvalidValue(
-            f"a picture must be a numpy array of uint8, (height, width) in grey or (height, width, "
+            f"a picture must be a uint8 array, (height, width) in grey or (height, width, "
             f"3) in BGR; found {found}"
         )
     if kind == np.uint16:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import Interrupted, UsageError
 from perchctl.flight import OperatorSwitch, session
-from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, INSIST_S
+from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, HUNG_S, INSIST_S
 from perchctl.mission import Operator
 from perchctl.profile import load_profile
 
@@ -102,6 +102,19 @@ def test_how_often_it_is_read_changes_nothing(silences_s: list[float], every_s: 
             often.at(t_s + every_s * i)
         t_s += silence_s
     assert often.at(t_s + HELD_S) is once.at(t_s + HELD_S)
+
+
+def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
+    for presses_s in ((), (0.0,), (0.0, AGAIN_S)):
+        it = Pressed(*presses_s)
+        it.at(1.0)
+        it.now_s = 50.0 + HUNG_S
+        it.switch.interrupt()  # it may still land, or be stopped
+    it = Pressed(0.0, AGAIN_S)
+    assert it.at(1.0) is Operator.STOP
+    it.now_s = 51.0 + HUNG_S
+    with pytest.raises(Interrupted, match="the stopped flight hung"):
+        it.switch.interrupt()
 
 
 def test_before_the_flight_a_signal_leaves() -> None:

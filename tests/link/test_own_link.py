@@ -109,7 +109,7 @@ def test_what_it_raises_is_a_lost_link_that_goes_on_sending(
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("telemetry", "has not returned for 0.6 s"), ("problem", "has not returned for 0.6 s"),
+    ("telemetry", "hangs for 0.6 s"), ("problem", "hangs for 0.6 s"),
     ("send", "no command has gone out for 0.6 s"),
 ])  # fmt: skip
 def test_what_hangs_in_it_is_a_lost_link_that_goes_on_sending(
