@@ -3,7 +3,11 @@ with a mounting that a hand has measured."""
 
 from __future__ import annotations
 
+import json
 import math
+from contextlib import closing
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +20,9 @@ from perchctl.faults.flight import FaultyFlight
 from perchctl.faults.results import FaultResult
 from perchctl.flight import fly_lockstep
 from perchctl.mission import Outcome, Phase, Tick
+from perchctl.positioning import CaptureFrame
 from perchctl.sim import CaptureFault, draw_scenario
+from perchctl.sim.capture import SimCapture
 from tests.helpers.capture import SWAPPED_XY, Y_UP, Rows
 from tests.helpers.flights import fly_short
 from tests.helpers.loop_rig import Watcher
@@ -49,6 +55,32 @@ def test_it_perches(own: dict[str, Any], capture: dict[str, Any], miss_m: float)
     assert it.flight.perched_miss_m is not None
     assert it.flight.perched_miss_m < miss_m
     assert Phase.LANDING.value not in it.way
+
+
+@pytest.mark.long
+def test_poses_from_your_own_source_carry_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulated capture's poses go as datagrams through the example of such a source."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    example, poll = import_module("own_positioning"), SimCapture.poll
+    monkeypatch.setattr(example, "ADDRESS", ("127.0.0.1", 0))
+    own, passed = example.UdpPoses(lambda: 0.0, None), []
+    address = own._socket.getsockname()
+
+    def relayed(capture: SimCapture, now_s: float) -> CaptureFrame | None:
+        if (frame := poll(capture, now_s)) is not None and "crazyflie" in frame.bodies:
+            pose = frame.bodies["crazyflie"]
+            told = {"position_m": pose.position_m, "quaternion": pose.quaternion}
+            own._socket.sendto(json.dumps({"body": "crazyflie", **told}).encode(), address)
+        passed.append(own.poll(now_s))
+        return passed[-1]
+
+    monkeypatch.setattr(SimCapture, "poll", relayed)
+    with closing(own):
+        it = fly_short(MOCAP)
+    assert it.report.phase is Phase.PERCHED
+    assert it.flight.perched_miss_m is not None
+    assert it.flight.perched_miss_m < 0.01
+    assert sum(frame is not None for frame in passed) > 500
 
 
 @pytest.mark.long
