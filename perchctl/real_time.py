@@ -52,7 +52,7 @@ def fly(
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
     **It arms at once.** In the main thread Ctrl-C lands, a second one stops the motors. Warnings of
-    the checks are Python warnings (`perchctl.errors.Note`).
+    the checks, and an incomplete log, are Python warnings (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name or its file.
@@ -102,7 +102,10 @@ def fly(
             log.abandon(str(error) or type(error).__name__)
             raise
         miss_m = miss_m if report.phase is Phase.PERCHED else None
-        log.close(report, miss_m)
+        summary = log.close(report, miss_m)
+    problem = None if summary is None else summary.log_problem
+    if problem is not None:
+        warnings.warn(f"the flight's log is incomplete: {problem}", Note, stacklevel=2)
     return Flight(report, log.path, miss_m)
 
 

@@ -410,6 +410,18 @@ def test_a_row_of_your_own_and_ctrl_c_land_in_real_time(by: str, here: Path) -> 
 
 
 @pytest.mark.usefixtures("pictures")
+def test_a_log_that_is_incomplete_is_told(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heights_m, lost = [0.0], property(lambda log: "the disk is full")
+    monkeypatch.setattr("perchctl.record.LogWatcher.loss_reason", lost)
+    with pytest.warns(Note, match="log is incomplete: the disk is full"):
+        fly_toy(
+            here,
+            lambda tick: heights_m.append(tick.telemetry.position_m[2]),
+            lambda: heights_m[-1] > 0.1,
+        )
+
+
+@pytest.mark.usefixtures("pictures")
 def test_what_a_callback_raises_lands_the_vehicle_first(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

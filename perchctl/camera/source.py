@@ -291,14 +291,17 @@ class GuardedSource:
         self.live, self.size_px = bool(source.live), source.size_px
 
     def wait_first_frame(self, timeout_s: float) -> None:
-        """Wait for the first frame of a camera. Raises ConnectionFailed, TimedOut."""
+        """Wait for the first frame of a camera. Raises ConnectionFailed, TimedOut, with it
+        closed."""
         end_s = time.monotonic() + timeout_s
         while self.live and (frame := self.poll(self._clock())) is None:
+            if self._failure is None and time.monotonic() <= end_s:
+                time.sleep(_POLL_S)
+                continue
+            self.close()
             if self._failure is not None:
                 raise ConnectionFailed(self._failure)
-            if time.monotonic() > end_s:
-                raise TimedOut(f"{self._name}: no first frame within {timeout_s:g} s")
-            time.sleep(_POLL_S)
+            raise TimedOut(f"{self._name}: no first frame within {timeout_s:g} s")
         self._first = frame if self.live else None
 
     @property

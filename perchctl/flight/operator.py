@@ -39,6 +39,7 @@ class OperatorSwitch:
     """
 
     listening: bool = False
+    closing: bool = False  # the link
     landing_requested: bool = False
     clock: Callable[[], float] = time.monotonic
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -78,8 +79,8 @@ class OperatorSwitch:
         thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
-        if self.clock() - self._stopped_s >= HUNG_S:
-            raise Interrupted("the stopped flight hung: left by Ctrl-C")
+        if not self.closing and self.clock() - self._stopped_s >= HUNG_S:
+            raise Interrupted("the stopped flight hung")
 
     def _confirm(self, now_s: float, insists: bool = False) -> None:
         second_s = self._second_s

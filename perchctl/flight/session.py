@@ -167,7 +167,7 @@ def fly_session(
                     waiting.enter_context(clock.waiting_for_loop())
                 report = fly(parts)
         finally:
-            switch.listening = True  # while closing, Ctrl-C must not cut the wait short
+            switch.listening = switch.closing = True  # Ctrl-C must not cut it short
             link.close()
         return report, _true_miss_m(simulated)
 

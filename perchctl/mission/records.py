@@ -151,7 +151,7 @@ class Turn:
     began_s: float
     t_s: float  # for which it was decided; later than `began_s` where it hung
     taken: TurnInputs
-    poses: dict[str, UnfilteredPose] = field(default_factory=dict)  # by large, small, joint
+    poses: dict[str, UnfilteredPose] = field(default_factory=dict)
     observation: Observation | None = None  # None while waiting
     command: Command | None = None  # None while waiting, and of one that failed
     phase: Phase | None = None

@@ -250,7 +250,7 @@ class PlannerState:
     stale_s: float | None = None  # when there was no position from outside last
     last: Telemetry | None = None  # the newest sample that was decided on
     energy: EnergyState = field(default_factory=EnergyState)  # fitted to the battery
-    battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # remaining
+    battery: BatteryOutlook = field(default_factory=BatteryOutlook)
     reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     reach_s: float | None = None  # within the magnet's reach since
     contact: ContactError | None = None  # as it made contact

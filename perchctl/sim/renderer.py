@@ -147,7 +147,7 @@ class Renderer:
         exposed = [self._exposed(shot, defocus_px) for shot in shots]
         picture = exposed[0]
         if len(shots) > 1:
-            later = 0 if self.scenario.camera_fields == "bottom" else 1  # the second field's rows
+            later = 0 if self.scenario.camera_fields == "bottom" else 1
             picture[later::2] = exposed[1][later::2]
         if self._noise is not None:
             width, height = self.camera.size_px

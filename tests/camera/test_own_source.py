@@ -21,6 +21,7 @@ class Camera:
     """Each poll returns, or raises, the next of `script`, then None."""
 
     live, finished, size_px = True, False, None
+    closed = 0
     script: list[Any]
     wrong: BaseException | None
 
@@ -41,7 +42,8 @@ class Camera:
     def describe(self) -> str:
         return "my camera"
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        Camera.closed += 1
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setitem(sys.modules, "my_camera", module)
 
     def open_with(*script: Any, wrong: BaseException | None = None) -> Any:
-        Camera.script, Camera.wrong = list(script), wrong
+        Camera.script, Camera.wrong, Camera.closed = list(script), wrong, 0
         return open_camera("my_camera:Camera", lambda: 10.0, timeout_s=0.05)
 
     return open_with
@@ -75,6 +77,7 @@ def test_the_first_frame_is_waited_for_and_given_first(opened: Any) -> None:
     assert source.problem(-math.inf) is None
     with pytest.raises(TimedOut, match=r"my_camera:Camera: no first frame within 0\.05 s"):
         opened()
+    assert Camera.closed == 1
 
 
 @pytest.mark.parametrize(("given", "words"), [
@@ -87,6 +90,7 @@ def test_the_first_frame_is_waited_for_and_given_first(opened: Any) -> None:
 def test_what_it_does_wrong_is_a_lost_camera(given: Any, words: str, opened: Any) -> None:
     with pytest.raises(ConnectionFailed, match=f"my_camera:Camera: .*{words}"):
         opened(given)
+    assert Camera.closed == 1
     source = opened(frame(9.0), given, frame(9.8))
     polled = [source.poll(10.0) for _ in range(3)]
     assert [each and each.t_s for each in polled] == [9.0, None, None]

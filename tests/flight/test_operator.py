@@ -115,6 +115,8 @@ def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
     it.now_s = 51.0 + HUNG_S
     with pytest.raises(Interrupted, match="the stopped flight hung"):
         it.switch.interrupt()
+    it.switch.closing = True  # the link waits, bounded, for a vehicle that still flies
+    it.switch.interrupt()
 
 
 def test_before_the_flight_a_signal_leaves() -> None:

@@ -63,7 +63,7 @@ class Firmware:
         self.supply_v, self.power_state, self._fine_s = self.world.battery_v, 0, 0.0
         self._pressed = False
         if self.scenario.extra.get("external_position"):
-            self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
+            self._parameters["deck.bcFlow2"] = 0.0  # external positions
         self._parameters |= self.scenario.parameters
         self.supervisor.emergency = bool(self._parameters["stabilizer.stop"])
         self.estimator.reset(0.0)
