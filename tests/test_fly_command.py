@@ -54,6 +54,13 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []  # no log either
 
 
+def test_the_plan_loads_what_the_profile_names(tmp_path: Path) -> None:
+    (tmp_path / "my_part.py").write_text("class Camera: pass\n")
+    said = run("fly", "--source", "my_part:Camra", "--dry-run")
+    assert (said.code, "did you mean Camera?" in said.stderr) == (20, True)
+    assert run("fly", "--source", "my_part:Camera", "--dry-run").code == 0
+
+
 def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CFLIB_URI", "bogus")
     assert run("fly", "--dry-run").code == 30

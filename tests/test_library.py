@@ -82,6 +82,17 @@ def test_a_pose_is_as_near_to_the_truth_as_its_covariance_says() -> None:
     assert 0.5 < np.mean(chi2) < 15.0  # of six degrees of freedom
 
 
+def test_the_covariance_holds_the_print_s_scale_and_the_example_s_calibration_is_named() -> None:
+    unsure = SIM.with_({"target.size_sigma": 0.05})
+    (seen,) = track([picture()[0]], unsure, CAMERA)
+    assert seen.T_cam_target is not None
+    assert seen.covariance is not None
+    z_m = seen.T_cam_target[2, 3]
+    assert seen.covariance[2, 2] ** 0.5 == pytest.approx(0.05 * z_m, rel=0.1)
+    with pytest.warns(Note, match="example calibration"):
+        track([], SIM)
+
+
 def test_with_an_attitude_the_pose_is_also_in_the_level_frame() -> None:
     image, truth = picture()
     # At the profile's mounting of zero the camera's axes are the body's: it leans as was drawn.

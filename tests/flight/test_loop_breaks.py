@@ -96,6 +96,17 @@ def test_a_failure_of_the_camera_lands_first_and_on_the_ground_starts_nothing() 
     assert rig.link.sent == []
 
 
+def test_a_link_that_raises_when_it_is_asked_is_landed_all_the_same() -> None:
+    rig = Rig()
+    usual = rig.link.problem
+
+    def fails(now_s: float) -> str | None:
+        return _break() if now_s > BREAKS_S else usual(now_s)
+
+    rig.link.problem = fails  # type: ignore[method-assign]
+    landed_after_a_break(rig)
+
+
 @pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
 def test_a_failure_right_after_the_take_off_order_lands(after_s: float) -> None:
     """The order does not show in the telemetry yet, and a vehicle in high-level flight would

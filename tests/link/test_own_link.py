@@ -157,7 +157,24 @@ def test_closing_sends_what_waits_and_waits_for_a_vehicle_that_flies(vehicle: Ve
     closing = threading.Thread(target=vehicle.link.close)
     closing.start()
     until(lambda: LAND in vehicle.sent)
+    closing.join(0.3)
     assert not vehicle.closed
     vehicle.bits = 0
     closing.join(LANDING_WAIT_S / 2)
     assert vehicle.closed
+
+
+def test_closing_hands_over_what_a_slow_link_has_not_taken_yet(vehicle: Vehicle) -> None:
+    free, inside = threading.Event(), threading.Event()
+    vehicle.act["send"] = lambda: inside.set() or free.wait(5.0)
+    until(lambda: vehicle.link.telemetry() != [])  # it stands: nothing else is waited for
+    for command in (PLACE, LAND):
+        vehicle.link.send(command)
+        assert inside.wait(5.0)
+    closing = threading.Thread(target=vehicle.link.close)
+    closing.start()
+    closing.join(0.3)
+    assert not vehicle.closed
+    free.set()
+    closing.join(LANDING_WAIT_S / 2)
+    assert vehicle.sent == [PLACE, LAND]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -422,8 +422,9 @@ def test_a_row_of_your_own_waits_in_the_alignment() -> None:
     assert (waiting.phase, waiting.pause, waiting.hold) == (P.ALIGN, "mine", "")
     assert isinstance(command, PositionSetpoint)
     assert waiting.waited_s == 39.0 > PROFILE.planner.align.timeout_s
-    after = waiting
-    for tick in range(25):
+    after, _ = planner.step_mission(waiting, observation(50.0), PROFILE, table)
+    assert (after.phase, after.pause) == (P.ALIGN, "")  # it has yet to stay aligned
+    for tick in range(1, 25):
         after, _ = planner.step_mission(after, observation(50.0 + TICK_S * tick), PROFILE, table)
     assert (after.phase, after.pause, after.waited_s) == (P.ASCEND, "", 0.0)
     lost = observation(11.0, target=None)
@@ -436,14 +437,16 @@ def test_a_profile_names_rows_or_a_function_that_makes_them_anew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     module: Any = ModuleType("my_rows")
-    module.ROWS, module.make, module.fails, module.clock = [MINE], lambda: [MINE], bool, time.time
+    called: list[int] = []
+    module.ROWS, module.make, module.fails = [MINE], lambda: [MINE], lambda: 1 / 0
+    module.other = partial(called.append, 1)  # as a log's profile might name anything
     monkeypatch.setitem(sys.modules, "my_rows", module)
     for name in ("ROWS", "make"):
         assert [row.name for row in table_of(f"my_rows:{name}") if row.name == "mine"] == ["mine"]
-    module.fails = lambda: 1 / 0
-    for name, words in (("fails", "ZeroDivisionError"), ("clock", "must be"), ("none", "no none")):
+    for name, words in (("fails", "ZeroDivisionError"), ("other", "must be"), ("none", "no none")):
         with pytest.raises(PerchError, match=words):
             table_of(f"my_rows:{name}")
+    assert called == []
 
 
 @pytest.mark.parametrize("change", [
