@@ -3,7 +3,6 @@ are the code's."""
 
 from __future__ import annotations
 
-import gzip
 import re
 import runpy
 import shlex
@@ -25,6 +24,7 @@ from perchctl.flight import fly_lockstep
 from perchctl.profile import Profile
 from perchctl.profile.keys import keys
 from tests.helpers.boards import CHARUCO, render_folder
+from tests.helpers.decided import decided_here
 from tests.helpers.flights import ROOT, SEED, short_profile
 from tests.helpers.gear import write_turned_about
 from tests.helpers.mounting import hand, seen
@@ -138,8 +138,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     MountingRecording.write(folder / "hand.jsonl", [seen(hand("pivot"))])
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
-    packed = ROOT / "tests" / "data" / "flights" / "searched-out.jsonl.gz"
-    (folder / "last.jsonl").write_bytes(gzip.decompress(packed.read_bytes()))
+    (folder / "last.jsonl").write_bytes(b"".join(decided_here("searched-out")))
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
     for name in ("my_vehicle", "left", "right", "large"):
         shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / f"{name}.yaml")

@@ -17,7 +17,7 @@ SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOT.rglob(
 # bound in its own change, and says why there.
 MOST_LINES = {
     ".": 1535,
-    "analysis": 2340,
+    "analysis": 2400,
     "calibration": 2920,
     "camera": 1585,
     "campaign": 1095,
@@ -27,7 +27,7 @@ MOST_LINES = {
     "faults": 2660,
     "flight": 2225,
     "link": 2305,
-    "record": 2160,
+    "record": 2235,
     "mission": 4285,
     "perception": 730,
     "positioning": 950,

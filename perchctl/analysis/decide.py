@@ -1,16 +1,19 @@
 """A flight decided again: the recorded observations through the planner.
 
 The planner is pure, so the same observations and the same profile have to give the same
-commands, to the bit.
+commands: to the bit on the computer that flew, and within a tolerance on any other, whose libraries
+may round differently.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from perchctl.errors import InvalidValue
 from perchctl.mission import Observation, PlannerState, Turn, step_mission, table_of
@@ -28,8 +31,7 @@ class ReplayedDecision:
 
     Attributes:
         tick: number of flown turns before this turn.
-        difference: first field that differs from the log, or None. The planner's exceptions are not
-            compared for logs before version 4, which do not hold them.
+        difference: first field that differs from the log, or None.
         error: class name of the exception that the planner raised, or None.
     """
 
@@ -61,13 +63,15 @@ def replay_decisions(
     turns: Iterable[Turn],
     profile: Profile,
     observation_of: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
+    comparison: Comparison | None = None,
 ) -> Iterator[ReplayedDecision]:
     """Replay the planner turn by turn.
 
     `observation_of` returns a turn's observation (default: as recorded), or None to skip the turn.
     Only flown turns advance the planner's state. The replay ends with the first turn on which the
-    planner raises, as a flight does.
+    planner raises, as a flight does. `comparison` is to the bit by default.
     """
+    comparison = comparison or Comparison()
     state: PlannerState | None = None
     table, tick = table_of(profile.planner.rows), 0
     for turn in turns:
@@ -78,16 +82,21 @@ def replay_decisions(
             new, command = step_mission(state, obs, profile, table)
         except Exception as error:
             name = type(error).__name__
-            yield ReplayedDecision(tick, turn, field_difference("error", turn.error, name), name)
+            differs = None
+            if turn.role != "failed" or ("Turn", "error") not in comparison.unknown:
+                differs = comparison.difference("error", turn.error, name)
+            yield ReplayedDecision(tick, turn, differs, name)
             return  # what came after it cannot be decided
-        yield ReplayedDecision(tick, turn, _difference(turn, new, command))
+        yield ReplayedDecision(tick, turn, _difference(turn, new, command, comparison))
         if turn.role == "flown":
             state, tick = new, tick + 1
 
 
-def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDifference | None:
+def _difference(
+    turn: Turn, state: PlannerState, command: Command, comparison: Comparison
+) -> FieldDifference | None:
     if turn.role == "failed":
-        return field_difference("error", turn.error, None)
+        return comparison.difference("error", turn.error, None)
     if turn.command is None:
         return None
     replayed = {
@@ -96,41 +105,66 @@ def _difference(turn: Turn, state: PlannerState, command: Command) -> FieldDiffe
         "held": bool(state.hold),
         "attempts": state.attempts,
         "command": command,
+        "outcome": state.outcome,
+        "reason": state.reason,
     }
-    if turn.reason is not None:  # not in a log before version 4
-        replayed |= {"outcome": state.outcome, "reason": state.reason}
-    return first_field_difference((n, getattr(turn, n), value) for n, value in replayed.items())
+    compared = [n for n in replayed if ("Turn", n) not in comparison.unknown]
+    return comparison.first_difference((n, getattr(turn, n), replayed[n]) for n in compared)
 
 
-# --- In which field two values first differ, to the bit: 0.0 is not -0.0, and NaN is NaN ---
+# --- In which field two values first differ ---
 
 
-def field_difference(name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
-    """The first subfield of field `name` in which its two values differ, or None.
+@dataclass(frozen=True)
+class Comparison:
+    """How recorded and replayed values are compared: by default to the bit, where 0.0 is not -0.0
+    and NaN is NaN.
 
-    Values of different classes are returned whole, as text with their class.
+    Attributes:
+        unknown: fields that are not compared, each as the names of its dataclass and of itself.
+        tolerances: by the name of a field, by how much its numbers may differ, in the field's own
+            unit; the empty name stands for all other fields.
     """
-    if type(recorded) is not type(replayed):
-        return name, _shown(recorded), _shown(replayed)
-    return _first_differing(name, to_exact_json(recorded), to_exact_json(replayed))
 
+    unknown: Collection[tuple[str, str]] = ()
+    tolerances: Mapping[str, float] = field(default_factory=dict)
 
-def first_field_difference(fields: Iterable[FieldDifference]) -> FieldDifference | None:
-    """The first difference among fields (name, recorded and replayed value), or None."""
-    return next((d for field in fields if (d := field_difference(*field)) is not None), None)
+    def difference(self, name: str, recorded: Any, replayed: Any) -> FieldDifference | None:
+        """Return the first subfield of field `name` in which its two values differ, or None.
 
+        Values of different classes are returned whole, as text with their class.
+        """
+        if type(recorded) is not type(replayed):
+            return name, _shown(recorded), _shown(replayed)
+        one, other = to_exact_json(recorded), to_exact_json(replayed)
+        if json.dumps(one) == json.dumps(other):
+            return None
+        parts: list[FieldDifference]
+        if dataclasses.is_dataclass(recorded):
+            owner = type(recorded).__name__
+            names = [each.name for each in dataclasses.fields(recorded)]
+            compared = [n for n in names if (owner, n) not in self.unknown]
+            parts = [(f"{name}.{n}", getattr(recorded, n), getattr(replayed, n)) for n in compared]
+        elif isinstance(recorded, dict):
+            keys = {**recorded, **replayed}
+            parts = [(f"{name}.{key}", recorded.get(key), replayed.get(key)) for key in keys]
+        elif isinstance(recorded, (tuple, list, np.ndarray)) and len(recorded) == len(replayed):
+            parts = [(f"{name}[{k}]", recorded[k], replayed[k]) for k in range(len(recorded))]
+        elif isinstance(recorded, float) and abs(recorded - replayed) <= self._tolerance(name):
+            return None
+        else:
+            return name, one, other
+        return self.first_difference(parts)
 
-def _first_differing(name: str, one: Any, other: Any) -> FieldDifference | None:
-    if json.dumps(one) == json.dumps(other):
-        return None
-    parts: list[FieldDifference] = []
-    if isinstance(one, dict) and isinstance(other, dict):
-        parts = [(f"{name}.{key}", one.get(key), other.get(key)) for key in {**one, **other}]
-    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        pairs = zip(one, other, strict=True)
-        parts = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(pairs)]
-    within = next((d for part in parts if (d := _first_differing(*part)) is not None), None)
-    return within or (name, one, other)
+    def first_difference(self, fields: Iterable[FieldDifference]) -> FieldDifference | None:
+        """Return the first difference among fields (name, recorded and replayed value), or None."""
+        found = (self.difference(*each) for each in fields)
+        return next((difference for difference in found if difference is not None), None)
+
+    def _tolerance(self, name: str) -> float:
+        last = name.rpartition(".")[2].partition("[")[0]
+        to_the_bit = -1.0  # not even 0.0 and -0.0 are near
+        return self.tolerances.get(last, self.tolerances.get("", to_the_bit))
 
 
 def _shown(value: Any) -> Any:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import perchctl
 from perchctl.analysis.compare import profile_differences
 from perchctl.analysis.decide import (
+    Comparison,
     ReplayedDecision,
-    first_field_difference,
     replay_decisions,
     turns_and_gap_text,
 )
@@ -116,6 +116,13 @@ class Replay:
         return not self.differences and (self.seen is None or self.seen.is_identical)
 
     @property
+    def uncompared(self) -> list[str]:
+        """Dotted names of the fields that the log does not hold, so that they are not compared."""
+        names = (field.path.removeprefix("observation.") for field in self.log.unknown_fields)
+        # A sample of telemetry has the same fields in all its places.
+        return [name for name in names if not name.startswith("taken.")]
+
+    @property
     def notes(self) -> list[str]:
         """What limits the replay, a sentence each."""
         made_by, elsewhere = self.log.header.get("perchctl"), self.log.computer_differences
@@ -127,7 +134,13 @@ class Replay:
             )
         if elsewhere:
             found.append(
-                f"it was flown with {elsewhere}: the last bits of a number may differ for that"
+                f"it was flown with {elsewhere}: numbers may differ in their last bits because of "
+                f"that"
+            )
+        if self.uncompared:
+            found.append(
+                f"the perchctl that flew it did not record {', '.join(self.uncompared)}: these are "
+                f"not compared, and the planner is given their default"
             )
         if self.log.truncated:
             found.append("the log ends in the flight, without its summary: replayed is its rest")
@@ -144,7 +157,8 @@ class Replay:
         """The replay in JSON types.
 
         `ticks`, `differences` and `first_difference` are the planner's; `pictures` (perception) is
-        None without pictures; `changed` is empty for the flown profile.
+        None without pictures; `changed` is empty for the flown profile; `not_compared` names the
+        fields that the log does not hold.
         """
         seen = self.seen
         pictures = seen and {
@@ -160,6 +174,7 @@ class Replay:
             **_counted(self.differences),
             "pictures": pictures,
             "changed": list(self.changed_keys),
+            "not_compared": self.uncompared,
             "notes": self.notes,
         }
 
@@ -194,27 +209,38 @@ def replay(
     pictures: Iterable[Picture] | None = None,
     profile: Profile | None = None,
     pipeline: Pipeline | None = None,
+    tolerances: Mapping[str, float] | None = None,
 ) -> Replay:
     """Replay the flight with its own profile or, if given, with `profile`.
 
     The planner gets the recorded observations; with another profile and `pictures`, those of the
     replayed perception. Perception is compared separately. `pipeline`: by default the profile's,
-    with the flown calibration and mask. Errors: InvalidValue, NotFound.
+    with the flown calibration and mask. `tolerances`: by how much numbers of a field, named without
+    its owner, may differ, "" for all other fields; by default every bit counts. Errors:
+    InvalidValue, NotFound.
     """
     flown = log.flown_profile
     turns, gap = turns_and_gap_text(log)
+    unknown = {(field.owner, field.name) for field in log.unknown_fields}
+    comparison = Comparison(unknown, tolerances or {})
     used = profile or flown
     changed = changed_keys(flown, used)
     seen = None
     if pictures is not None:
         pipeline = pipeline or replay_pipeline(log, used, changed)
-        seen = _seen(log, turns, flown, used, pictures, pipeline)
+        # A source takes the latency off the time at which a picture came.
+        delay_s = flown.camera.start_latency_s - used.camera.start_latency_s
+        replayed, missing = _replayed(turns, used, pipeline, pictures, delay_s)
+        differing = list(_differing(log, turns, replayed, comparison))
+        seen = PerceptionReplay(replayed, differing, _frames_of(turns), missing)
     observations: dict[int, Observation | None] = {}
     if seen is not None and changed and seen.frames:
         observations = {each.turn.number: each.observation for each in seen.turns}
         turns = turns[: len(seen.turns)]
     decided = list(
-        replay_decisions(turns, used, lambda turn: observations.get(turn.number, turn.observation))
+        replay_decisions(
+            turns, used, lambda turn: observations.get(turn.number, turn.observation), comparison
+        )
     )
     differences = [
         Difference(each.tick, log.to_flight_s(each.turn.t_s), *each.difference)
@@ -247,16 +273,14 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
 # --- What the pictures show ---
 
 
-def _seen(
-    log: FlightLog,
+def _replayed(
     turns: Sequence[Turn],
-    flown: Profile,
     profile: Profile,
-    pictures: Iterable[Picture],
     pipeline: Pipeline,
-) -> PerceptionReplay:
-    # A source takes the latency off the time at which a picture came.
-    delay_s = flown.camera.start_latency_s - profile.camera.start_latency_s
+    pictures: Iterable[Picture],
+    delay_s: float,
+) -> tuple[list[ReplayedInputs], PictureMissing | None]:
+    """Replay perception up to the first missing picture."""
     found: list[ReplayedInputs] = []
     missing: PictureMissing | None = None
     try:
@@ -264,19 +288,26 @@ def _seen(
             found.append(each)
     except PictureMissing as error:
         missing = error
-    return PerceptionReplay(found, list(_differing(log, turns, found)), _frames_of(turns), missing)
+    return found, missing
 
 
 def _differing(
-    log: FlightLog, turns: Sequence[Turn], found: Iterable[ReplayedInputs]
+    log: FlightLog,
+    turns: Sequence[Turn],
+    found: Iterable[ReplayedInputs],
+    comparison: Comparison,
 ) -> Iterator[Difference]:
     tick = -sum(turn.role == "waiting" for turn in turns)
     for each in found:
         was, seen = each.turn.observation, each.observation
         fields: list[tuple[str, Any, Any]] = [("poses", each.turn.poses, each.poses)]
         if was is not None and seen is not None:
-            fields += [(n, getattr(was, n), getattr(seen, n)) for n in FlightInputs.SENSED_FIELDS]
-        difference = first_field_difference(fields)
+            fields += [
+                (n, getattr(was, n), getattr(seen, n))
+                for n in FlightInputs.SENSED_FIELDS
+                if ("Observation", n) not in comparison.unknown
+            ]
+        difference = comparison.first_difference(fields)
         if difference is not None:
             yield Difference(tick, log.to_flight_s(each.turn.t_s), *difference)
         tick += each.turn.role in ("waiting", "flown")

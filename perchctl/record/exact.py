@@ -82,6 +82,66 @@ def _members(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
+@dataclasses.dataclass(frozen=True)
+class ExactField:
+    """A field of a dataclass at some depth of a type, for example ``observation.imu.t_s``.
+
+    Attributes:
+        path: the dotted names that lead to it.
+        owner: name of the dataclass that has it.
+        is_always_written: False if `to_exact_json` leaves the field out while it is None.
+    """
+
+    path: str
+    owner: str
+    name: str
+    is_always_written: bool
+
+
+def exact_fields(hint: Any, path: str = "") -> list[ExactField]:
+    """Return the fields of all dataclasses that a value of type `hint` can hold, at every depth.
+
+    `path` stands before the dotted names.
+    """
+    found: list[ExactField] = []
+    for kind in _members(hint):
+        if not dataclasses.is_dataclass(kind):
+            for part in typing.get_args(kind):
+                found += exact_fields(part, path)
+            continue
+        assert isinstance(kind, type)
+        for name, default, _ in _fields_of(kind):
+            within = f"{path}.{name}" if path else name
+            found.append(ExactField(within, kind.__name__, name, default is not None))
+            found += exact_fields(_hints(kind)[name], within)
+    return found
+
+
+def collect_written_names(hint: Any, data: Any, names: dict[str, set[str]]) -> None:
+    """Add to `names`, by dataclass, the fields that `data` holds: JSON from which `from_exact_json`
+    makes a value of type `hint`."""
+    members = _members(hint)
+    if data is None:
+        return
+    if len(members) > 1:
+        class_name, data = data
+        members = tuple(kind for kind in members if kind.__name__ == class_name)
+    (kind,) = members
+    args = typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        assert isinstance(kind, type)
+        names.setdefault(kind.__name__, set()).update(data)
+        for name in _hints(kind).keys() & data.keys():
+            collect_written_names(_hints(kind)[name], data[name], names)
+    elif typing.get_origin(kind) is tuple:
+        kinds = [args[0]] * len(data) if args[-1] is Ellipsis else args
+        for each, part in zip(kinds, data, strict=True):
+            collect_written_names(each, part, names)
+    elif typing.get_origin(kind) is dict:
+        for part in data.values() if isinstance(data, dict) else (value for _, value in data):
+            collect_written_names(args[1], part, names)
+
+
 def from_exact_json(kind: type[T], data: Any) -> T:
     """The value of `kind` that `to_exact_json` wrote. A missing field has its default.
 

@@ -23,8 +23,9 @@ import perchctl
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
 from perchctl.errors import PerchError
+from perchctl.mission import Turn
 from perchctl.profile import Profile, read_mask
-from perchctl.record.exact import to_exact_json
+from perchctl.record.exact import exact_fields, to_exact_json
 from perchctl.record.fields import FIELDS, FORMAT, SCHEMA_VERSION
 
 
@@ -55,7 +56,23 @@ def make_header(
         **camera_record(profile),
         **computer_record(),
         "fields": FIELDS,
+        "turn_fields": turn_fields(),
     }
+
+
+@cache
+def turn_fields() -> dict[str, list[str]]:
+    """Return the names of the fields that a turn is written with, by dataclass.
+
+    A later perchctl knows by them which of its fields a log cannot hold: a field that is None is
+    left out of a turn, as one that does not exist yet.
+    """
+    names: dict[str, list[str]] = {}
+    for field in exact_fields(Turn):
+        of = names.setdefault(field.owner, [])
+        if field.name not in of:
+            of.append(field.name)
+    return names
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:

@@ -26,7 +26,13 @@ from perchctl.files import file_kind
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand, Turn
 from perchctl.profile import Profile, key_and_reason
-from perchctl.record.exact import decode_line, from_exact_json
+from perchctl.record.exact import (
+    ExactField,
+    collect_written_names,
+    decode_line,
+    exact_fields,
+    from_exact_json,
+)
 from perchctl.record.fields import FIELDS, FORMAT, READABLE_VERSIONS, SCHEMA_VERSION
 from perchctl.record.header import computer_record
 from perchctl.vision import CameraModel
@@ -90,6 +96,40 @@ class FlightLog:
     def turns(self) -> list[Turn]:
         """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
         return [parse_turn(record) for record in self.turn_records]
+
+    @cached_property
+    def unknown_fields(self) -> tuple[ExactField, ...]:
+        """The fields of a turn that this log cannot hold, because an older perchctl wrote it; in
+        `turns` they have their default. Errors: InvalidValue.
+
+        A field of a command is never unknown: its default is what the older perchctl sent.
+        """
+        known = self.header.get("turn_fields")
+        if not isinstance(known, dict):
+            known = self._written_names()
+        return tuple(
+            each
+            for each in exact_fields(Turn)
+            if each.name not in known.get(each.owner, (each.name,))
+            and not each.path.startswith("command.")
+        )
+
+    def _written_names(self) -> dict[str, set[str]]:
+        """By dataclass the names of the fields that a log without ``turn_fields`` may hold.
+
+        A field that is left out while it is None counts as held: None may be what it was.
+        """
+        names: dict[str, set[str]] = {}
+        if self.turns:  # readable
+            for record in self.turn_records:
+                collect_written_names(Turn, _whole_turn(record), names)
+        for each in exact_fields(Turn):
+            is_since_4 = each.owner == "Turn" and each.name in ("outcome", "reason", "error")
+            if each.is_always_written or (is_since_4 and self.header["version"] < 4):
+                continue
+            if each.owner in names:
+                names[each.owner].add(each.name)
+        return names
 
     @cached_property
     def sent(self) -> list[SentCommand]:
@@ -371,13 +411,17 @@ def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:
 
 def parse_turn(record: dict[str, Any]) -> Turn:
     """The turn of a record, to the same bits. Errors: InvalidValue."""
+    return parse_exact(Turn, _whole_turn(record))
+
+
+def _whole_turn(record: dict[str, Any]) -> dict[str, Any]:
+    """The record with the observation's telemetry, which a line holds once: among the samples."""
     obs, taken = record.get("observation"), record.get("taken")
     if isinstance(obs, dict) and "telemetry" not in obs and isinstance(taken, dict):
-        # The newest sample of the turn stands in the line once.
         samples = taken.get("late") or taken.get("samples")
         if isinstance(samples, list) and samples:
-            record = record | {"observation": obs | {"telemetry": samples[-1]}}
-    return parse_exact(Turn, record)
+            return record | {"observation": obs | {"telemetry": samples[-1]}}
+    return record
 
 
 def parse_exact(kind: type[Exact], record: Mapping[str, Any]) -> Exact:

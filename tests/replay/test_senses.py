@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -104,9 +105,15 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not found.seen.end_reason
 
 
-def test_a_source_that_ends_does_so_again(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlightLog, list[Picture]]:
+    """A flight whose camera ends on the way."""
+    return flown(tmp_path_factory.mktemp("ended"), Rig(camera=Camera(frames=40)))
+
+
+def test_a_source_that_ends_does_so_again(ended: tuple[FlightLog, list[Picture]]) -> None:
     """By its own name, which the planner was shown."""
-    log, pictures = flown(tmp_path, Rig(camera=Camera(frames=40)))
+    log, pictures = ended
     observed = [turn.observation for turn in log.turns if turn.observation is not None]
     assert observed[-1].camera_problem == "the scripted camera has ended"
     assert seen_again(log, pictures).is_identical
@@ -180,6 +187,57 @@ def test_what_is_wrong_with_the_pictures_ends_them_and_not_the_planner_s_replay(
     assert f"up to frame {found.seen.frames} of {found.seen.frames_flown}" in line
     assert ("to the bit" in line) is (frames > 0)
     assert why in record["ended"]
+
+
+def older(log: FlightLog, path: str, known: dict[str, list[str]] | None) -> FlightLog:
+    """As one would have it that does not know a field of the observation yet; `known`: the names
+    that its header has."""
+    *owners, name = path.split(".")
+    records = copy.deepcopy(log.turn_records)
+    for record in records:
+        part = record.get("observation")
+        for owner in owners:
+            part = part and part.get(owner)
+        if part:
+            part.pop(name, None)
+    return replace(log, turn_records=records, header=log.header | {"turn_fields": known})
+
+
+@pytest.mark.parametrize(
+    ("path", "owner", "says_so"),
+    [
+        ("imu.steady_aside_s", "ImuMotion", True),
+        ("imu.steady_aside_s", "ImuMotion", False),  # it is always written, and is not there
+        ("imu", "Observation", False),
+        ("camera_problem", "Observation", True),  # left out while there is none
+    ],
+)
+def test_a_field_that_the_log_does_not_hold_is_not_compared_and_named(
+    ended: tuple[FlightLog, list[Picture]], path: str, owner: str, says_so: bool
+) -> None:
+    log, pictures = ended
+    all_known = log.header["turn_fields"]
+    known = {**all_known, owner: [n for n in all_known[owner] if n != path.split(".")[-1]]}
+    found = seen_again(older(log, path, known if says_so else None), pictures)
+    assert found.seen is not None
+    assert not found.seen.differences
+    assert found.uncompared == [path] or {n.split(".")[0] for n in found.uncompared} == {path}
+    assert found.record()["not_compared"] == found.uncompared
+    assert any(path in note and "not compared" in note for note in found.notes)
+    lost = seen_again(older(log, path, all_known), pictures)
+    assert lost.seen is not None
+    assert lost.seen.differences[0].field.startswith(path)
+    assert lost.uncompared == []
+
+
+def test_a_field_that_may_have_been_none_is_compared(
+    ended: tuple[FlightLog, list[Picture]],
+) -> None:
+    """In a log that does not say which fields it knows: the camera may have had no problem."""
+    log, pictures = ended
+    found = seen_again(older(log, "camera_problem", None), pictures)
+    assert found.seen is not None
+    assert found.seen.differences[0].field == "camera_problem"
 
 
 def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -> None:
