@@ -39,7 +39,7 @@ MOST_LINES = {
 }
 MOST_FILES = 220
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
-CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 35.06, 0.106, 0.05
+CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 35.06, 0.106, 0.06
 MOST_MEDIAN_LINES = 15  # of a function
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 

@@ -154,16 +154,25 @@ def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]
     share = slice(None, None, 1 + len(errors) // MOST_ROWS)
     power, pull, place = power[share], pull[share], place[share]
     n = len(power)
-    kept = place[:, None, None] != np.arange(g + 1)[:, None]  # the last one keeps all
     rng = np.random.default_rng(_STREAM)
     passes = max(LEAST_PASSES, math.ceil(LEAST_RUN_ROWS / n))
     order = np.concatenate([rng.permutation(n) for _ in range(passes)])
     first = np.minimum(START_STEP, 0.5 / np.maximum(power.max(axis=0), 1.0))
-    w = np.full((g + 1, 4), start)
-    for taken, row in enumerate(order.tolist()):
-        step = first / (1.0 + 0.5 * first * taken)
-        w -= kept[row] * (step * power[row] * w + step * pull[row])
-    return w[-1], w[:-1]
+    step = first / (1.0 + 0.5 * first * np.arange(len(order))[:, None])
+    shrink, shift = 1.0 - step * power[order], -step * pull[order]
+    held_out = [place[order] != position for position in range(g)]
+    folds = np.array([_run(start, shrink[kept], shift[kept]) for kept in held_out])
+    return _run(start, shrink, shift), folds
+
+
+def _run(start: float, shrink: Array, shift: Array) -> Array:
+    """The last w (4,) of ``w <- shrink[k] w + shift[k]``, which begins at `start`.
+
+    `shrink`, `shift`: (n, 4). By one sum, because the recursion is linear.
+    """
+    product = np.cumprod(shrink[::-1], axis=0)  # of the last 1, 2, ... n factors
+    later = np.vstack([product[-2::-1], np.ones(4)])  # of the factors behind each row
+    return np.asarray(product[-1] * start + (shift * later).sum(axis=0))
 
 
 def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
