@@ -5,6 +5,7 @@ Examples are drawn the same in each run, and no time decides a test.
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterator
 
@@ -13,6 +14,11 @@ from hypothesis import settings
 
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
+
+# One core for each worker and for each process that a test starts: threads of BLAS and OpenCV that
+# wait for a core of another worker take up to three times the processor's time.
+for _name in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_name, "1")
 
 # What tests start gets its signals as from a terminal, also where nohup or a background shell
 # started the tests with some of them ignored, which children inherit.

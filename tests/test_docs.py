@@ -23,9 +23,10 @@ from perchctl.commands.command_line import COMMANDS
 from perchctl.flight import fly_lockstep
 from perchctl.profile import Profile
 from perchctl.profile.keys import keys
+from tests.helpers import log as made_up_log
 from tests.helpers.boards import CHARUCO, render_folder
 from tests.helpers.decided import decided_here
-from tests.helpers.flights import ROOT, SEED, short_profile
+from tests.helpers.flights import ROOT, SEED, SHORT, short_profile
 from tests.helpers.gear import write_turned_about
 from tests.helpers.mounting import hand, seen
 from tests.helpers.recording import make_recording
@@ -47,8 +48,8 @@ CAMCHAIN = """cam0:
   intrinsics: [400.5, 401.5, 320.25, 240.75]
   resolution: [640, 480]
 """
-QUICK = """extends: sim
-planner: {perching_time_s: 0.3}
+QUICK = f"""extends: {SHORT}
+planner: {{perching_time_s: 0.3}}
 """
 """A flight that lands again before it has left the floor; whole ones are flown in tests/flight."""
 TOOLS = ("pytest", "ruff ", "mypy", "sphinx-build ")
@@ -109,7 +110,7 @@ def cheap(line: str) -> list[str]:
             words += ["--positions", "3", "--frames", "10"]
         case ["perchctl", "calibrate"] if words[2] == "mount":  # without a vehicle in a hand
             words = [*words[:3], "-p", "my_vehicle.yaml", "--from", "hand.jsonl"]
-        case ["perchctl", "log"]:
+        case ["perchctl", "log"] if "replay" not in words:
             words = ["short.jsonl" if word.endswith(".jsonl") else word for word in words]
         case ["perchctl", "track"]:  # without a camera
             words = [WITHOUT_A_CAMERA.get(word, word) for word in words]
@@ -130,7 +131,8 @@ def cheap(line: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the commands name: pictures, a video and its calibration, profiles."""
+    """A folder with what the commands name: pictures, a video and its calibration, profiles, and
+    the made-up log of a flight."""
     folder = tmp_path_factory.mktemp("place")
     make_recording(folder)
     render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
@@ -138,6 +140,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     MountingRecording.write(folder / "hand.jsonl", [seen(hand("pivot"))])
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
+    made_up_log.write(folder / "short.jsonl", summary=made_up_log.SUMMARY)
     (folder / "last.jsonl").write_bytes(b"".join(decided_here("searched-out")))
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
     for name in ("my_vehicle", "left", "right", "large"):
@@ -176,9 +179,12 @@ def run_python(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 ONCE = {tuple(cheap(line)): line for line in command_lines() if not line.startswith(TOOLS)}
 """Lines that come to the same command are run once."""
 LONG = (
+    "dask ",
     "perchctl log plot",
     "perchctl log compare",
     "perchctl log export",
+    "perchctl log film",
+    "perchctl log report",
     "perchctl simulate",
     "perchctl calibrate aideck:",
     "perchctl calibrate images:board -b",
@@ -209,12 +215,12 @@ def test_every_command_line_runs(
     shutil.copytree(place, tmp_path, dirs_exist_ok=True)
     if "collect" in words:
         (tmp_path / "session.csv").unlink()
-    if "short.jsonl" in words:
+    if line.startswith(LONG) and "short.jsonl" in words:
         shutil.copyfile(request.getfixturevalue("short_log"), tmp_path / "short.jsonl")
     if words[:2] == ["perchctl", "log"]:
         log = tmp_path / "perchctl-logs" / "flight_short.jsonl"
         log.parent.mkdir()
-        shutil.copyfile(request.getfixturevalue("short_log"), log)
+        shutil.copyfile(tmp_path / "short.jsonl", log)
     before = set(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     if "--cluster" in words:
