@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -197,9 +198,13 @@ class SleepyClock(Clock):
             self._link.advance_to(self.now() + self._for_s)
 
 
+@cache
 def noise(number: int) -> np.ndarray:
+    """The same picture for each flight, which none may change."""
     rng = np.random.default_rng(number)
-    return rng.normal(120, 6, SIZE_PX[::-1]).clip(0, 255).astype(np.uint8)
+    picture = rng.normal(120, 6, SIZE_PX[::-1]).clip(0, 255).astype(np.uint8)
+    picture.setflags(write=False)
+    return picture
 
 
 @dataclass
