@@ -70,7 +70,7 @@ def answers(draw: st.DrawFn) -> dict[str, str]:
     }
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(answers())
 def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> None:
     assert said.keys() == QUESTIONS.keys()

@@ -60,7 +60,7 @@ def axis_m(mount: Mounting, height_m: float) -> tuple[float, float]:
     return x / z * height_m, y / z * height_m
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(mounts, st.floats(0.6, 3.0), angles, angles, st.floats(0.0, 0.97))
 def test_within_the_reach_the_marker_is_whole_at_any_turn_and_beyond_it_some_is_cut(
     mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
@@ -81,7 +81,7 @@ def test_within_the_reach_the_marker_is_whole_at_any_turn_and_beyond_it_some_is_
     assert not all(seen(beyond_m, way, way + turn) for way in around for turn in ahead)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(mounts, angles, angles, st.floats(-0.9, 0.9), st.floats(-0.9, 0.9), st.floats(0.8, 2.5))
 def test_a_sight_is_the_lens_s_wherever_the_body_stands(
     mount: Mounting, yaw_rad: float, target_yaw: float, x: float, y: float, height_m: float

@@ -72,7 +72,7 @@ def test_lines_find_corners_without_bias(
 def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float) -> None:
     """As where a vehicle in motion has its target expected, in the last decimetres."""
     fitted = 0
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         rvec, tvec = pose_of(*rng.uniform(-0.01, 0.01, 2), 0.18, rng.uniform(-3.1, 3.1))
         image = render(rvec, tvec, noise=3.0, blur_px=0.8, seed=seed)
@@ -83,7 +83,7 @@ def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float)
         if result is not None:
             fitted += 1
             assert np.abs(result.corners_px - true).max() < 0.1
-    assert fitted >= 6
+    assert fitted >= 3
 
 
 @pytest.mark.parametrize("curl", [-0.02, 0.02])
