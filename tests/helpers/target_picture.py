@@ -15,6 +15,7 @@ from perchctl.vision import CameraModel, undistort
 
 LARGE_M, SMALL_M, SHEET_M = 0.150, 0.025, 0.200
 BACKGROUND = 120.0
+_FAR = 12.0  # so many widths of an edge from it there is no grey between, by 3e-12
 Drawn = tuple[str, int, float]
 """A marker by its dictionary, its id, and its side in metres."""
 MARKERS: dict[str, Drawn] = {
@@ -96,15 +97,24 @@ def bits_of(name: str, index: int) -> NDArray[np.uint8]:
 
 
 def _pattern(name: str, index: int, side_m: float, x: Array, y: Array, soft: Array) -> Array:
+    dark, half_m = np.zeros_like(x), side_m / 2 + _FAR * soft
+    on = (np.abs(x) < half_m) & (np.abs(y) < half_m)
+    x, y, soft = x[on], y[on], soft[on]
     black = np.pad(1.0 - bits_of(name, index), 1, constant_values=1.0)
     edges = np.linspace(-side_m / 2, side_m / 2, len(black) + 1)
     columns = np.diff(_step(edges[:, None] - x, soft), axis=0)
     bands = np.diff(_step(edges[:, None] + y, soft), axis=0)  # rows run against y
-    return np.einsum("rn,rc,cn->n", bands, black, columns)
+    dark[on] = np.einsum("rn,rn->n", bands, black @ columns)
+    return dark
 
 
 def _step(distance: Array, soft: Array) -> Array:
-    return 0.5 * (1.0 + np.tanh(0.8 * np.sqrt(2.0) * distance / soft))
+    """From 0 to 1."""
+    away = distance / soft
+    step = np.where(away > 0.0, 1.0, 0.0)
+    near = np.abs(away) < _FAR
+    step[near] = 0.5 * (1.0 + np.tanh(0.8 * np.sqrt(2.0) * away[near]))
+    return step
 
 
 def _box(v: Array, low: float, high: float, soft: Array) -> Array:
