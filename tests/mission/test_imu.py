@@ -46,10 +46,13 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     assert alive.fell_s > 0.0
 
 
+HUNG = [telemetry(0.01 * i, 1.9) for i in range(100)]
+UNTIL_THEN = flown(HUNG)
+
+
 def since_heard(after: Telemetry, before: Telemetry | None = None) -> ImuMotion:
     """What a silence leaves, of a vehicle that hung at 1.9 m before it."""
-    hung = [telemetry(0.01 * i, 1.9) for i in range(100)]
-    return flown(hung).with_sample(before or hung[-1], after)
+    return UNTIL_THEN.with_sample(before or HUNG[-1], after)
 
 
 @given(silent_s=st.floats(GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
