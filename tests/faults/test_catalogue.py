@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,15 +35,25 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
             assert all(effect.keywords.get("for_s", 1.0) > 0.0 for effect in case.effects)
 
 
+def rounded(value: Any) -> Any:
+    """To what no computer's sine can change."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [rounded(each) for each in value]
+    return round(float(value), 9) if isinstance(value, float) else value
+
+
 def test_the_same_seeds_draw_the_same_cases_for_ever() -> None:
     """Campaigns of before are repeated by their seeds."""
     drawn = hashlib.sha256()
     for seed in range(1000):
         case = draw_case(seed, SCENARIO)
         effects = [(effect.func.__name__, effect.keywords) for effect in case.effects]
-        drawn.update(repr((case.fault.name, case.phase, case.moment_s, effects)).encode())
-        drawn.update(repr((case.landed_from, case.landed_after_s, case.first_hold_ratio)).encode())
-    assert drawn.hexdigest()[:16] == "3b5972a2ac966813"
+        told = (case.fault.name, case.phase, case.moment_s, effects)
+        then = (case.landed_from, case.landed_after_s, case.first_hold_ratio)
+        drawn.update(repr((rounded(told), rounded(then))).encode())
+    assert drawn.hexdigest()[:16] == "73f303e5471d3caf"
 
 
 @pytest.mark.parametrize(("name", "stops"), [("operator-held", False), ("operator-hammers", True)])
