@@ -39,6 +39,17 @@ def _own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_radio() -> Iterator[None]:
+    """A Crazyradio or a Crazyflie on USB that is plugged into this computer is nobody's here."""
+    from cflib.drivers import cfusb, crazyradio
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(crazyradio, "_find_devices", lambda serial=None: [])
+        patch.setattr(cfusb, "_find_devices", lambda: [])
+        yield
+
+
 SLOW_FIRST = (
     "flight/test_flights.py",
     "flight/test_realtime.py",

@@ -84,7 +84,7 @@ def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> 
         ("--source=", 30, ["camera:N"]),
         ("--dry-run --source webcam:0", 30, ["'webcam:0'", "camera:N"]),
         ("--seed -1", 30, ["-1", "negative"]),
-        (f"--uri {NOWHERE} --source camera:9 --yes", 20, ["camera:9"]),
+        (f"--uri {NOWHERE} --source camera:97 --yes", 20, ["camera:97"]),
         ("--source video:none.mp4", 20, ["none.mp4"]),
         (f"--uri {NOWHERE} --source video:none.mp4", 2, ["recording", NOWHERE]),
         ("-p crazyflie --source video:none.mp4 --dry-run", 2, ["recording", "--source"]),
@@ -111,7 +111,7 @@ def test_a_log_that_cannot_be_written(command: str, folder: str) -> None:
 
 
 def test_nobody_to_ask_is_no_consent() -> None:
-    said = run_apart("fly", "--uri", NOWHERE, "--source", "camera:9")
+    said = run_apart("fly", "--uri", NOWHERE, "--source", "camera:97")
     assert said.code == 2
     assert "--yes" in said.complaint
     assert NOWHERE in said.complaint
@@ -126,7 +126,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nobody_is_asked_before_the_camera_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("builtins.input", pytest.fail)
     with pytest.raises(SystemExit) as left:
-        app(["fly", "--uri", NOWHERE, "--source", "camera:9"])
+        app(["fly", "--uri", NOWHERE, "--source", "camera:97"])
     assert left.value.code == 20
 
 
