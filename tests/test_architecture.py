@@ -120,6 +120,9 @@ def module_name(path: Path) -> str:
 MODULES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
 
 
+HOLD_STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)
+
+
 def imports_of(name: str, source: str, is_package: bool, known: set[str]) -> list[Import]:
     """All imports of a module; `from package import module` counts as the module."""
     found: list[Import] = []
@@ -134,7 +137,7 @@ def imports_of(name: str, source: str, is_package: bool, known: set[str]) -> lis
                 inner = f"{base}.{alias.name}"
                 target = inner if inner in known else base
                 found.append(Import(name, target, node.lineno, at_run_time, at_load))
-        inside_function = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        inside_function = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             for child in node.body:
                 visit(child, False, at_load)
@@ -142,7 +145,8 @@ def imports_of(name: str, source: str, is_package: bool, known: set[str]) -> lis
                 visit(child, at_run_time, at_load)
             return
         for child in ast.iter_child_nodes(node):
-            visit(child, at_run_time, at_load and not inside_function)
+            if isinstance(child, HOLD_STATEMENTS):
+                visit(child, at_run_time, at_load and not inside_function)
 
     visit(ast.parse(source), True, True)
     return found
