@@ -130,6 +130,7 @@ class Pilot(Client):
         self.t_s = 0.0
         self.samples: list[tuple[float, dict[str, float]]] = []
         self._stamps: list[float] = []
+        self._due: list[float] = []
         self._periods_s: list[float] = []
         self._news = threading.Condition()
 
@@ -242,17 +243,19 @@ class Pilot(Client):
             self.samples.append((stamp_ms / 1000.0, data))
             if index < len(self._stamps):
                 self._stamps[index] = stamp_ms / 1000.0
-            self._news.notify_all()
+            if self._has_arrived():
+                self._news.notify_all()  # and not for each packet of the way there
+
+    def _has_arrived(self) -> bool:
+        return all(stamp >= due for stamp, due in zip(self._stamps, self._due, strict=False))
 
     def _sync(self) -> None:
         counts = [int(self.t_s / period_s + 1e-6) for period_s in self._periods_s]
         periods = zip(counts, self._periods_s, strict=True)
-        due = [count * period_s - 1e-6 if count else -1.0 for count, period_s in periods]
         with self._news:
-            arrived = self._news.wait_for(
-                lambda: all(s >= at for s, at in zip(self._stamps, due, strict=True)), WAIT_S
-            )
-        assert arrived, f"no log data up to {due} s, only {self._stamps}"
+            self._due = [count * period_s - 1e-6 if count else -1.0 for count, period_s in periods]
+            arrived = self._news.wait_for(self._has_arrived, WAIT_S)
+        assert arrived, f"no log data up to {self._due} s, only {self._stamps}"
 
 
 def height(pilot: Pilot) -> float:
