@@ -148,7 +148,7 @@ long = pytest.mark.long
                  ["ALIGN", ..., "LANDING", "LANDED"], id="camera gone"),
     # The same bytes again and again are no measurement, though they show the target.
     pytest.param({}, {"camera_freeze_at_s": FAULT_S}, Outcome.SAFETY, 52, "stands still",
-                 ["ALIGN", ..., "LANDING", "LANDED"], id="camera frozen"),
+                 ["ALIGN", ..., "LANDING", "LANDED"], marks=long, id="camera frozen"),
     pytest.param(LOW, {"battery_rest_v": 3.3}, Outcome.SAFETY, 52, "battery",
                  ["LANDING", "LANDED"], marks=long, id="battery nearly empty"),
     # It would just do here: the gate does not bet on it, and lands with the figures.

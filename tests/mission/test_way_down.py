@@ -389,7 +389,9 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
     ("frozen", "ends"),
     [
         ({"thrust": 0.0, "supervisor": AIRBORNE}, Phase.PERCHED),
-        ({"thrust": 1000.0, "supervisor": READY}, Phase.ABORTED),
+        pytest.param(
+            {"thrust": 1000.0, "supervisor": READY}, Phase.ABORTED, marks=pytest.mark.long
+        ),
         ({"thrust": 20000.0, "supervisor": AIRBORNE}, Phase.ABORTED),
     ],
 )

@@ -107,7 +107,7 @@ def _steps_up(sample: Telemetry) -> Telemetry:
     ("until_s", "spoil", "words"),
     [
         (math.inf, lambda s: replace(s, yaw_rad=1.0), "heading jumped"),
-        (math.inf, _steps_up, "the state estimate jumped"),
+        pytest.param(math.inf, _steps_up, "the state estimate jumped", marks=pytest.mark.long),
         (4.0, lambda s: replace(s, velocity_mps=(math.nan, 0.0, 0.0)), "no telemetry"),
     ],
     ids=["heading", "height", "no number for long"],

@@ -110,10 +110,14 @@ def catch_a_slip(pilot: Pilot, share: float, answer: str) -> float:
 @pytest.mark.parametrize(
     ("answer", "share", "lost_m"),
     [
-        ("below", 0.24, 0.67), ("below", 0.73, 0.86), ("below", 0.92, 1.03),
-        ("above", 0.24, 0.09), ("above", 0.73, 0.53), ("above", 0.92, 0.80),
+        ("below", 0.24, 0.67),
+        pytest.param("below", 0.73, 0.86, marks=pytest.mark.long),
+        pytest.param("below", 0.92, 1.03, marks=pytest.mark.long),
+        pytest.param("above", 0.24, 0.09, marks=pytest.mark.long),
+        ("above", 0.73, 0.53),
+        pytest.param("above", 0.92, 0.80, marks=pytest.mark.long),
     ],
-)  # fmt: skip
+)
 def test_catching_a_slip(pilot: Pilot, answer: str, share: float, lost_m: float) -> None:
     """Row "Catching a slip during the release": below the contact it costs 0.67, 0.86, 1.03 m,
     above until vz >= 0 and then down 0.09, 0.53, 0.80 m (magnet 0.24, 0.73, 0.92)."""

@@ -104,8 +104,8 @@ def test_the_thrust_budget(pilot: Pilot) -> None:
     ("mass_kg", "mode", "lowest_m", "within_m"),
     [
         (0.042, "hover", 0.47, 0.025),
-        (0.030, "hover", 0.74, 0.01),
-        (0.042, "zdistance", 0.45, 0.045),
+        pytest.param(0.030, "hover", 0.74, 0.01, marks=pytest.mark.long),
+        pytest.param(0.042, "zdistance", 0.45, 0.045, marks=pytest.mark.long),
         (0.042, "position", 0.8, 0.05),
     ],
 )

@@ -73,7 +73,9 @@ def refined(picture: NDArray[np.uint8], corners: NDArray[np.float32]) -> NDArray
     return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize(
+    "page", [PAGES[0], *(pytest.param(page, marks=pytest.mark.long) for page in PAGES[1:])]
+)
 def test_the_pdf_at_600_dpi_is_read_and_true_to_size(page: str) -> None:
     """So are the rulers, the line itself and half a tick at each end; and the back's cross and
     circle lie over the front's centre, the middle of the paper."""

@@ -196,11 +196,11 @@ def errors(setup: Pipeline, in_world: bool, bias_rad: float, scale: float) -> Ar
 @pytest.mark.parametrize(
     ("in_world", "bias_rad", "sigma_deg", "scale", "size_sigma"),
     [
-        (False, 0.0, 0.3, 1.0, 0.0),
-        (True, 0.0, 0.0, 1.0, 0.0),
+        pytest.param(False, 0.0, 0.3, 1.0, 0.0, marks=pytest.mark.long),
+        pytest.param(True, 0.0, 0.0, 1.0, 0.0, marks=pytest.mark.long),
         (True, BIAS_RAD, 0.3, 1.0, 0.0),
         (False, 0.0, 0.3, 1.007, 0.005),
-        (True, 0.0, 0.0, 0.993, 0.005),
+        pytest.param(True, 0.0, 0.0, 0.993, 0.005, marks=pytest.mark.long),
     ],
 )
 def test_the_filter_is_no_worse_than_the_stills_and_knows_how_good_it_is(

@@ -190,7 +190,7 @@ def test_markers_that_contradict_are_counted_and_the_better_is_used(
     position_m=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
     later_s=st.floats(0.0, 0.1),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_the_estimate_follows_the_vehicle(
     build: Build,
     angles: tuple[float, float, float],
@@ -318,7 +318,7 @@ def rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31))
 def test_places_that_step_are_overruled_by_speeds(seed: int) -> None:
     """2 mm of steps are 5 px at 0.2 m."""

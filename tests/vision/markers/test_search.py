@@ -77,16 +77,16 @@ EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
 NEAR, ASIDE = pose_of(0.05, -0.05, 1.2, 0.4), pose_of(-0.45, 0.3, 1.2, 0.4)
 
 
-@pytest.mark.parametrize("lost", [0, 1, 2, 3, 7, 40])
+@pytest.mark.parametrize("lost", [0, 1, 2, 3, 7, pytest.param(40, marks=pytest.mark.long)])
 @pytest.mark.parametrize("place", [NEAR, ASIDE])
 def test_what_comes_back_is_found_by_the_second_frame(
     build: Build, lost: int, place: tuple[np.ndarray, np.ndarray]
 ) -> None:
     """Wherever it is by then, sharp as it is; a jump out of the window costs one frame at most."""
     images = [render(*NEAR)] * 3 + [EMPTY] * lost + [render(*place)] * 2
-    state, seen = PipelineState(), []
+    state, seen, pipeline = PipelineState(), [], build()
     for k, image in enumerate(images):
-        state, output = step(state, Frame(k, k / 30.0, image), None, build())
+        state, output = step(state, Frame(k, k / 30.0, image), None, pipeline)
         seen.append(output.detections.large is not None)
     assert seen[: 3 + lost] == [True] * 3 + [False] * lost
     assert any(seen[3 + lost :])
