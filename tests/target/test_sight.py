@@ -236,6 +236,7 @@ def test_gaps_are_named(paper_design: TargetDesign, changes: dict[str, Any], sai
     assert said in "".join(warnings)
 
 
+@pytest.mark.long
 def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position() -> None:
     """From the search height it would be near enough."""
     ground = short_profile({"positioning": "target"}, base="sim")
