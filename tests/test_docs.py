@@ -248,11 +248,20 @@ def notebook(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(place, tmp_path_factory.mktemp("notebook") / "place"))
 
 
-@pytest.mark.parametrize("number", range(len(blocks(TEXT[DOCS / "python.md"], "python"))))
+EXAMPLES = blocks(TEXT[DOCS / "python.md"], "python")
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(number, marks=[pytest.mark.long] * ("fly_lockstep" in text))
+        for number, text in enumerate(EXAMPLES)
+    ],
+)
 def test_every_example_runs(
     number: int, notebook: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = blocks(TEXT[DOCS / "python.md"], "python")[number]
+    source = EXAMPLES[number]
     assert len(source.strip().splitlines()) <= 10
     if "import pandas" in source:
         pytest.importorskip("pandas", reason="the example needs pandas (in the extra [dev])")

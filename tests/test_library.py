@@ -276,6 +276,7 @@ def test_poses_of_a_folder_become_a_table_and_datagrams(here: Path) -> None:
         open_camera("images:nothing")
 
 
+@pytest.mark.long
 def test_a_row_of_your_own_waits_for_a_switch(monkeypatch: pytest.MonkeyPatch) -> None:
     import own_row
 
