@@ -5,6 +5,7 @@ Examples are drawn the same in each run, and no time decides a test.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -27,6 +28,36 @@ for _name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"):
     if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
         _usual = signal.default_int_handler if _name == "SIGINT" else signal.SIG_DFL
         signal.signal(_number, _usual)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--as-recorded",
+        action="store_true",
+        help="take each log for one of this computer, whatever its header says: no test may care",
+    )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _as_recorded(request: pytest.FixtureRequest) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        if request.config.getoption("--as-recorded"):
+            from perchctl.record import FlightLog
+
+            patch.setattr(FlightLog, "computer_differences", "")
+        yield
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One more than cores: some tests wait for a radio, a camera or another process."""
+    return len(os.sched_getaffinity(0)) + 1 if hasattr(os, "sched_getaffinity") else 2
+
+
+def pytest_collection_finish() -> None:
+    """What has been loaded by now stays to the end: no collection of garbage looks through it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
