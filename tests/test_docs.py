@@ -52,7 +52,7 @@ QUICK = f"""extends: {SHORT}
 planner: {{perching_time_s: 0.3}}
 """
 """A flight that lands again before it has left the floor; whole ones are flown in tests/flight."""
-TOOLS = ("pytest", "ruff ", "mypy", "sphinx-build ")
+TOOLS = ("pytest", "env $(python ", "ruff ", "mypy", "sphinx-build ")
 """`.ci/run` runs these; a test does not run the tests."""
 AIDECK = "aideck://192.168.4.1"
 WITHOUT_A_CAMERA = {
