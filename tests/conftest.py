@@ -21,6 +21,11 @@ settings.load_profile("repeatable")
 for _name in ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_name, "1")
 
+# By these somebody's shell, or a service that runs tests, asks for colours, another width, or
+# another vehicle. Libraries read some of them as they are loaded.
+for _name in ("CFLIB_URI", "COLUMNS", "FORCE_COLOR", "GITHUB_ACTIONS", "NO_COLOR", "PY_COLORS"):
+    os.environ.pop(_name, None)
+
 # What tests start gets its signals as from a terminal, also where nohup or a background shell
 # started the tests with some of them ignored, which children inherit.
 for _name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"):
