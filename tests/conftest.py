@@ -59,10 +59,14 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return len(os.sched_getaffinity(0)) + 1 if hasattr(os, "sched_getaffinity") else 2
 
 
+gc.disable()  # until all is loaded, of which hardly anything is garbage
+
+
 def pytest_collection_finish() -> None:
     """What has been loaded by now stays to the end: no collection of garbage looks through it."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

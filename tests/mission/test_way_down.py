@@ -251,7 +251,15 @@ class InAHand(Motors):
 @pytest.mark.parametrize(
     ("positioning", "seen_until_s"), [("deck", math.inf), ("target", math.inf), ("target", 13.0)]
 )
-@pytest.mark.parametrize("phase", [Phase.SEARCH, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER])
+@pytest.mark.parametrize(
+    "phase",
+    [
+        pytest.param(Phase.SEARCH, marks=pytest.mark.long),
+        Phase.ALIGN,
+        Phase.ASCEND,
+        pytest.param(Phase.RECOVER, marks=pytest.mark.long),
+    ],
+)
 def test_what_a_hand_holds_below_the_target_has_not_perched(
     phase: Phase, positioning: str, seen_until_s: float
 ) -> None:

@@ -70,8 +70,8 @@ def test_they_show_all_that_matters() -> None:
     ("module", "name"),
     [
         (edge_fit, "_SHIFT_PRIOR_PX"),  # the fit of edges
-        (edge_fit, "MIN_LINE_SIGMA_PX"),
-        (pose, "_TRUST"),  # the pose
+        pytest.param(edge_fit, "MIN_LINE_SIGMA_PX", marks=pytest.mark.long),
+        pytest.param(pose, "_TRUST", marks=pytest.mark.long),  # the pose
         (the_filter, "_PUSH_S"),
     ],
 )
