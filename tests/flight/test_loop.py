@@ -108,7 +108,7 @@ def test_a_log_that_fails_is_said_once_and_landed_for_where_the_profile_wants_it
     assert "the disk is full" in said[0].reason
 
 
-@pytest.mark.parametrize("is_set", [False, True])
+@pytest.mark.parametrize("is_set", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_mirrored_picture_is_named(monkeypatch: pytest.MonkeyPatch, is_set: bool) -> None:
     real = perception.step
 

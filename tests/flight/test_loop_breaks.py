@@ -290,7 +290,8 @@ def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
 @pytest.mark.parametrize(("changed", "words"), [
     (lambda s: None if s.t_s > 2.0 else s,
      ["no telemetry for 1.0 s", "not confirmed in time: nothing was heard"]),
-    (lambda s: replace(s, thrust=50000.0), ["not confirmed in time: by its telemetry"]),
+    pytest.param(lambda s: replace(s, thrust=50000.0), ["not confirmed in time: by its telemetry"],
+                 marks=pytest.mark.long),
 ], ids=["silent", "flies on"])  # fmt: skip
 def test_a_landing_that_nobody_saw_is_no_landing(
     changed: Callable[..., Any], words: list[str]

@@ -196,7 +196,15 @@ def test_ctrl_c_works_while_the_main_thread_hangs_in_a_library() -> None:
         flight.sends("EmergencyStop", "STOP")
 
 
-@pytest.mark.parametrize("name", ["SIGHUP", "SIGTERM", "SIGQUIT", "SIGTSTP"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "SIGHUP",
+        pytest.param("SIGTERM", marks=pytest.mark.long),
+        pytest.param("SIGQUIT", marks=pytest.mark.long),
+        "SIGTSTP",
+    ],
+)
 def test_signals_that_end_or_suspend_a_program_land(name: str) -> None:
     with Hanging(60.0) as flight:
         for _ in range(2):

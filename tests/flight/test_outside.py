@@ -162,7 +162,9 @@ def test_nothing_that_tells_the_position_is_a_refusal() -> None:
     it.refused(SafetyAbort, "no positioning deck.*set positioning: mocap")
 
 
-@pytest.mark.parametrize(("for_s", "lands"), [(0.3, False), (60.0, True)])
+@pytest.mark.parametrize(
+    ("for_s", "lands"), [(0.3, False), pytest.param(60.0, True, marks=pytest.mark.long)]
+)
 def test_an_occlusion_is_held_and_a_lasting_one_landed(for_s: float, lands: bool) -> None:
     def hidden(t_s: float) -> bool:
         first = it.link.said(PositionSetpoint)

@@ -66,6 +66,7 @@ def set_to(pilot: Pilot, name: str, value: float) -> None:
     kept(pilot, name, value)
 
 
+@pytest.mark.long
 def test_covered_for_good_the_variance_grows_and_the_vehicle_slides(bare: Pilot) -> None:
     """Rows "3e-4 m^2 all the way", "0.05 m^2 4 s after the loss, 0.2 after 7 s" and "12 s, 0.9 m
     aside", at 28 g."""
@@ -99,6 +100,7 @@ def test_covered_for_a_moment_it_stays_where_it_is(bare: Pilot) -> None:
     assert max(map(abs, error_m(bare))) < 0.02
 
 
+@pytest.mark.long
 def test_pressed_and_blind_the_height_runs_away(bare: Pilot) -> None:
     """Row "z 0.1 to 0.2 m/s, variance 0.04 after 5 s and 0.2 after 8 s"."""
     bare.fresh(extra=NO_DECK, ceiling_z_m=0.95, no_target=True)

@@ -30,6 +30,7 @@ def test_release_in_position_mode_stops_at_thrust_min(pilot: Pilot) -> None:
     assert pilot.sim.truth()["magnet_engaged"]
 
 
+@pytest.mark.long
 def test_release_in_raw_mode_reaches_nothing(pilot: Pilot) -> None:
     """Row "Released in raw mode": 20000 -> PWM 25,700; 10000 -> 15,300; 5000 and less -> 0.
 
@@ -51,6 +52,7 @@ def test_release_in_raw_mode_reaches_nothing(pilot: Pilot) -> None:
     assert pilot.sim.truth()["magnet_engaged"]
 
 
+@pytest.mark.long
 def test_flying_clears_while_the_stream_lives(pilot: Pilot) -> None:
     """Row "After 2 s at PWM 0 `flying` clears by itself; `stop` + `notify` then leaves 0x020E"."""
     pilot.perch()

@@ -130,6 +130,7 @@ def test_position_to_another_mode_dips(
     assert lowest == pytest.approx(lowest_m, abs=within_m)
 
 
+@pytest.mark.long
 def test_hover_to_velocity_falls_to_the_floor(pilot: Pilot) -> None:
     """Row "hover -> velocity_world(0) falls to the floor"."""
     pilot.take_off(0.8)
@@ -157,6 +158,7 @@ def test_take_off_lags_behind_its_plan(pilot: Pilot, mass_kg: float, lift_s: flo
 # --- Signs and units --------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_position_setpoint_axes(pilot: Pilot) -> None:
     """Row "position setpoint x y z yaw: m, degrees, counter-clockwise positive"."""
     pilot.fly_to(0.8)
@@ -167,6 +169,7 @@ def test_position_setpoint_axes(pilot: Pilot) -> None:
     assert pilot.now("stateEstimate.yaw") == pytest.approx(40, abs=3)
 
 
+@pytest.mark.long
 def test_hover_setpoint_is_in_body_axes(pilot: Pilot) -> None:
     """Row "hover setpoint vx vy: body axes, +x forward, +y left; yaw rate ccw positive"."""
     hover = pilot.cf.commander.send_hover_setpoint
@@ -183,6 +186,7 @@ def test_hover_setpoint_is_in_body_axes(pilot: Pilot) -> None:
     assert pilot.sim.truth()["position_m"][0] - x1 < -0.2
 
 
+@pytest.mark.long
 def test_raw_yaw_rate_is_clockwise(pilot: Pilot) -> None:
     """Row "send_setpoint yawrate clockwise positive (+60 for 1 s gave -48 deg)"."""
     pilot.fresh(mass_kg=0.030)
@@ -210,6 +214,7 @@ def test_raw_attitude_and_the_estimates_sign(
     assert abs(moved[1 - axis]) < 0.03
 
 
+@pytest.mark.long
 def test_go_to_yaw_in_radians_and_relative_in_world_axes(pilot: Pilot) -> None:
     """Row "HL go_to yaw radians; relative=True offsets in world axes"."""
     pilot.fresh(mass_kg=0.030)
@@ -369,6 +374,7 @@ def test_landing_is_hard(pilot: Pilot) -> None:
     assert touched_mps == pytest.approx(0.55, abs=0.03)
 
 
+@pytest.mark.long
 def test_a_landing_from_the_ceiling_runs_by_its_clock(pilot: Pilot) -> None:
     """Row "the quintic runs by its clock while the vehicle stays up": then it falls, 5.8 m/s."""
     pilot.fresh(magnet_force_n=0.73 * WEIGHT_N, ceiling_z_m=2.05)

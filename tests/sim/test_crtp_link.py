@@ -251,6 +251,7 @@ def test_an_exception_in_a_with_block_drops_the_vehicle(
     assert spoiled.truth()["supervisor_info"] & LOCKED_BIT
 
 
+@pytest.mark.long
 def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
     """Row "Protocol < 12": supervisor port missing, old channels work, bit field reads 0."""
     link = {"protocol_version": 11, "missing_log_variables": ("supervisor.info",)}
@@ -272,6 +273,7 @@ def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
             assert process.truth()["supervisor_info"] & LOCKED_BIT
 
 
+@pytest.mark.long
 def test_a_lost_packet_hangs_cflibs_connect(spoiled: SimProcess) -> None:
     """Row "UdpDriver sets needs_resending=False: with loss a connect can hang for ever"."""
     spoiled.silence_link(0.01)
@@ -284,6 +286,7 @@ def test_a_lost_packet_hangs_cflibs_connect(spoiled: SimProcess) -> None:
         assert not client.cf.link.needs_resending
 
 
+@pytest.mark.long
 def test_a_silent_peer_is_never_reported(pilot: Pilot) -> None:
     """Row "a silent peer is never reported": no answer, no error; then it is back."""
     lost: list[str] = []

@@ -192,6 +192,7 @@ def test_ranges_agree_with_the_renderer(bench: ModuleType, focal_px: float, blur
         assert designed == pytest.approx(measured, rel=0.15), name
 
 
+@pytest.mark.long
 def test_the_paper_s_ranges_and_where_they_differ(paper_design: TargetDesign) -> None:
     """z2 and z3 agree; a blur that explains z1 = 115 cm would be 3.5 px, not 2.5."""
     design = paper_design
@@ -218,6 +219,7 @@ def test_z3_is_the_geometry_s() -> None:
     assert view.nearest_m(turned, behind, np.zeros(3)) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
