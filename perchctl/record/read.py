@@ -107,12 +107,13 @@ class FlightLog:
         known = self.header.get("turn_fields")
         if not isinstance(known, dict):
             known = self._written_names()
-        return tuple(
-            each
-            for each in exact_fields(Turn)
-            if each.name not in known.get(each.owner, (each.name,))
-            and not each.path.startswith("command.")
-        )
+        found = []
+        for each in exact_fields(Turn):
+            names = known.get(each.owner)
+            is_listed = not isinstance(names, (list, set)) or each.name in names
+            if not (is_listed or each.path.startswith("command.")):
+                found.append(each)
+        return tuple(found)
 
     def _written_names(self) -> dict[str, set[str]]:
         """By dataclass the names of the fields that a log without ``turn_fields`` may hold.
