@@ -224,10 +224,11 @@ def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     found: list[str] = []
     why = ["the radio did not answer in time"]
 
+    init_cflib()
+
     def run() -> None:
         from cflib import crtp
 
-        init_cflib()
         with contextlib.suppress(Exception):  # whatever the driver raises
             why[0] = _radio_problem()
         for driver in crtp.CLASSES:
