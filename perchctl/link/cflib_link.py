@@ -137,6 +137,10 @@ class CflibLink:
             return f"nothing heard for {silent_s:.1f} s"
         return None
 
+    def new_notes(self) -> list[str]:
+        """Sentences on what went wrong and did not matter, since the last call."""
+        return [] if self._sender is None else self._sender.new_notes()
+
     def close(self) -> None:
         """Close when nothing flies; otherwise leave the link without its farewell packet.
 

@@ -22,7 +22,8 @@ class GuardedLink:
 
     A reader thread asks it for telemetry and problems, and the `Sender`'s threads hand it commands
     and ask the watchdog, so nothing waits for a call of it that hangs. An error that it raises, an
-    invalid sample, or a call longer than `HANGS_S` counts as a lost link.
+    invalid sample, or a call longer than `HANGS_S` counts as a lost link, until it works again;
+    errors of `send` do once they last for `HANGS_S`.
     """
 
     def __init__(self, inner: VehicleLink, clock: Callable[[], float]) -> None:
@@ -30,10 +31,8 @@ class GuardedLink:
         self._lock = threading.Lock()
         self._waiting: list[Telemetry] = []  # that the loop has not taken yet
         self._newest: Telemetry | None = None
-        self._failure: str | None = None  # permanent
-        self._trouble: str | None = None  # the link's own word, of the last round
+        self._trouble: str | None = None  # the link's own word, or its error, of the last round
         self._answered_s: float | None = None  # end of the reader's last round
-        self._send_error = ""  # of the last command
         self._closing = threading.Event()
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
@@ -59,9 +58,11 @@ class GuardedLink:
     def problem(self, now_s: float) -> str | None:
         silent_s = 0.0 if self._answered_s is None else now_s - self._answered_s
         hangs = f"telemetry() hangs for {silent_s:.1f} s" if silent_s > HANGS_S else None
-        stuck = self._sender.trouble()
-        stuck = stuck and f"{stuck}{self._send_error}"
-        return self._failure or stuck or hangs or self._trouble
+        return self._sender.trouble() or hangs or self._trouble
+
+    def new_notes(self) -> list[str]:
+        """Sentences on what went wrong and did not matter, since the last call."""
+        return self._sender.new_notes()
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
@@ -80,10 +81,9 @@ class GuardedLink:
     def _hand_over(self, command: Command) -> None:
         try:
             self._inner.send(command)
-        except BaseException as error:  # SystemExit would end the sender's thread
-            self._send_error = f": send() raised {error_at(error)}"
-            raise RuntimeError from error  # the sender tries again
-        self._send_error = ""
+        except BaseException as error:
+            # The sender counts it and tries again; SystemExit would end its thread.
+            raise RuntimeError(f"send() raised {error_at(error)}") from error
 
     def _ask(self) -> Command | None:
         with self._lock:
@@ -100,7 +100,7 @@ class GuardedLink:
                     self._newest = samples[-1] if samples else self._newest
                 self._trouble = self._inner.problem(self._clock())
             except BaseException as error:
-                self._failure = f"telemetry() or problem() raised {error_at(error)}"
+                self._trouble = f"telemetry() or problem() raised {error_at(error)}"
             self._answered_s = self._clock()
 
     def _checked(self, sample: object) -> Telemetry:

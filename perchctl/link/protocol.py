@@ -71,8 +71,8 @@ class VehicleLink(Protocol):
     profile's section `link`.
 
     `telemetry` and `problem` are called in one thread, 200 times a second, `send` in another one
-    (after a hang in a new one). An error that they raise, or a call longer than 0.5 s, counts as a
-    lost link: perchctl goes on sending, and lands the vehicle.
+    (after a hang in a new one). An error of the first two, errors of `send` for 0.5 s, or a call
+    longer than 0.5 s, count as a lost link: perchctl goes on sending, and lands the vehicle.
     """
 
     def connect(self) -> None:

@@ -20,6 +20,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
 from perchctl.link import CflibLink, ProbeLink
+from perchctl.link.crtp import LAND_TIMES
 from perchctl.link.protocol import LANDING_WAIT_S
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
@@ -42,6 +43,7 @@ from tests.helpers.mission import AIRBORNE, READY, telemetry
 
 CONFIG = LinkConfig(parameters={"stabilizer.estimator": 2})
 LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
+HIGH_LEVEL_PORT = 8
 RAW_PORT = 3  # raw setpoints: attitude and thrust
 COMMAND_PORTS = (RAW_PORT, 7, 8, 9)
 
@@ -182,6 +184,28 @@ def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) ->
 
 
 # --- In the air, and left ---------------------------------------------------------------------
+
+
+def test_a_driver_that_fails_once_has_lost_no_link(
+    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with linked(sim) as link:
+        driver, times = cf(link).link, 2
+        send_packet = driver.send_packet
+
+        def send(packet: Any) -> None:
+            nonlocal times
+            if packet.port == HIGH_LEVEL_PORT and times:
+                times -= 1
+                raise OSError("no buffer space")
+            send_packet(packet)
+
+        monkeypatch.setattr(driver, "send_packet", send)
+        sent = commands_sent(link, sim)
+        link.send(Land(-0.05, 1.0))
+        until(lambda: [port for port, _ in sent].count(HIGH_LEVEL_PORT) == LAND_TIMES)
+        assert link.problem(time.monotonic()) is None
+        assert "failed 2 times so far" in link.new_notes()[0]
 
 
 def test_what_is_unknown_flies() -> None:

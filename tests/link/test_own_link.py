@@ -142,6 +142,20 @@ def test_a_sample_of_another_type_or_clock_is_a_lost_link(wrong: Any, vehicle: V
     assert all(each.t_s == 10.0 for each in vehicle.link.telemetry())
 
 
+@pytest.mark.parametrize("name", ["telemetry", "problem", "send"])
+def test_one_error_of_it_is_no_lost_link_for_ever(name: str, vehicle: Vehicle) -> None:
+    vehicle.act[name] = raises(ZeroDivisionError("of its author"))
+    vehicle.link.send(LAND)
+    if name == "send":
+        until(lambda: "of its author" in "".join(vehicle.link.new_notes()))
+    else:
+        until(lambda: "of its author" in vehicle.trouble())
+    vehicle.act.clear()
+    until(lambda: LAND in vehicle.sent and vehicle.trouble() == "")
+    vehicle.now_s += 100.0
+    until(lambda: vehicle.trouble() == "")
+
+
 def test_its_own_word_is_passed_on_and_taken_back(vehicle: Vehicle) -> None:
     vehicle.act["problem"] = lambda: "its antenna is off"
     until(lambda: vehicle.trouble() == "its antenna is off")
