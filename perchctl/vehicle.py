@@ -76,6 +76,18 @@ def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
     return newest is None or not is_fresh(newest, now_s) or newest.has_bit(FLYING)
 
 
+def is_disarmed(newest: Telemetry) -> bool:
+    """True if the vehicle waits for an arming request: it does not arm itself, its motors stand
+    still, and nothing else keeps it from flying (docs/firmware.md, "Arming")."""
+    return newest.has_bit(CAN_ARM) and not newest.has_bit(ARMED | AUTO_ARM)
+
+
+def is_armed_by_request(newest: Telemetry) -> bool:
+    """True if a vehicle that does not arm itself is armed: its propellers turn, on the ground,
+    too."""
+    return newest.has_bit(ARMED) and not newest.has_bit(AUTO_ARM)
+
+
 def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
     """True if an emergency stop took effect: locked, with the motors off."""
     if newest is None or not is_fresh(newest, now_s):
@@ -147,7 +159,18 @@ class EmergencyStop:
     """Cut the motors now and lock: the user's second Ctrl-C, or a useless attitude."""
 
 
-Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop
+@dataclass(frozen=True)
+class Arm:
+    """Arm a vehicle that does not arm itself, or disarm it; on the ground only.
+
+    While armed its propellers turn (docs/firmware.md, "Idle propellers"); disarming in the air
+    cuts the motors.
+    """
+
+    armed: bool
+
+
+Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop | Arm
 
 
 def is_battery_reading(volts: float) -> bool:

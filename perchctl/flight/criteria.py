@@ -33,6 +33,8 @@ from perchctl.vehicle import (
     TUMBLED,
     ExternalPosition,
     Telemetry,
+    is_armed_by_request,
+    is_disarmed,
 )
 from perchctl.vision import TargetEstimate
 
@@ -87,9 +89,18 @@ class GroundCriteria:
         return None
 
     @property
+    def waits_for_arming(self) -> bool:
+        """True if the vehicle does not arm itself, and needs nothing but to be armed: `fly` does
+        that last, just before take-off. True as well while its motors start."""
+        telemetry = self.telemetry
+        if telemetry.has_bit(CAN_FLY):
+            return False
+        return is_disarmed(telemetry) or is_armed_by_request(telemetry)
+
+    @property
     def supervisor_not_ready(self) -> Problem | None:
-        """Problem: the supervisor does not allow flight (yet)."""
-        if self.telemetry.has_bit(CAN_FLY):
+        """Problem: the supervisor does not allow flight (yet), and arming would not change that."""
+        if self.telemetry.has_bit(CAN_FLY) or self.waits_for_arming:
             return None
         return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart it")
 

@@ -22,7 +22,7 @@ from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import TargetView, view_from
 from perchctl.values import replace
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import ARMED, Arm, Telemetry
 from perchctl.vision import CameraModel, TargetEstimate
 
 
@@ -134,6 +134,61 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
     if waited_s > limit_s:
         raise TimedOut(f"waited {limit_s:.0f} s for {what}: not flying")
     return what
+
+
+# --- Arming, the last step before take-off ---
+
+
+ARMS_WITHIN_S = 5.0
+"""From the first request until the supervisor allows flight: the firmware gives up on motors that
+do not start after 2 s. A longer time keeps propellers turning on a vehicle that does not fly."""
+REQUEST_PERIOD_S = 0.25
+PAUSE_S = 0.5
+"""Something else was waited for: what was seen of the arming before says nothing any more."""
+
+
+class Arming:
+    """Arms a vehicle that does not arm itself, once nothing else is waited for.
+
+    Its propellers turn from then on, so it comes last: after the operator's word, and whatever the
+    wait for it took. A vehicle that has disarmed itself meanwhile is armed again.
+    """
+
+    def __init__(self) -> None:
+        self._began_s = self._asked_s = self._requested_s = -math.inf
+        self._was_armed = False
+
+    @property
+    def has_begun(self) -> bool:
+        """True once the vehicle was to be armed."""
+        return self._requested_s > -math.inf
+
+    def next_request(self, telemetry: Telemetry, now_s: float) -> Arm | None:
+        """The request to send now, if any. To be called in each turn in which the vehicle
+        `waits_for_arming`, with fresh telemetry.
+
+        Raises TimedOut if it does not arm within `ARMS_WITHIN_S`, SafetyAbort if it disarms itself
+        while its motors start.
+        """
+        if now_s - self._asked_s > PAUSE_S:
+            self._began_s, self._was_armed = now_s, False
+        self._asked_s = now_s
+        bits = f"supervisor 0x{telemetry.supervisor:04X}"
+        if telemetry.has_bit(ARMED):
+            self._was_armed = True
+        elif self._was_armed:
+            raise SafetyAbort(
+                f"the vehicle was armed, and disarmed itself before its motors were ready "
+                f"({bits}): something may block a propeller; look at it, then restart the vehicle"
+            )
+        if now_s - self._began_s > ARMS_WITHIN_S:
+            raise TimedOut(
+                f"the vehicle could not be armed within {ARMS_WITHIN_S:.0f} s ({bits}): restart it"
+            )
+        if telemetry.has_bit(ARMED) or now_s - self._requested_s < REQUEST_PERIOD_S:
+            return None
+        self._requested_s = now_s
+        return Arm(True)
 
 
 # --- Whether a target that is the positioning system stays in view on the way up. Pure ---

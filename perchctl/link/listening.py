@@ -38,7 +38,7 @@ from perchctl.link.firmware import (
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import FLYING
+from perchctl.vehicle import ARMED, AUTO_ARM, FLYING
 
 
 class ReadOnlyLink(CflibLink):
@@ -87,7 +87,8 @@ class AttitudeLink(ReadOnlyLink):
 
     @property
     def motors_running(self) -> bool:
-        """True while the newest packet reports turning motors: until 2 s after they stop."""
+        """True while the newest packet reports turning motors, until 2 s after they stop, or a
+        vehicle that is armed and does not arm itself, whose propellers turn all the time."""
         return self._motors_run
 
     def samples(self) -> list[AttitudeSample]:
@@ -106,7 +107,8 @@ class AttitudeLink(ReadOnlyLink):
         pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed."""
         now_s = self._blocks.last_arrival_s = self._clock()
         t_s = self._timebase.to_loop_s(stamp, now_s)
-        self._motors_run = bool(int(values["supervisor.info"]) & FLYING)
+        bits = int(values["supervisor.info"])
+        self._motors_run = bool(bits & FLYING) or (bool(bits & ARMED) and not bits & AUTO_ARM)
         self._heard.set()
         if all(map(math.isfinite, values.values())):
             self._samples.append(

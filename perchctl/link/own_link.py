@@ -8,9 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from perchctl.extensions import error_at
+from perchctl.link.arming import disarm, warn_of_armed
 from perchctl.link.protocol import LANDING_WAIT_S, Guard, SentCallback, VehicleLink, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
-from perchctl.vehicle import Command, ExternalPosition, Idle, Telemetry, may_be_flying
+from perchctl.vehicle import Arm, Command, ExternalPosition, Idle, Telemetry, may_be_flying
 
 READ_PERIOD_S = 0.005
 AHEAD_S = 0.1
@@ -33,6 +34,7 @@ class GuardedLink:
         self._newest: Telemetry | None = None
         self._trouble: str | None = None  # the link's own word, or its error, of the last round
         self._answered_s: float | None = None  # end of the reader's last round
+        self._was_armed = False  # by an order of this session
         self._closing = threading.Event()
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
@@ -50,6 +52,7 @@ class GuardedLink:
 
     def send(self, command: Command) -> None:
         if not isinstance(command, Idle):
+            self._was_armed = self._was_armed or command == Arm(True)
             self._sender.put(command)
 
     def send_external(self, place: ExternalPosition) -> bool:
@@ -68,15 +71,24 @@ class GuardedLink:
         self._guard, self._on_sent = guard, on_sent
 
     def close(self) -> None:
-        """Wait, bounded, until nothing flies, and close the inner link."""
+        """Wait, bounded, until nothing flies, disarm it, and close the inner link."""
         self._sender.drain(1.0)
         end_s = time.monotonic() + (0.0 if self._answered_s is None else LANDING_WAIT_S)
         while may_be_flying(self._newest, self._clock()) and time.monotonic() < end_s:
             time.sleep(0.05)
+        disarmed = disarm(
+            lambda: self._newest,
+            lambda order: self._sender.put(order, "farewell"),
+            self._clock,
+            time.sleep,
+            was_ordered=self._was_armed,
+        )
         self._closing.set()
         self._sender.stop()
         with suppress(Exception):  # the flight is over, and its report counts
             self._inner.close()
+        if self._was_armed and not disarmed:
+            warn_of_armed("the vehicle of your own link")
 
     def _hand_over(self, command: Command) -> None:
         try:

@@ -5,9 +5,9 @@ hang in the library with one. The second never touches the library: it asks the 
 to be sent while the loop hangs, and gives the work to a new first thread where the old one hangs.
 No error ends a thread.
 
-Setpoints coalesce (only the newest counts), and one that has waited too long is dropped. Orders
-keep their place until the library has taken them, however long that takes; an emergency stop
-takes everybody's place.
+Setpoints coalesce (only the newest counts), and one that has waited too long is dropped, as is an
+arming request. Orders keep their place until the library has taken them, however long that takes;
+an emergency stop takes everybody's place.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ from typing import Any
 
 from perchctl.link.protocol import SentCallback, ignore_sent
 from perchctl.mission import SentCommand
-from perchctl.vehicle import Command, EmergencyStop, PositionSetpoint, RawThrust
+from perchctl.vehicle import Arm, Command, EmergencyStop, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
+_EXPIRING = (*_STREAMED, Arm)
+"""What is for its own moment only: dropped when it is stale, and never repeated on its own. An
+arming request that comes late would turn the propellers after the session has ended."""
 STALE_S = 0.25
-"""A setpoint that has waited longer, behind a command that hung, is for another moment."""
+"""What expires and has waited longer, behind a command that hung, is for another moment."""
 GUARD_PERIOD_S = 0.05
 HANGS_S = 0.5
 """For so long the library may hold one piece, or fail (docs/firmware.md, "Silence")."""
@@ -120,8 +123,8 @@ class Sender:
             if self._last is None:
                 return
             handed_s, command = self._last
-            overtaken = any(not isinstance(w.command, _STREAMED) for w in self._queue)
-        if handed_s >= since_s and not overtaken and not isinstance(command, _STREAMED):
+            overtaken = any(not isinstance(w.command, _EXPIRING) for w in self._queue)
+        if handed_s >= since_s and not overtaken and not isinstance(command, _EXPIRING):
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
@@ -219,7 +222,7 @@ class Sender:
         while self._queue:
             first = self._queue[0]
             stale = self._clock() - first.put_s > STALE_S
-            if not (stale and isinstance(first.command, _STREAMED)):
+            if not (stale and isinstance(first.command, _EXPIRING)):
                 return first
             self._queue.popleft()
         self._done()

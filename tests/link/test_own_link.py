@@ -8,9 +8,21 @@ from typing import Any
 
 import pytest
 
+from perchctl.errors import Note
 from perchctl.link import GuardedLink
 from perchctl.link.protocol import LANDING_WAIT_S
-from perchctl.vehicle import FLYING, Command, Idle, Land, PositionSetpoint, Telemetry
+from perchctl.vehicle import (
+    ARMED,
+    CAN_ARM,
+    CAN_FLY,
+    FLYING,
+    Arm,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    Telemetry,
+)
 from tests.helpers.waiting import until
 
 LAND, PLACE = Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.0)
@@ -192,3 +204,40 @@ def test_closing_hands_over_what_a_slow_link_has_not_taken_yet(vehicle: Vehicle)
     free.set()
     closing.join(LANDING_WAIT_S / 2)
     assert vehicle.sent == [PLACE, LAND]
+
+
+def test_what_was_armed_for_the_flight_is_disarmed_as_the_link_is_closed() -> None:
+    vehicle = Vehicle()
+    vehicle.bits = CAN_ARM
+
+    def advance() -> None:
+        vehicle.now_s += 0.01
+
+    vehicle.act["problem"] = advance
+    vehicle.link.connect()
+    vehicle.link.send(Arm(True))
+    until(lambda: Arm(True) in vehicle.sent)
+    vehicle.bits = ARMED | CAN_FLY
+    closing = threading.Thread(target=vehicle.link.close)
+    closing.start()
+    until(lambda: Arm(False) in vehicle.sent)
+    assert not vehicle.closed
+    vehicle.bits = CAN_ARM
+    closing.join(5.0)
+    assert vehicle.closed
+    assert {type(command) for command in vehicle.sent} == {Arm}
+
+
+def test_a_vehicle_of_your_own_that_stays_armed_is_told_of() -> None:
+    vehicle = Vehicle()
+    vehicle.bits = ARMED | CAN_FLY
+
+    def advance() -> None:
+        vehicle.now_s += 0.01
+
+    vehicle.act["problem"] = advance
+    vehicle.link.connect()
+    vehicle.link.send(Arm(True))
+    with pytest.warns(Note, match="may still be armed"):
+        vehicle.link.close()
+    assert vehicle.sent[-1] == Arm(False)

@@ -14,7 +14,7 @@ import pytest
 
 from perchctl.link.sender import GUARD_PERIOD_S, HANGS_S, NOTED_EVERY_S, STALE_S, Sender
 from perchctl.mission import SentCommand
-from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, StopMotors
+from perchctl.vehicle import Arm, Command, EmergencyStop, Land, PositionSetpoint, StopMotors
 from tests.helpers.waiting import until
 
 LIMIT_S = 5.0
@@ -340,3 +340,22 @@ def test_a_guard_is_not_asked_for_what_cannot_go_out(library: Library) -> None:
     assert len(polls) == before
     library.room = True
     until(lambda: len(polls) > before)
+
+
+# --- Arming -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [Arm(True), Arm(False)])
+def test_an_arming_request_is_for_its_moment_only(order: Arm, library: Library) -> None:
+    """Late it would turn the propellers after the session has ended, or stop them in the air."""
+    library.room = False
+    sender = library.sender()
+    sender.put(order)
+    library.now_s += STALE_S + 0.01
+    sender.put(LAND)
+    library.room = True
+    library.takes(LAND)
+    sender.put(order)
+    library.takes(order)
+    sender.repeat_order(0.0)  # the link was lost, and is back
+    library.takes()
