@@ -14,8 +14,13 @@ LOW_POWER = 3  # pm.state
 FULL_THRUST = 65535
 NO_BATTERY_READING_V = 1.0
 """Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
-MOST_CELL_V = 5.0
-"""No single cell has more: above this nothing is measured either."""
+MOST_CELL_V = 4.4
+"""No single cell has more: a full one of the high-voltage kind rests at 4.35 V, and readings err by
+1 %. With more there is no take-off, and in flight it is no reading."""
+
+AIRFRAMES = ("Crazyflie 2.0", "Crazyflie 2.1", "Crazyflie 2.1+", "Crazyflie 2.1 Brushless")
+"""Device types, by the firmware's names, for which perchctl's thrust and battery figures hold
+(docs/hardware.md, "Which vehicles")."""
 
 
 @dataclass(frozen=True)

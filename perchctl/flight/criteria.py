@@ -28,6 +28,7 @@ from perchctl.vehicle import (
     DECK_FAULT,
     FLYING,
     LOCKED,
+    MOST_CELL_V,
     NO_BATTERY_READING_V,
     POSITION_DECKS,
     TUMBLED,
@@ -114,6 +115,18 @@ class GroundCriteria:
         return Problem(
             f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
             "charge it",
+        )
+
+    @property
+    def battery_too_high(self) -> Problem | None:
+        """Problem: the battery has more volts than one cell, so none of the limits holds for it."""
+        rests_v = self.telemetry.battery_v
+        if not rests_v > MOST_CELL_V:
+            return None
+        rests, most = distinct_texts(rests_v, MOST_CELL_V, 2)
+        return Problem(
+            f"the battery rests at {rests} V, and one cell has at most {most} V",
+            "perchctl flies vehicles with a battery of one cell",
         )
 
     @property

@@ -33,10 +33,11 @@ def abort_on(problem: Problem | None) -> None:
 
 
 def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
-    """Raises SafetyAbort for a supervisor fault or a low battery, which waiting does not cure."""
+    """Raises SafetyAbort for a supervisor fault or an unfit battery: waiting does not cure them."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
-        abort_on(criteria.supervisor_fault or criteria.battery_too_low)
+        battery = criteria.battery_too_low or criteria.battery_too_high
+        abort_on(criteria.supervisor_fault or battery)
 
 
 def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) -> None:

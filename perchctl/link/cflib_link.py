@@ -23,7 +23,13 @@ from perchctl.link.crtp import (
     encode,
 )
 from perchctl.link.external_position import StandingFeed, estimator_parameters, settle_estimator
-from perchctl.link.firmware import check_firmware, detected_decks, read_parameters, set_parameters
+from perchctl.link.firmware import (
+    check_airframe,
+    check_firmware,
+    detected_decks,
+    read_parameters,
+    set_parameters,
+)
 from perchctl.link.protocol import (
     LANDING_WAIT_S,
     Guard,
@@ -174,6 +180,7 @@ class CflibLink:
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
+        check_airframe(connection.cf, self._uri)
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
         self._unlock_thrust(connection)  # from here on it is known to be on the ground

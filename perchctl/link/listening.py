@@ -33,6 +33,7 @@ from perchctl.link.firmware import (
     NEEDED_PROTOCOL,
     check_firmware,
     missing_variables,
+    read_device_type,
     read_parameters,
 )
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
@@ -161,6 +162,10 @@ class ProbeLink(ReadOnlyLink):
     def protocol_version(self) -> int:
         """The protocol's version; -1 for a vehicle that is too old to have one."""
         return int(self._cf.platform.get_protocol_version())
+
+    def device_type(self) -> str | None:
+        """The kind of vehicle, as its firmware names it; None without an answer."""
+        return read_device_type(self._cf)
 
     def parameters(self) -> dict[str, float]:
         """All parameters by name, as read when the link was opened."""

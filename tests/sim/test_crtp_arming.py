@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from perchctl.link.firmware import read_device_type
 from perchctl.sim.airframe import CRAZYFLIE_21_BRUSHLESS
 from tests.helpers.crtp_rig import (
     ARMED_BIT,
@@ -124,3 +126,11 @@ def test_the_least_raw_thrust_leaves_the_propellers_idling(brushless: Pilot) -> 
     brushless.unlock()
     brushless.stream(0.5, lambda: raw(brushless, 1000))
     assert motors(brushless) == (IDLE_PWM,) * 4
+
+
+@pytest.mark.parametrize("airframe", [{}, {"airframe": CRAZYFLIE_21_BRUSHLESS}])
+def test_it_names_its_airframe(airframe: dict[str, Any], shared_pilot: Pilot) -> None:
+    pilot = shared_pilot.fresh(**airframe)
+    name = airframe["airframe"].device_type if airframe else "Crazyflie 2.1"
+    assert pilot.ask(13, 1, b"\x02") == b"\x02" + name.encode() + b"\0"
+    assert read_device_type(pilot.cf) == name
