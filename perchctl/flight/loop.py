@@ -19,6 +19,7 @@ from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
 from perchctl.flight.preflight import (
     Arming,
     abort_on,
+    disarm_on_word,
     refuse_unfit_vehicle,
     refuse_without_positions,
     refuse_wrong_positions,
@@ -99,8 +100,10 @@ def fly(parts: FlightParts) -> FlightReport:
         send=parts.link.send_external,
         is_logged=turns.has_watchers,
     )
-    _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
-    watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
+    told = _teller(parts)
+    parts.link.set_guard(disarm_on_word(parts.operator), told)
+    _wait_until_ready(parts, inputs, turns, told)  # nothing flies before it returns
+    watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
     parts.link.set_guard(watchdog.poll, told)
     try:
         return _mission(parts, inputs, watchdog, turns)
@@ -136,9 +139,14 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     return tell
 
 
-def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnReporter) -> None:
+def _wait_until_ready(
+    parts: FlightParts,
+    inputs: FlightInputs,
+    turns: TurnReporter,
+    told: Callable[[SentCommand], None],
+) -> None:
     refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
-    started_s, at_rest, arming, tell = parts.clock.now(), RestCheck(), Arming(), _teller(parts)
+    started_s, at_rest, arming = parts.clock.now(), RestCheck(), Arming()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
@@ -176,7 +184,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
             request = arming.next_request(newest, now_s)
             if request is not None:
                 parts.link.send(request)
-                tell(SentCommand(now_s, "preflight", request))
+                told(SentCommand(now_s, "preflight", request))
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
 

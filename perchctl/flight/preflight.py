@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from perchctl.flight.criteria import (
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
+from perchctl.mission import Operator
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import TargetView, view_from
 from perchctl.values import replace
-from perchctl.vehicle import ARMED, Arm, Telemetry
+from perchctl.vehicle import ARMED, Arm, Telemetry, is_armed_by_request, may_be_flying
 from perchctl.vision import CameraModel, TargetEstimate
 
 
@@ -190,6 +191,20 @@ class Arming:
             return None
         self._requested_s = now_s
         return Arm(True)
+
+
+def disarm_on_word(operator: Callable[[], Operator]) -> Callable[..., Arm | None]:
+    """Return the link's guard for the wait before take-off: it disarms on the operator's word, also
+    while the loop hangs."""
+
+    def poll(
+        now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
+    ) -> Arm | None:
+        if operator() is Operator.NONE or may_be_flying(newest, now_s):
+            return None
+        return Arm(False) if newest is not None and is_armed_by_request(newest) else None
+
+    return poll
 
 
 # --- Whether a target that is the positioning system stays in view on the way up. Pure ---

@@ -133,7 +133,7 @@ class MockLink:
         return samples
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
-        self._guard, self._on_sent = guard, on_sent
+        self._guard, self._on_sent, self._watched_s = guard, on_sent, -math.inf
 
     def _run_guard(self) -> None:
         if self._guard is None or self.now_s < self._watched_s + WATCH_PERIOD_S - 1e-9:

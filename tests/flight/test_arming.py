@@ -47,7 +47,8 @@ from perchctl.vehicle import (
 from perchctl.vision import Frame
 from tests.helpers.crtp_rig import wired
 from tests.helpers.flights import SEED, SHORT
-from tests.helpers.loop_rig import Camera, Rig, Vehicle
+from tests.helpers.hangs import hang_in_the_camera
+from tests.helpers.loop_rig import Camera, Guarded, Rig, Vehicle
 from tests.helpers.waiting import until
 
 SPIN_UP_S = 0.3
@@ -141,6 +142,27 @@ def test_ctrl_c_while_its_motors_start_ends_it_on_the_ground() -> None:
     with pytest.raises(Interrupted, match="before take-off: disarming"):
         rig.fly()
     assert not rig.link.said(PositionSetpoint)
+
+
+class UnarmedAndGuarded(Guarded, Unarmed):
+    """Its link asks the guard every 50 ms, also while the loop hangs."""
+
+    def __init__(self) -> None:
+        Unarmed.__init__(self)
+        self.own, self._asked_s = [], 0.0
+
+
+@pytest.mark.parametrize("pressed", [Operator.LAND, Operator.STOP])
+def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: Operator) -> None:
+    link, camera = UnarmedAndGuarded(), Camera()
+    hang_in_the_camera(link, camera, 0.1, 3.0)
+    rig = Rig(link, camera, operator=lambda: pressed if link.now_s > 1.0 else Operator.NONE)
+    with pytest.raises(Interrupted):
+        rig.fly()
+    assert link.said(Arm)[0] < 0.2
+    disarmed_s, order = link.own[0]
+    assert (order, disarmed_s) == (Arm(False), pytest.approx(1.0, abs=0.06))
+    assert link.armed_s is None
 
 
 def test_a_vehicle_that_arms_itself_is_asked_for_nothing() -> None:
