@@ -159,7 +159,7 @@ def _airframe(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return failed("the vehicle does not say what it is", "update its firmware")
     if vehicle.device_type in AIRFRAMES:
         return passed(vehicle.device_type)
-    return failed(vehicle.device_type, f"perchctl flies {', '.join(AIRFRAMES)}")
+    return failed(vehicle.device_type, f"fly a {', '.join(AIRFRAMES[:-1])} or {AIRFRAMES[-1]}")
 
 
 def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:

@@ -92,9 +92,11 @@ def test_nothing_is_ordered_that_could_drop_it(bench: Bench, was_ordered: bool) 
     assert bench.sent == []
 
 
-def test_an_arming_request_under_way_is_caught_up_with() -> None:
-    """The telemetry still says disarmed while the request travels."""
-    bench = Bench(DISARMED, pending=[(10.05, IDLING)])
+@pytest.mark.parametrize("lost_until_s", [0.0, 10.05])
+def test_an_arming_request_under_way_is_caught_up_with(lost_until_s: float) -> None:
+    """The telemetry still says disarmed while the request travels, and shortly after the order."""
+    takes = lambda now_s: now_s > lost_until_s  # noqa: E731
+    bench = Bench(DISARMED, takes=takes, pending=[(10.09, IDLING)])
     assert bench.disarm(was_ordered=True)
     bench.wait(1.0)
     assert not bench.newest().has_bit(ARMED)

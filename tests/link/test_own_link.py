@@ -206,7 +206,8 @@ def test_closing_hands_over_what_a_slow_link_has_not_taken_yet(vehicle: Vehicle)
     assert vehicle.sent == [PLACE, LAND]
 
 
-def test_what_was_armed_for_the_flight_is_disarmed_as_the_link_is_closed() -> None:
+@pytest.mark.parametrize("bits", [ARMED | CAN_FLY, CAN_ARM], ids=["armed", "not yet"])
+def test_what_was_armed_for_the_flight_is_disarmed_as_the_link_is_closed(bits: int) -> None:
     vehicle = Vehicle()
     vehicle.bits = CAN_ARM
 
@@ -217,7 +218,7 @@ def test_what_was_armed_for_the_flight_is_disarmed_as_the_link_is_closed() -> No
     vehicle.link.connect()
     vehicle.link.send(Arm(True))
     until(lambda: Arm(True) in vehicle.sent)
-    vehicle.bits = ARMED | CAN_FLY
+    vehicle.bits = bits
     closing = threading.Thread(target=vehicle.link.close)
     closing.start()
     until(lambda: Arm(False) in vehicle.sent)
