@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from perchctl.vehicle import ARMED, CAN_FLY, FLYING, Command, Land, PositionSetpoint, Telemetry
+from perchctl.vehicle import AUTO_ARM, CAN_FLY, FLYING, Command, Land, PositionSetpoint, Telemetry
 
 PERIOD_S, SPEED_MPS, THRUST = 0.01, 0.5, 38000.0
-READY = CAN_FLY | ARMED
+READY = CAN_FLY | AUTO_ARM  # it arms itself
 
 
 class Toy:

@@ -58,6 +58,14 @@ def broken_motion_capture(why: str) -> UsageError:
     )
 
 
+def unfit_cflib(part: str, version: str) -> UsageError:
+    """The error for a cflib that lacks `part`, which perchctl reads or replaces."""
+    return UsageError(
+        f"cflib {version} has no {part}, which perchctl needs; install another one with: "
+        f"{sys.executable} -m pip install 'cflib>=0.1.34,<0.2'"
+    )
+
+
 def no_cluster(why: str = "it is missing") -> UsageError:
     """The error for an extra ``cluster`` that is missing, or cannot be loaded."""
     return UsageError(f"--cluster needs the library distributed ({why}); {_install('cluster')}")

@@ -14,8 +14,13 @@ LOW_POWER = 3  # pm.state
 FULL_THRUST = 65535
 NO_BATTERY_READING_V = 1.0
 """Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
-MOST_CELL_V = 5.0
-"""No single cell has more: above this nothing is measured either."""
+MOST_CELL_V = 4.4
+"""No single cell has more: a full one of the high-voltage kind rests at 4.35 V, and readings err by
+1 %. With more there is no take-off, and in flight it is no reading."""
+
+AIRFRAMES = ("Crazyflie 2.0", "Crazyflie 2.1", "Crazyflie 2.1+", "Crazyflie 2.1 Brushless")
+"""Device types, by the firmware's names, for which perchctl's thrust and battery figures hold
+(docs/hardware.md, "Which vehicles")."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,18 @@ def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
     """True if a zero setpoint could drop the vehicle, or lock it: the flying bit outlives
     the motors by 2 s (docs/firmware.md, "When setpoints stop")."""
     return newest is None or not is_fresh(newest, now_s) or newest.has_bit(FLYING)
+
+
+def is_disarmed(newest: Telemetry) -> bool:
+    """True if the vehicle waits for an arming request: it does not arm itself, its motors stand
+    still, and nothing else keeps it from flying (docs/firmware.md, "Arming")."""
+    return newest.has_bit(CAN_ARM) and not newest.has_bit(ARMED | AUTO_ARM)
+
+
+def is_armed_by_request(newest: Telemetry) -> bool:
+    """True if a vehicle that does not arm itself is armed: its propellers turn, on the ground,
+    too."""
+    return newest.has_bit(ARMED) and not newest.has_bit(AUTO_ARM)
 
 
 def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:
@@ -147,7 +164,18 @@ class EmergencyStop:
     """Cut the motors now and lock: the user's second Ctrl-C, or a useless attitude."""
 
 
-Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop
+@dataclass(frozen=True)
+class Arm:
+    """Arm a vehicle that does not arm itself, or disarm it; on the ground only.
+
+    While armed its propellers turn (docs/firmware.md, "Idle propellers"); disarming in the air
+    cuts the motors.
+    """
+
+    armed: bool
+
+
+Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop | Arm
 
 
 def is_battery_reading(volts: float) -> bool:

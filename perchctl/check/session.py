@@ -142,7 +142,7 @@ class VehicleChecks:
         for name, judge in vehicle.VEHICLE.items():
             yield evaluate_row(name, judge, seen, self.profile)
         yield from self._room_rows(self.probe.telemetry)
-        yield from self._lift_rows()
+        yield from self._lift_rows(is_armed=seen.is_armed)
         return self.probe.telemetry
 
     def _room_rows(self, take: TakeTelemetry) -> list[Row]:
@@ -163,9 +163,11 @@ class VehicleChecks:
             self.profile.positioning, self.uri, datetime.now().astimezone(), simulated=simulated
         )
 
-    def _lift_rows(self) -> Iterator[Row]:
+    def _lift_rows(self, *, is_armed: bool) -> Iterator[Row]:
         compared = self._compared_rows()
-        if self.scope.with_lift:
+        if self.scope.with_lift and is_armed:
+            yield from skipped_rows([vehicle.LIFTED], "it is armed", vehicle.DISARM_IT)
+        elif self.scope.with_lift:
             lifted = self._lift_finding()
             yield Row(vehicle.LIFTED, *lifted)
             if compared:

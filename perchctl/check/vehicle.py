@@ -21,7 +21,14 @@ from perchctl.check.row import (
 from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
-from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, POSITION_DECKS, Telemetry
+from perchctl.vehicle import (
+    AIRFRAMES,
+    LOW_POWER,
+    NO_BATTERY_READING_V,
+    POSITION_DECKS,
+    Telemetry,
+    is_armed_by_request,
+)
 
 LISTEN_S = 5.0
 MOVED_WARN_M = 0.05
@@ -30,6 +37,8 @@ KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 """By a motion capture, or by the target."""
+ARMED_BY_FLY = "armed by fly after your yes"
+DISARM_IT = "keep away, end the program that armed it, or wait 30 s until it disarms itself"
 
 Wait = Callable[[float], None]
 
@@ -38,11 +47,13 @@ Wait = Callable[[float], None]
 class VehicleStatus:
     """State of a vehicle, as the check queried it.
 
+    `device_type`: the kind of vehicle, as its firmware names it; None without an answer.
     `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
     infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest.
     """
 
     uri: str
+    device_type: str | None = AIRFRAMES[1]
     protocol: int = ProbeLink.NEEDED_PROTOCOL
     missing_variables: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -61,6 +72,11 @@ class VehicleStatus:
             raise Unanswerable("no telemetry")
         return self.telemetry
 
+    @property
+    def is_armed(self) -> bool:
+        """True if the vehicle is armed and does not arm itself: its propellers may turn."""
+        return self.telemetry is not None and is_armed_by_request(self.telemetry)
+
     def position_decks(self, profile: Profile) -> tuple[str, ...]:
         known = (*POSITION_DECKS, *profile.positioning.decks)
         return tuple(deck for deck in self.decks if deck in known)
@@ -75,6 +91,7 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
     later = link.telemetry() or samples
     return VehicleStatus(
         uri=uri,
+        device_type=link.device_type(),
         protocol=link.protocol_version(),
         missing_variables=link.missing,
         parameters=link.parameters(),
@@ -137,11 +154,22 @@ def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
     return passed(found)
 
 
+def _airframe(vehicle: VehicleStatus, profile: Profile) -> Finding:
+    if vehicle.device_type is None:
+        return failed("the vehicle does not say what it is", "update its firmware")
+    if vehicle.device_type in AIRFRAMES:
+        return passed(vehicle.device_type)
+    return failed(vehicle.device_type, f"fly a {', '.join(AIRFRAMES[:-1])} or {AIRFRAMES[-1]}")
+
+
 def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
-    criteria = GroundCriteria(t, profile)
+    criteria, bits = GroundCriteria(t, profile), f"0x{t.supervisor:04X}"
+    if vehicle.is_armed:
+        return failed(f"the vehicle is armed, and its propellers may turn ({bits})", DISARM_IT)
     return problem_finding(
-        criteria.supervisor_fault or criteria.supervisor_not_ready, f"ready (0x{t.supervisor:04X})"
+        criteria.supervisor_fault or criteria.supervisor_not_ready,
+        f"ready, {ARMED_BY_FLY} ({bits})" if criteria.waits_for_arming else f"ready ({bits})",
     )
 
 
@@ -202,7 +230,8 @@ def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not t.battery_v >= NO_BATTERY_READING_V:
         return skipped("no reading", "restart the vehicle")
     found = f"{t.battery_v:.2f} V at rest"
-    if problem := GroundCriteria(t, profile).battery_too_low:
+    criteria = GroundCriteria(t, profile)
+    if problem := criteria.battery_too_low or criteria.battery_too_high:
         return failed(problem.found, problem.advice)
     if t.battery_state == LOW_POWER:
         return failed(f"{found}, but it reports low power", "charge it")
@@ -214,6 +243,7 @@ def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
 VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
     "packets": _packets,
     "telemetry": _telemetry,
+    "airframe": _airframe,
     "firmware": _firmware,
     "supervisor": _supervisor,
     "positioning": _positioning,

@@ -249,7 +249,8 @@ def _record_live(
 
 @contextlib.contextmanager
 def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
-    """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors turn."""
+    """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors
+    turn or may turn."""
     link = AttitudeLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri}, to read from it and nothing else")
     link.connect()
@@ -257,7 +258,7 @@ def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
     def problem(now_s: float) -> str | None:
         if link.motors_running:
             raise SafetyAbort(
-                f"the motors of {uri} turn, or did 2 s ago: nothing is measured by hand "
+                f"{uri} is armed, or its motors turn or did 2 s ago: nothing is measured by hand "
                 f"with them on; switch it off and on"
             )
         return link.problem(now_s)

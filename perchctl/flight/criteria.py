@@ -28,11 +28,14 @@ from perchctl.vehicle import (
     DECK_FAULT,
     FLYING,
     LOCKED,
+    MOST_CELL_V,
     NO_BATTERY_READING_V,
     POSITION_DECKS,
     TUMBLED,
     ExternalPosition,
     Telemetry,
+    is_armed_by_request,
+    is_disarmed,
 )
 from perchctl.vision import TargetEstimate
 
@@ -87,9 +90,18 @@ class GroundCriteria:
         return None
 
     @property
+    def waits_for_arming(self) -> bool:
+        """True if the vehicle does not arm itself, and needs nothing but to be armed: `fly` does
+        that last, just before take-off. True as well while its motors start."""
+        telemetry = self.telemetry
+        if telemetry.has_bit(CAN_FLY):
+            return False
+        return is_disarmed(telemetry) or is_armed_by_request(telemetry)
+
+    @property
     def supervisor_not_ready(self) -> Problem | None:
-        """Problem: the supervisor does not allow flight (yet)."""
-        if self.telemetry.has_bit(CAN_FLY):
+        """Problem: the supervisor does not allow flight (yet), and arming would not change that."""
+        if self.telemetry.has_bit(CAN_FLY) or self.waits_for_arming:
             return None
         return Problem(f"0x{self.telemetry.supervisor:04X}", "wait, or restart it")
 
@@ -103,6 +115,18 @@ class GroundCriteria:
         return Problem(
             f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
             "charge it",
+        )
+
+    @property
+    def battery_too_high(self) -> Problem | None:
+        """Problem: the battery has more volts than one cell, so none of the limits holds for it."""
+        rests_v = self.telemetry.battery_v
+        if not rests_v > MOST_CELL_V:
+            return None
+        rests, most = distinct_texts(rests_v, MOST_CELL_V, 2)
+        return Problem(
+            f"the battery rests at {rests} V, and one cell has at most {most} V",
+            "perchctl flies vehicles with a battery of one cell",
         )
 
     @property

@@ -14,10 +14,12 @@ from typing import Protocol
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
-from perchctl.flight.criteria import RestCheck
+from perchctl.flight.criteria import GroundCriteria, RestCheck
 from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
 from perchctl.flight.preflight import (
+    Arming,
     abort_on,
+    disarm_on_word,
     refuse_unfit_vehicle,
     refuse_without_positions,
     refuse_wrong_positions,
@@ -98,8 +100,10 @@ def fly(parts: FlightParts) -> FlightReport:
         send=parts.link.send_external,
         is_logged=turns.has_watchers,
     )
-    _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
-    watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
+    told = _teller(parts)
+    parts.link.set_guard(disarm_on_word(parts.operator), told)
+    _wait_until_ready(parts, inputs, turns, told)  # nothing flies before it returns
+    watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
     parts.link.set_guard(watchdog.poll, told)
     try:
         return _mission(parts, inputs, watchdog, turns)
@@ -135,13 +139,19 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     return tell
 
 
-def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnReporter) -> None:
+def _wait_until_ready(
+    parts: FlightParts,
+    inputs: FlightInputs,
+    turns: TurnReporter,
+    told: Callable[[SentCommand], None],
+) -> None:
     refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
-    started_s, at_rest = parts.clock.now(), RestCheck()
+    started_s, at_rest, arming = parts.clock.now(), RestCheck(), Arming()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
-            raise Interrupted("interrupted before take-off: nothing was started")
+            ending = "disarming" if arming.has_begun else "nothing was started"
+            raise Interrupted(f"interrupted before take-off: {ending}")
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_unfit_vehicle(newest, parts.profile)
@@ -163,13 +173,18 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
                 f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
                 f"go on, from a camera or a longer recording"
             )
-        if not waiting:
+        if not waiting and newest is not None:
             positioning = inputs.target_positioning
-            if newest is not None and positioning is not None and positioning.feed.target:
+            if positioning is not None and positioning.feed.target:
                 camera, yaw_rad = parts.pipeline.camera, newest.yaw_rad
                 place, start_m = positioning.feed.target, newest.position_m
                 abort_on(view_problem(place, start_m, yaw_rad, parts.profile, camera))
-            return
+            if not GroundCriteria(newest, parts.profile).waits_for_arming:
+                return
+            request = arming.next_request(newest, now_s)
+            if request is not None:
+                parts.link.send(request)
+                told(SentCommand(now_s, "preflight", request))
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
 

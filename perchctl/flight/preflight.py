@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from perchctl.flight.criteria import (
 )
 from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
+from perchctl.mission import Operator
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import TargetView, view_from
 from perchctl.values import replace
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import ARMED, Arm, Telemetry, is_armed_by_request, may_be_flying
 from perchctl.vision import CameraModel, TargetEstimate
 
 
@@ -33,10 +34,11 @@ def abort_on(problem: Problem | None) -> None:
 
 
 def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
-    """Raises SafetyAbort for a supervisor fault or a low battery, which waiting does not cure."""
+    """Raises SafetyAbort for a supervisor fault or an unfit battery: waiting does not cure them."""
     if telemetry is not None:
         criteria = GroundCriteria(telemetry, profile)
-        abort_on(criteria.supervisor_fault or criteria.battery_too_low)
+        battery = criteria.battery_too_low or criteria.battery_too_high
+        abort_on(criteria.supervisor_fault or battery)
 
 
 def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) -> None:
@@ -134,6 +136,75 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
     if waited_s > limit_s:
         raise TimedOut(f"waited {limit_s:.0f} s for {what}: not flying")
     return what
+
+
+# --- Arming, the last step before take-off ---
+
+
+ARMS_WITHIN_S = 5.0
+"""From the first request until the supervisor allows flight: the firmware gives up on motors that
+do not start after 2 s. A longer time keeps propellers turning on a vehicle that does not fly."""
+REQUEST_PERIOD_S = 0.25
+PAUSE_S = 0.5
+"""Something else was waited for: what was seen of the arming before says nothing any more."""
+
+
+class Arming:
+    """Arms a vehicle that does not arm itself, once nothing else is waited for.
+
+    Its propellers turn from then on, so it comes last: after the operator's word, and whatever the
+    wait for it took. A vehicle that has disarmed itself meanwhile is armed again.
+    """
+
+    def __init__(self) -> None:
+        self._began_s = self._asked_s = self._requested_s = -math.inf
+        self._was_armed = False
+
+    @property
+    def has_begun(self) -> bool:
+        """True once the vehicle was to be armed."""
+        return self._requested_s > -math.inf
+
+    def next_request(self, telemetry: Telemetry, now_s: float) -> Arm | None:
+        """The request to send now, if any. To be called in each turn in which the vehicle
+        `waits_for_arming`, with fresh telemetry.
+
+        Raises TimedOut if it does not arm within `ARMS_WITHIN_S`, SafetyAbort if it disarms itself
+        while its motors start.
+        """
+        if now_s - self._asked_s > PAUSE_S:
+            self._began_s, self._was_armed = now_s, False
+        self._asked_s = now_s
+        bits = f"supervisor 0x{telemetry.supervisor:04X}"
+        if telemetry.has_bit(ARMED):
+            self._was_armed = True
+        elif self._was_armed:
+            raise SafetyAbort(
+                f"the vehicle was armed, and disarmed itself before its motors were ready "
+                f"({bits}): something may block a propeller; look at it, then restart the vehicle"
+            )
+        if now_s - self._began_s > ARMS_WITHIN_S:
+            raise TimedOut(
+                f"the vehicle could not be armed within {ARMS_WITHIN_S:.0f} s ({bits}): restart it"
+            )
+        if telemetry.has_bit(ARMED) or now_s - self._requested_s < REQUEST_PERIOD_S:
+            return None
+        self._requested_s = now_s
+        return Arm(True)
+
+
+def disarm_on_word(operator: Callable[[], Operator]) -> Callable[..., Arm | None]:
+    """Return the link's guard for the wait before take-off: it disarms on the operator's word, also
+    while the loop hangs."""
+
+    def poll(
+        now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
+    ) -> Arm | None:
+        if operator() is Operator.NONE or may_be_flying(newest, now_s):
+            return None
+        return Arm(False) if newest is not None and is_armed_by_request(newest) else None
+
+    return poll
 
 
 # --- Whether a target that is the positioning system stays in view on the way up. Pure ---

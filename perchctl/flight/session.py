@@ -159,7 +159,7 @@ def fly_session(
                 watchers,
                 switch.read,
                 positions,
-                remarks,
+                lambda: [*remarks(), *link.new_notes()],
                 table,
             )
             with contextlib.ExitStack() as waiting:

@@ -13,9 +13,9 @@ import time
 from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
+from perchctl.link.arming import disarm, warn_of_armed
 from perchctl.link.connection import Connection, open_connection, send_packets
 from perchctl.link.crtp import (
-    ARM,
     UNLOCK_PERIOD_S,
     UNLOCK_THRUST,
     UNLOCK_TIMES,
@@ -23,7 +23,13 @@ from perchctl.link.crtp import (
     encode,
 )
 from perchctl.link.external_position import StandingFeed, estimator_parameters, settle_estimator
-from perchctl.link.firmware import check_firmware, detected_decks, read_parameters, set_parameters
+from perchctl.link.firmware import (
+    check_airframe,
+    check_firmware,
+    detected_decks,
+    read_parameters,
+    set_parameters,
+)
 from perchctl.link.protocol import (
     LANDING_WAIT_S,
     Guard,
@@ -37,13 +43,14 @@ from perchctl.mission import SentCommand
 from perchctl.positioning import PositionFeed
 from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import (
-    ARMED,
     FLYING,
+    Arm,
     Command,
     ExternalPosition,
     Idle,
     RawThrust,
     Telemetry,
+    is_armed_by_request,
     is_fresh,
     may_be_flying,
 )
@@ -82,6 +89,7 @@ class CflibLink:
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
         self._lost_since_s: float | None = None  # last heard, while the link is lost
+        self._was_armed = False  # by an order of this session
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -90,7 +98,7 @@ class CflibLink:
             self._prepare(self.connection)
         except BaseException:
             # As long as nothing is known of the vehicle, it may be flying for another.
-            self._leave(farewell=self._may_say_farewell())
+            self._leave(farewell=self._may_say_farewell() and not self._is_armed)
             raise
 
     def decks(self) -> tuple[str, ...]:
@@ -103,6 +111,7 @@ class CflibLink:
 
     def send(self, command: Command) -> None:
         if self._sender is not None and not isinstance(command, Idle):
+            self._was_armed = self._was_armed or command == Arm(True)
             self._sender.put(command)
 
     def send_external(self, place: ExternalPosition) -> bool:
@@ -137,29 +146,43 @@ class CflibLink:
             return f"nothing heard for {silent_s:.1f} s"
         return None
 
+    def new_notes(self) -> list[str]:
+        """Sentences on what went wrong and did not matter, since the last call."""
+        return [] if self._sender is None else self._sender.new_notes()
+
     def close(self) -> None:
         """Close when nothing flies; otherwise leave the link without its farewell packet.
 
-        A vehicle that still reports flying after the wait, or of which nothing is known any
-        more, is better off with its own landing or level-out than with a zero setpoint.
+        On the ground a vehicle that does not arm itself is disarmed. A vehicle that still reports
+        flying after the wait, or of which nothing is known any more, is better off with its own
+        landing or level-out than with a zero setpoint.
         """
         if self._sender is not None:
             self._sender.drain(DRAIN_S)
         end_s = self._clock() + self._landing_wait_s
         while self._may_hear_more() and not self._may_say_farewell() and self._clock() < end_s:
             time.sleep(0.05)
+        sender, disarmed = self._sender, True
+        if sender is not None:
+            disarmed = disarm(
+                lambda: self._blocks.newest,
+                lambda order: sender.put(order, "farewell"),
+                self._clock,
+                time.sleep,
+                was_ordered=self._was_armed,
+            )
         farewell = self._may_say_farewell()
-        if self._sender is not None:
-            self._sender.stop()
+        if sender is not None:
+            sender.stop()
         self._leave(farewell=farewell)
+        if not disarmed:
+            warn_of_armed(f"the vehicle at {self._uri}")
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
+        check_airframe(connection.cf, self._uri)
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
-        newest = self._blocks.newest
-        if newest is not None and not newest.has_bit(ARMED):  # a Crazyflie 2.1 arms itself
-            send_packets(connection.cf, ARM)
         self._unlock_thrust(connection)  # from here on it is known to be on the ground
         set_parameters(connection.cf, self._uri, estimator_parameters(self._positioning))
         self._sender = Sender(
@@ -180,6 +203,11 @@ class CflibLink:
         if newest is not None and newest.has_bit(FLYING):
             raise ConnectionFailed(
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
+            )
+        if self._is_armed:
+            raise ConnectionFailed(
+                f"the vehicle at {self._uri} is armed already: keep away from its propellers, end "
+                f"the program that armed it, or wait 30 s until it disarms itself"
             )
         for _ in range(UNLOCK_TIMES):
             send_packets(connection.cf, UNLOCK_THRUST)
@@ -217,6 +245,12 @@ class CflibLink:
         """True unless the link is lost for good: with a sender it is being opened again."""
         connection = self.connection
         return connection is not None and (connection.lost is None or self._sender is not None)
+
+    @property
+    def _is_armed(self) -> bool:
+        """True if the vehicle does not arm itself, and is armed."""
+        newest = self._blocks.newest
+        return newest is not None and is_armed_by_request(newest)
 
     def _may_say_farewell(self) -> bool:
         """True where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from perchctl.errors import ConnectionFailed
+from perchctl.link import internals
 from perchctl.link.crtp import Packet
 from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_folder
@@ -57,12 +58,8 @@ class Connection:
         self._refused_since_s: float | None = None  # by the lock
         self._asked_s = self._counted_s = 0.0  # `is_dead`, and since when it finds the same
         self._counted: object = None
-        # A driver reports its end from inside `send_packet`, where the caller holds cflib's lock,
-        # or from its own thread. cflib's handler closes the link there, and joins the thread of its
-        # pings, which waits for that lock: then nothing can be sent ever again. So nothing is
-        # joined there, and nobody pings (the radio's own null packets keep the link).
-        self.cf._link_error_cb = partial(self._on_error, self._number)
-        self.cf.link_statistics.latency.start = lambda: None
+        internals.replace_error_callback(self.cf, partial(self._on_error, self._number))
+        internals.stop_pings(self.cf)
         self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
         self.cf.connection_failed.add_callback(self._on_failed)
 
@@ -72,7 +69,7 @@ class Connection:
         start_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
             return False
-        self._has_safelink = not getattr(self.cf.link, "needs_resending", True)
+        self._has_safelink = internals.has_safelink(self.cf.link)
         return True
 
     def send(self, packet: Packet) -> bool:
@@ -84,7 +81,7 @@ class Connection:
         if self.lost is not None:
             return False
         outgoing = _as_cflib(packet)
-        lock = self.cf._send_lock
+        lock = internals.send_lock(self.cf)
         if not lock.acquire(blocking=False):
             if self._refused_since_s is None:
                 self._refused_since_s = time.monotonic()
@@ -92,10 +89,7 @@ class Connection:
         try:
             self._refused_since_s = None
             driver = self.cf.link
-            if driver is None or isinstance(driver, _Nowhere):
-                return False
-            queue = getattr(driver, "out_queue", None)
-            if queue is not None and queue.full():
+            if driver is None or isinstance(driver, _Nowhere) or not internals.has_room(driver):
                 return False
             driver.send_packet(outgoing)
             self.cf.packet_sent.call(outgoing)
@@ -115,8 +109,8 @@ class Connection:
         self._asked_s = now_s
         if self._refused_since_s is not None and now_s - self._refused_since_s > DEAD_S:
             return True
-        thread = getattr(self.cf.link, "_thread", None)
-        left = getattr(thread, "_retry_before_disconnect", None)
+        thread = internals.driver_thread(self.cf.link)
+        left = internals.retries_left(thread)
         if self._counted != (thread, left) or now_s - asked_s > DEAD_S:
             self._counted, self._counted_s = (thread, left), now_s
         if thread is None:
@@ -179,7 +173,7 @@ class Connection:
         with self._change:
             self._number += 1
             number = self._number
-        _forget_dead_dongle(self.cf.link_uri)
+        internals.forget_dead_dongle(self.cf.link_uri)
         try:
             driver = cflib.crtp.get_link_driver(
                 self.cf.link_uri,
@@ -193,8 +187,7 @@ class Connection:
         if self._agrees_on_safelink(driver):
             with self._change:
                 if number == self._number and not self._left:
-                    # Whoever hung in the old driver may hold the old lock for ever.
-                    self.cf._send_lock = threading.Lock()
+                    internals.renew_send_lock(self.cf)
                     self._refused_since_s = None
                     self.cf.link, self.lost = driver, None
                     return True
@@ -208,7 +201,7 @@ class Connection:
         (docs/firmware.md, "Safelink"). A radio opened out of the vehicle's reach is such a driver
         for as long as it lives."""
         end_s = time.monotonic() + SAFELINK_S
-        while self._has_safelink and getattr(driver, "needs_resending", False):
+        while self._has_safelink and not internals.has_safelink(driver):
             if self._left or time.monotonic() >= end_s:
                 return False
             time.sleep(0.01)
@@ -261,15 +254,16 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 def init_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence cflib, which logs what it also reports by callback, and prints on stdout."""
+    silence cflib, which logs what it also reports by callback, and prints on stdout. Raises
+    UsageError if this cflib lacks what perchctl needs of it."""
     import cflib.crtp
-    from cflib.crtp import radiodriver
 
+    internals.check_internals()
     logger = logging.getLogger("cflib")
     logger.addHandler(logging.NullHandler())
     logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
-    vars(radiodriver)["print"] = lambda *words: logger.info("%s", words)
-    radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
+    internals.log_prints(logger)
+    internals.keep_retrying(RADIO_RETRIES)
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()
 
@@ -323,16 +317,6 @@ def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
     thread = threading.Thread(target=call, name=name, daemon=True)
     thread.start()
     return thread
-
-
-def _forget_dead_dongle(uri: str) -> None:
-    """Remove a dongle's thread that has ended; cflib would keep it for good."""
-    with contextlib.suppress(Exception):  # a URI without a dongle, another cflib
-        from cflib.crtp.radiodriver import RadioDriver, RadioManager
-
-        number = RadioDriver.parse_uri(uri)[0]
-        if not RadioManager._radios[number].is_alive():
-            RadioManager.remove(number)
 
 
 # --- One program at a time for each vehicle: a lock that this user's programs on this computer

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from perchctl.errors import InvalidValue
 from perchctl.vehicle import (
+    Arm,
     Command,
     EmergencyStop,
     ExternalPosition,
@@ -112,6 +113,8 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
             return stop, _NOTIFY
         case EmergencyStop():
             return (Packet(Port.SUPERVISOR, _REQUEST, bytes((_EMERGENCY_STOP,))),)
+        case Arm(armed):
+            return (Packet(Port.SUPERVISOR, _REQUEST, bytes((_ARM, armed))),)
         case ExternalPosition(position_m, quaternion):
             if quaternion is None:
                 data = struct.pack("<fff", *position_m)
@@ -129,7 +132,6 @@ def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
 
 _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPOINT_STOP, 0))
 
-ARM = (Packet(Port.SUPERVISOR, _REQUEST, bytes((_ARM, True))),)
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet since boot, on the ground, then the priority back: without the
 first a raw thrust stays 0, without the second the vehicle's own landing is not flown

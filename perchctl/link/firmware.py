@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import queue
 from collections.abc import Mapping
 from typing import Any
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
+from perchctl.link.connection import send_packets
+from perchctl.link.crtp import Packet, Port
 from perchctl.link.telemetry import NEEDED
+from perchctl.vehicle import AIRFRAMES
 
 NEEDED_PROTOCOL = 12
 """From firmware 2026.08 on: the supervisor's own port (docs/firmware.md, "Link")."""
 PARAMETER_TIMEOUT_S = 2.0
+ASKED_TIMES = 10
+_VERSION_CHANNEL, _DEVICE_TYPE = 1, b"\x02"
 
 
 def check_firmware(cf: Any, uri: str) -> None:
@@ -25,6 +31,42 @@ def check_firmware(cf: Any, uri: str) -> None:
         )
     for name in missing_variables(cf):
         raise NotFound(f"the firmware at {uri} has no log variable {name}: {remedy}")
+
+
+def read_device_type(cf: Any) -> str | None:
+    """The kind of vehicle, as its firmware names it; None without an answer. Bounded.
+
+    cflib 0.1.34 never asks for it.
+    """
+    answers: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def on_packet(packet: Any) -> None:
+        data = bytes(packet.data)
+        if data[:1] == _DEVICE_TYPE:
+            answers.put(data[1:].split(b"\0")[0].decode("utf-8", "replace").strip())
+
+    cf.add_header_callback(on_packet, Port.PLATFORM, _VERSION_CHANNEL)
+    try:
+        for _ in range(ASKED_TIMES):
+            send_packets(cf, [Packet(Port.PLATFORM, _VERSION_CHANNEL, _DEVICE_TYPE)])
+            with contextlib.suppress(queue.Empty):
+                return answers.get(timeout=PARAMETER_TIMEOUT_S / ASKED_TIMES)
+        return None
+    finally:
+        cf.remove_header_callback(on_packet, Port.PLATFORM, _VERSION_CHANNEL)
+
+
+def check_airframe(cf: Any, uri: str) -> None:
+    """Raises ConnectionFailed for a kind of vehicle whose thrust or battery perchctl does not
+    know."""
+    device_type = read_device_type(cf)
+    if device_type in AIRFRAMES:
+        return
+    found = f"is a {device_type}" if device_type else "does not say what kind of vehicle it is"
+    raise ConnectionFailed(
+        f"the vehicle at {uri} {found}: perchctl's thrust and battery figures are those of a "
+        f"{', '.join(AIRFRAMES[:-1])} or {AIRFRAMES[-1]}; fly one of these"
+    )
 
 
 def missing_variables(cf: Any) -> list[str]:

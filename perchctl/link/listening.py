@@ -33,12 +33,13 @@ from perchctl.link.firmware import (
     NEEDED_PROTOCOL,
     check_firmware,
     missing_variables,
+    read_device_type,
     read_parameters,
 )
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import FLYING
+from perchctl.vehicle import ARMED, AUTO_ARM, FLYING
 
 
 class ReadOnlyLink(CflibLink):
@@ -87,7 +88,8 @@ class AttitudeLink(ReadOnlyLink):
 
     @property
     def motors_running(self) -> bool:
-        """True while the newest packet reports turning motors: until 2 s after they stop."""
+        """True while the newest packet reports turning motors, until 2 s after they stop, or a
+        vehicle that is armed and does not arm itself, whose propellers turn all the time."""
         return self._motors_run
 
     def samples(self) -> list[AttitudeSample]:
@@ -106,7 +108,8 @@ class AttitudeLink(ReadOnlyLink):
         pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed."""
         now_s = self._blocks.last_arrival_s = self._clock()
         t_s = self._timebase.to_loop_s(stamp, now_s)
-        self._motors_run = bool(int(values["supervisor.info"]) & FLYING)
+        bits = int(values["supervisor.info"])
+        self._motors_run = bool(bits & FLYING) or (bool(bits & ARMED) and not bits & AUTO_ARM)
         self._heard.set()
         if all(map(math.isfinite, values.values())):
             self._samples.append(
@@ -159,6 +162,10 @@ class ProbeLink(ReadOnlyLink):
     def protocol_version(self) -> int:
         """The protocol's version; -1 for a vehicle that is too old to have one."""
         return int(self._cf.platform.get_protocol_version())
+
+    def device_type(self) -> str | None:
+        """The kind of vehicle, as its firmware names it; None without an answer."""
+        return read_device_type(self._cf)
 
     def parameters(self) -> dict[str, float]:
         """All parameters by name, as read when the link was opened."""
@@ -224,10 +231,11 @@ def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     found: list[str] = []
     why = ["the radio did not answer in time"]
 
+    init_cflib()
+
     def run() -> None:
         from cflib import crtp
 
-        init_cflib()
         with contextlib.suppress(Exception):  # whatever the driver raises
             why[0] = _radio_problem()
         for driver in crtp.CLASSES:

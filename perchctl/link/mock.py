@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from perchctl.link.arming import disarm
 from perchctl.link.crtp import (
     UNLOCK_PERIOD_S,
     UNLOCK_THRUST,
@@ -33,7 +34,7 @@ from perchctl.link.telemetry import (
 from perchctl.mission import SentCommand
 from perchctl.positioning import VehiclePose
 from perchctl.profile import PositioningConfig
-from perchctl.vehicle import FLYING, Command, ExternalPosition, Telemetry
+from perchctl.vehicle import FLYING, Arm, Command, ExternalPosition, Telemetry
 
 TELEMETRY_DELAY_S = 0.01
 SETTLE_S = 1.0
@@ -87,6 +88,7 @@ class MockLink:
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
+        self._was_armed = False  # by an order of this session
         self._watched_s = -math.inf
         self._call: Callable[[float], object] = lambda now_s: None
         self._call_due_s = self._call_period_s = math.inf
@@ -131,7 +133,7 @@ class MockLink:
         return samples
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
-        self._guard, self._on_sent = guard, on_sent
+        self._guard, self._on_sent, self._watched_s = guard, on_sent, -math.inf
 
     def _run_guard(self) -> None:
         if self._guard is None or self.now_s < self._watched_s + WATCH_PERIOD_S - 1e-9:
@@ -143,15 +145,18 @@ class MockLink:
             self.send(command)
             self._on_sent(SentCommand(self.now_s, "watchdog", command))
 
-    def _collect(self) -> None:
+    def _collect(self) -> Telemetry | None:
+        """Take in what has arrived by now; return the newest sample."""
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
             _, _, block, stamp_s, values, start = heapq.heappop(self._under_way)
             sample = self._assembler.accept(block, values, stamp_s, start)
             if sample is not None:
                 self._newest = sample
                 self._arrived.append(sample)
+        return self._newest
 
     def send(self, command: Command) -> None:
+        self._was_armed = self._was_armed or command == Arm(True)
         self._hand_over(encode(command))
 
     def send_external(self, place: ExternalPosition) -> bool:
@@ -170,10 +175,19 @@ class MockLink:
         return None
 
     def close(self) -> None:
-        """Wait, bounded, until nothing flies any more, as the real link does."""
+        """Wait, bounded, until nothing flies any more, and disarm it, as the real link does."""
         end_s = self.now_s + 6.0
         while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:
             self.advance_to(self.now_s + 0.1)
+        ordered = self._was_armed
+        disarm(self._collect, self._disarm, lambda: self.now_s, self._wait, was_ordered=ordered)
+
+    def _disarm(self, order: Arm) -> None:
+        self.send(order)
+        self._on_sent(SentCommand(self.now_s, "farewell", order))
+
+    def _wait(self, duration_s: float) -> None:
+        self.advance_to(self.now_s + duration_s)
 
     def _hand_over(self, packets: Iterable[Packet]) -> None:
         for packet in packets:

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from perchctl.extensions import error_at
+from perchctl.link.arming import disarm, warn_of_armed
 from perchctl.link.protocol import LANDING_WAIT_S, Guard, SentCallback, VehicleLink, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
-from perchctl.vehicle import Command, ExternalPosition, Idle, Telemetry, may_be_flying
+from perchctl.vehicle import Arm, Command, ExternalPosition, Idle, Telemetry, may_be_flying
 
 READ_PERIOD_S = 0.005
 AHEAD_S = 0.1
@@ -22,7 +23,8 @@ class GuardedLink:
 
     A reader thread asks it for telemetry and problems, and the `Sender`'s threads hand it commands
     and ask the watchdog, so nothing waits for a call of it that hangs. An error that it raises, an
-    invalid sample, or a call longer than `HANGS_S` counts as a lost link.
+    invalid sample, or a call longer than `HANGS_S` counts as a lost link, until it works again;
+    errors of `send` do once they last for `HANGS_S`.
     """
 
     def __init__(self, inner: VehicleLink, clock: Callable[[], float]) -> None:
@@ -30,10 +32,9 @@ class GuardedLink:
         self._lock = threading.Lock()
         self._waiting: list[Telemetry] = []  # that the loop has not taken yet
         self._newest: Telemetry | None = None
-        self._failure: str | None = None  # permanent
-        self._trouble: str | None = None  # the link's own word, of the last round
+        self._trouble: str | None = None  # the link's own word, or its error, of the last round
         self._answered_s: float | None = None  # end of the reader's last round
-        self._send_error = ""  # of the last command
+        self._was_armed = False  # by an order of this session
         self._closing = threading.Event()
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
@@ -51,6 +52,7 @@ class GuardedLink:
 
     def send(self, command: Command) -> None:
         if not isinstance(command, Idle):
+            self._was_armed = self._was_armed or command == Arm(True)
             self._sender.put(command)
 
     def send_external(self, place: ExternalPosition) -> bool:
@@ -59,31 +61,41 @@ class GuardedLink:
     def problem(self, now_s: float) -> str | None:
         silent_s = 0.0 if self._answered_s is None else now_s - self._answered_s
         hangs = f"telemetry() hangs for {silent_s:.1f} s" if silent_s > HANGS_S else None
-        stuck = self._sender.trouble()
-        stuck = stuck and f"{stuck}{self._send_error}"
-        return self._failure or stuck or hangs or self._trouble
+        return self._sender.trouble() or hangs or self._trouble
+
+    def new_notes(self) -> list[str]:
+        """Sentences on what went wrong and did not matter, since the last call."""
+        return self._sender.new_notes()
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
 
     def close(self) -> None:
-        """Wait, bounded, until nothing flies, and close the inner link."""
+        """Wait, bounded, until nothing flies, disarm it, and close the inner link."""
         self._sender.drain(1.0)
         end_s = time.monotonic() + (0.0 if self._answered_s is None else LANDING_WAIT_S)
         while may_be_flying(self._newest, self._clock()) and time.monotonic() < end_s:
             time.sleep(0.05)
+        disarmed = disarm(
+            lambda: self._newest,
+            lambda order: self._sender.put(order, "farewell"),
+            self._clock,
+            time.sleep,
+            was_ordered=self._was_armed,
+        )
         self._closing.set()
         self._sender.stop()
         with suppress(Exception):  # the flight is over, and its report counts
             self._inner.close()
+        if self._was_armed and not disarmed:
+            warn_of_armed("the vehicle of your own link")
 
     def _hand_over(self, command: Command) -> None:
         try:
             self._inner.send(command)
-        except BaseException as error:  # SystemExit would end the sender's thread
-            self._send_error = f": send() raised {error_at(error)}"
-            raise RuntimeError from error  # the sender tries again
-        self._send_error = ""
+        except BaseException as error:
+            # The sender counts it and tries again; SystemExit would end its thread.
+            raise RuntimeError(f"send() raised {error_at(error)}") from error
 
     def _ask(self) -> Command | None:
         with self._lock:
@@ -100,7 +112,7 @@ class GuardedLink:
                     self._newest = samples[-1] if samples else self._newest
                 self._trouble = self._inner.problem(self._clock())
             except BaseException as error:
-                self._failure = f"telemetry() or problem() raised {error_at(error)}"
+                self._trouble = f"telemetry() or problem() raised {error_at(error)}"
             self._answered_s = self._clock()
 
     def _checked(self, sample: object) -> Telemetry:

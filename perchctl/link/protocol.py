@@ -36,7 +36,8 @@ class Link(Protocol):
     """
 
     def connect(self) -> None:
-        """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
+        """Connect, check the firmware, set parameters, unlock the thrust. Bounded. Arms nothing:
+        a vehicle that does not arm itself is sent `Arm` once it is to take off."""
 
     def decks(self) -> tuple[str, ...]:
         """The decks that the connected vehicle found at boot, by the firmware's names."""
@@ -63,7 +64,8 @@ class Link(Protocol):
         """
 
     def close(self) -> None:
-        """Close the link, after a bounded wait until the vehicle no longer flies."""
+        """Close the link, after a bounded wait until the vehicle no longer flies. A vehicle on
+        the ground that does not arm itself is disarmed, whatever has ended the session."""
 
 
 class VehicleLink(Protocol):
@@ -71,13 +73,14 @@ class VehicleLink(Protocol):
     profile's section `link`.
 
     `telemetry` and `problem` are called in one thread, 200 times a second, `send` in another one
-    (after a hang in a new one). An error that they raise, or a call longer than 0.5 s, counts as a
-    lost link: perchctl goes on sending, and lands the vehicle.
+    (after a hang in a new one). An error of the first two, errors of `send` for 0.5 s, or a call
+    longer than 0.5 s, count as a lost link: perchctl goes on sending, and lands the vehicle.
     """
 
     def connect(self) -> None:
-        """Connect to a vehicle on the ground, and make it ready to fly; bounded in time. Raises
-        one of `perchctl.errors`, such as ConnectionFailed."""
+        """Connect to a vehicle on the ground, and prepare it for a flight; bounded in time. Must
+        not turn a motor, and so not arm: nobody has been asked yet. Raises one of
+        `perchctl.errors`, such as ConnectionFailed."""
 
     def decks(self) -> tuple[str, ...]:
         """Decks that measure the vehicle's position, by the firmware's names (bcFlow2, ...)."""
@@ -88,7 +91,11 @@ class VehicleLink(Protocol):
 
     def send(self, command: Command) -> None:
         """Hand one command of `perchctl.vehicle` to the vehicle, about 50 times a second.
-        Without a next one it must level out by itself after 0.5 s, and stop after 2 s."""
+        Without a next one it must level out by itself after 0.5 s, and stop after 2 s.
+
+        `Arm(True)` comes just before take-off, if the telemetry's bits are `CAN_ARM` without
+        `AUTO_ARM` and `CAN_FLY`; `Arm(False)` after a session, on the ground, if they are `ARMED`
+        without `AUTO_ARM`."""
 
     def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence with the cause."""

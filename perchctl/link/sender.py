@@ -5,13 +5,14 @@ hang in the library with one. The second never touches the library: it asks the 
 to be sent while the loop hangs, and gives the work to a new first thread where the old one hangs.
 No error ends a thread.
 
-Setpoints coalesce (only the newest counts), and one that has waited too long is dropped. Orders
-keep their place until the library has taken them, however long that takes; an emergency stop
-takes everybody's place.
+Setpoints coalesce (only the newest counts), and one that has waited too long is dropped, as is an
+arming request. Orders keep their place until the library has taken them, however long that takes;
+an emergency stop takes everybody's place.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -22,16 +23,21 @@ from typing import Any
 
 from perchctl.link.protocol import SentCallback, ignore_sent
 from perchctl.mission import SentCommand
-from perchctl.vehicle import Command, EmergencyStop, PositionSetpoint, RawThrust
+from perchctl.vehicle import Arm, Command, EmergencyStop, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
+_EXPIRING = (*_STREAMED, Arm)
+"""What is for its own moment only: dropped when it is stale, and never repeated on its own. An
+arming request that comes late would turn the propellers after the session has ended."""
 STALE_S = 0.25
-"""A setpoint that has waited longer, behind a command that hung, is for another moment."""
+"""What expires and has waited longer, behind a command that hung, is for another moment."""
 GUARD_PERIOD_S = 0.05
 HANGS_S = 0.5
-"""For so long the library may hold one piece (docs/firmware.md, "Silence")."""
+"""For so long the library may hold one piece, or fail (docs/firmware.md, "Silence")."""
 RETRY_S = 0.002
 """Until a piece that found no room is offered again: about what one packet takes by radio."""
+NOTED_EVERY_S = 1.0
+"""Errors are noted so often at most."""
 
 
 @dataclass(eq=False)
@@ -61,7 +67,7 @@ class Sender:
     raised errors, for longer than `HANGS_S`. `spare` is called by the first thread when no command
     waits; it may hand over something of its own, and returns True if it did.
 
-    `problem` is the permanent failure in one sentence, else None.
+    `errors` counts the attempts to send that failed.
     """
 
     def __init__(
@@ -90,7 +96,10 @@ class Sender:
         self._raised = False  # by the library, at the last attempt
         self._last: tuple[float, Command] | None = None
         self._running = True
-        self.problem: str | None = None
+        self.errors, self._error = 0, ""
+        self._failing_since_s: float | None = None  # the first error since the last success
+        self._keeper_error: str | None = None  # of the second thread's last round
+        self._noted, self._noted_s = 0, -math.inf  # of the errors
         with self._ready:
             self._start_worker()
         self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
@@ -114,8 +123,8 @@ class Sender:
             if self._last is None:
                 return
             handed_s, command = self._last
-            overtaken = any(not isinstance(w.command, _STREAMED) for w in self._queue)
-        if handed_s >= since_s and not overtaken and not isinstance(command, _STREAMED):
+            overtaken = any(not isinstance(w.command, _EXPIRING) for w in self._queue)
+        if handed_s >= since_s and not overtaken and not isinstance(command, _EXPIRING):
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
@@ -125,9 +134,26 @@ class Sender:
 
     def trouble(self) -> str | None:
         """A sentence on why no command goes out, else None."""
-        stuck = self.stuck_s() > HANGS_S
-        text = f"no command has gone out for {self.stuck_s():.1f} s" if stuck else None
-        return self.problem or text
+        if self._keeper_error is not None:
+            return self._keeper_error
+        since_s = self._failing_since_s
+        if since_s == -math.inf:
+            return f"a command could not be sent: {self._error}"
+        if since_s is not None and self._clock() - since_s > HANGS_S:
+            failing_s = self._clock() - since_s
+            return f"no command could be sent for {failing_s:.1f} s: {self._error}"
+        if self.stuck_s() > HANGS_S:
+            return f"no command has gone out for {self.stuck_s():.1f} s"
+        return None
+
+    def new_notes(self) -> list[str]:
+        """A sentence with the number of errors if there are new ones, at most once a second."""
+        now_s, errors = self._clock(), self.errors
+        if errors == self._noted or now_s - self._noted_s < NOTED_EVERY_S:
+            return []
+        self._noted, self._noted_s = errors, now_s
+        times = "once" if errors == 1 else f"{errors} times"
+        return [f"sending a command has failed {times} so far, and was tried again: {self._error}"]
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until all commands are handed over; return False after `timeout_s`."""
@@ -172,7 +198,9 @@ class Sender:
                     pause_s = GUARD_PERIOD_S
                 self._raised = False
             except BaseException as error:  # the library's, whatever it is: this thread goes on
-                self.problem = f"a command could not be sent: {error}"
+                self._note_error(error)
+                if waiting is not None and self._failing_since_s is None:
+                    self._failing_since_s = self._clock()
                 self._raised, pause_s = True, GUARD_PERIOD_S
             with self._ready:
                 if not self._is_mine():
@@ -180,6 +208,10 @@ class Sender:
                 self._called_s = None
                 if waiting is None and self._queue:
                     pause_s = 0.0  # something came meanwhile
+
+    def _note_error(self, error: BaseException) -> None:
+        self.errors += 1
+        self._error = (str(error).strip() or type(error).__name__).splitlines()[0]
 
     def _is_mine(self) -> bool:
         """True while the work is this thread's: not once it was found hanging."""
@@ -190,7 +222,7 @@ class Sender:
         while self._queue:
             first = self._queue[0]
             stale = self._clock() - first.put_s > STALE_S
-            if not (stale and isinstance(first.command, _STREAMED)):
+            if not (stale and isinstance(first.command, _EXPIRING)):
                 return first
             self._queue.popleft()
         self._done()
@@ -203,14 +235,15 @@ class Sender:
             try:
                 waiting.rest = deque(self._pieces(waiting.command))
             except Exception:
-                self._remove(waiting)  # it will never be better
+                self._remove(waiting)  # it will never be better: lost, and a trouble at once
+                self._failing_since_s = -math.inf
                 raise
         if waiting.rest and self._hand_over(waiting.rest[0]) is False:
             return RETRY_S
         with self._ready:
             if not self._is_mine():
                 return 0.0  # the next thread has begun with the same piece
-            self._called_s = None
+            self._called_s = self._failing_since_s = None
             if waiting.rest:
                 waiting.rest.popleft()
             waiting.begun = True
@@ -250,11 +283,13 @@ class Sender:
                 self._ready.wait_for(lambda: not self._running, GUARD_PERIOD_S)
                 if not self._running:
                     return
+            failed: str | None = None
             for part in (self._look_after_worker, self._run_guard):
                 try:
                     part()
                 except BaseException as error:  # this thread goes on, whatever it is
-                    self.problem = f"the link is not looked after: {error}"
+                    failed = f"the link is not looked after: {error}"
+            self._keeper_error = failed
 
     def _look_after_worker(self) -> None:
         called_s, stuck_s = self._called_s, self.stuck_s()

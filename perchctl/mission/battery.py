@@ -1,7 +1,7 @@
 """How much the battery has left, and whether it is enough for an attempt and a landing.
 
 No current is measured on a Crazyflie. Assumed are a cell's resting voltage by its charge (`VOLTS`)
-and the current at full thrust (`FULL_A`). Fitted are the sag under full thrust and `hunger`: how
+and the current at full thrust (`Drive`). Fitted are the sag under full thrust and `hunger`: how
 much faster this battery empties than assumed, by least squares, with old readings fading.
 """
 
@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from dataclasses import dataclass
 
 from perchctl.mission.conditions import max_press_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.state import BatteryOutlook, EnergyState, Phase
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import FULL_THRUST, is_battery_reading
+from perchctl.vehicle import AUTO_ARM, FULL_THRUST, Telemetry, is_battery_reading
 
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 VOLTS = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
 """Of the charge, and of the resting cell with it: a little below the firmware's own table."""
-FULL_A = 4.4  # four motors at full thrust; proportional to the thrust below
-LOW_POWER_V = 3.2  # the firmware's, unless `pm.lowVoltage` differs
 USUAL_SAG_V, SAG_WITHIN_V, LEAST_SAG_V = 0.63, 0.3, 0.2
 USUAL_HUNGER, HUNGER_WITHIN, LEAST_HUNGER, MOST_HUNGER = 1.1, 0.3, 1.0, 3.0
 READING_V, FADES_S = 0.02, 40.0  # error of a second of readings, and how long it counts
@@ -36,6 +35,34 @@ PRESS_DIP_V = 0.3  # below `safety.min_load_v`, for a press shorter than the deb
 BACK_OFF_S = 3.0  # until it is steady and sees the target again
 
 
+# --- Brushed and brushless motors ---
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Motors with their supply.
+
+    Attributes:
+        full_a: current of four motors at full thrust, A; proportional to the thrust below.
+        low_power_v: voltage below which the firmware reports low power, unless `pm.lowVoltage`
+            is set.
+    """
+
+    full_a: float
+    low_power_v: float
+
+
+BRUSHED = Drive(full_a=4.4, low_power_v=3.2)
+BRUSHLESS = Drive(full_a=7.3, low_power_v=3.35)
+"""The current is not published. Taken is that of the brushed motors for each newton (0.80 N at full
+thrust, 0.48 N brushed): an upper bound, since the brushless ones are built to be more efficient."""
+
+
+def drive_of(telemetry: Telemetry) -> Drive:
+    """The vehicle's motors: those that start by an arming request only are brushless."""
+    return BRUSHED if telemetry.has_bit(AUTO_ARM) else BRUSHLESS
+
+
 # --- The battery's state, fitted reading by reading ---
 
 
@@ -44,11 +71,17 @@ def read_battery(c: Context) -> EnergyState:
     tel = c.telemetry
     reading_v = tel.battery_v if c.obs.battery_age_s <= FRESH_S else math.nan
     dt_s = max(0.0, c.t_s - c.state.t_s)
-    return update_energy(c.state.energy, dt_s, reading_v, tel.thrust, c.profile.vehicle.battery_mah)
+    mah, drive = c.profile.vehicle.battery_mah, drive_of(tel)
+    return update_energy(c.state.energy, dt_s, reading_v, tel.thrust, mah, drive)
 
 
 def update_energy(
-    state: EnergyState, dt_s: float, battery_v: float, thrust: float, battery_mah: float
+    state: EnergyState,
+    dt_s: float,
+    battery_v: float,
+    thrust: float,
+    battery_mah: float,
+    drive: Drive = BRUSHED,
 ) -> EnergyState:
     """The state `dt_s` later, under a commanded thrust 0..65535, for a battery of `battery_mah`.
 
@@ -56,7 +89,7 @@ def update_energy(
     load = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
-        used_share=state.used_share + load * _per_s(battery_mah) * dt_s,
+        used_share=state.used_share + load * _per_s(battery_mah, drive) * dt_s,
         load=_towards(state.load, load, dt_s / LAG_S),
     )
     if load >= LEAST_LOAD:
@@ -66,7 +99,7 @@ def update_energy(
         state = replace(state, unknown_s=state.unknown_s + dt_s)
         if state.rest_v is None:
             return state
-        spent = fit_sag_model(state)[1] * state.load * _per_s(battery_mah) * dt_s
+        spent = fit_sag_model(state)[1] * state.load * _per_s(battery_mah, drive) * dt_s
         return replace(state, rest_v=rest_v_from_charge(charge_from_rest_v(state.rest_v) - spent))
     state = replace(state, unknown_s=0.0)
     if load == 0.0 and not state.loaded_s:
@@ -130,9 +163,9 @@ def _summed(
     )
 
 
-def _per_s(battery_mah: float) -> float:
+def _per_s(battery_mah: float, drive: Drive) -> float:
     """Share of the charge that a second of full thrust takes."""
-    return FULL_A / (3.6 * battery_mah)
+    return drive.full_a / (3.6 * battery_mah)
 
 
 def _towards(value: float, goal: float, part: float) -> float:
@@ -148,7 +181,7 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     energy = c.state.energy
     used_mah = energy.used_share * c.profile.vehicle.battery_mah
     load = (c.state.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
-    counted_s = hover_left_s(energy, c.profile, load)
+    counted_s = hover_left_s(energy, c.profile, load, drive_of(c.telemetry))
     seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
     if c.target_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
@@ -163,14 +196,16 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
-def hover_left_s(state: EnergyState, profile: Profile, load: float) -> float | None:
+def hover_left_s(
+    state: EnergyState, profile: Profile, load: float, drive: Drive = BRUSHED
+) -> float | None:
     """Seconds of hovering with `load`, a share of full thrust, until `battery-low` fires; None if
     unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     safety, perch = profile.safety, profile.planner.perch
     hover_v = max(
-        float(profile.link.parameters.get("pm.lowVoltage", LOW_POWER_V)), safety.min_load_v
+        float(profile.link.parameters.get("pm.lowVoltage", drive.low_power_v)), safety.min_load_v
     )
     lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
@@ -178,7 +213,7 @@ def hover_left_s(state: EnergyState, profile: Profile, load: float) -> float | N
     sag_v, hunger = fit_sag_model(state)
     end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
     share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
-    return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah))
+    return max(0.0, share) / (hunger * load * _per_s(profile.vehicle.battery_mah, drive))
 
 
 def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 
 from perchctl.mission.context import Context
+from perchctl.mission.guidance import THRUST_MIN
 from perchctl.mission.state import Condition, ContactError, Phase
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST, LOW_POWER, NO_BATTERY_READING_V
@@ -27,6 +28,7 @@ OTHERWISE_MPS = 0.15  # true positions make at most 0.07
 SATURATED = 0.98  # of the full thrust: how much more it takes is unknown
 LITTLE_LEFT = 0.93  # of the full thrust: on more it is no sign of a press
 SUPERVISOR_S = 5.0  # the flying bit outlives the motors by 2 s
+MOST_HOLDING = 0.8  # of the hover thrust: with more the air under the ceiling may hold the vehicle
 PROVABLE = 0.99  # of the pressing thrust: a contact's proof asks for no more
 STILL_MOTORS_THRUST = 5000  # and less stops them
 FALLING_MPS = -0.05
@@ -137,8 +139,14 @@ def is_hover_thrust(c: Context) -> bool:
 
 
 def _is_carried(c: Context) -> bool:
-    """True if the thrust could not carry the vehicle."""
+    """True if the thrust could not carry the vehicle.
+
+    Position mode goes no lower than `THRUST_MIN`, which is more than `hold_ratio` of the hover
+    thrust where the motors are strong: then that is what proves the hold.
+    """
     most = c.planner.complete.hold_ratio * c.state.hover_thrust
+    if MOST_HOLDING * c.state.hover_thrust >= THRUST_MIN:
+        most = max(most, THRUST_MIN)
     return c.thrust_is_known and c.state.hover_thrust > 0 and c.telemetry.thrust <= most
 
 

@@ -82,8 +82,9 @@ class SentCommand:
     whether it arrived is unknown.
 
     `by`: ``watchdog`` while the loop is silent, and the operator's stop; ``rescue`` after an error;
-    ``reconnect``, an order once more over a link that was lost; ``farewell``, the zero setpoint
-    that closes the link.
+    ``reconnect``, an order once more over a link that was lost; ``preflight``, the arming of a
+    vehicle that does not arm itself; ``farewell``, its disarming, and the zero setpoint that closes
+    the link.
     """
 
     t_s: float

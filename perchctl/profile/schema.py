@@ -12,7 +12,7 @@ import difflib
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from perchctl.errors import InvalidValue, require_type
 from perchctl.plain_yaml import clip_text
@@ -32,6 +32,9 @@ from perchctl.profile.vision import (
     check_marker_id,
 )
 
+MOTOR_PARAMETERS = ("motorPowerSet.", "health.start")
+"""Beginnings of the firmware parameters that turn motors on the ground, armed or not."""
+
 
 class LinkConfig(Section):
     """The profile's `link`: URI, telemetry and firmware parameters."""
@@ -41,10 +44,20 @@ class LinkConfig(Section):
     )
     connect_timeout_s: float = key(15.0, "time limit for both tries to connect", gt=0, le=120)
     parameters: dict[str, int | float] = Field(
-        default_factory=dict, description="firmware parameters, set and read back before the flight"
+        default_factory=dict,
+        description="firmware parameters, set and read back before the flight; none turns a motor",
     )
     telemetry_period_s: float = key(0.01, "period of position and attitude", ge=0.01, le=0.1)
     loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
+
+    @field_validator("parameters")
+    @classmethod
+    def _turn_no_motor(cls, parameters: dict[str, int | float]) -> dict[str, int | float]:
+        """Refuse parameters that turn motors at once: they are set before anybody was asked."""
+        for name in parameters:
+            if name.startswith(MOTOR_PARAMETERS):
+                raise ValueError(f"{name} turns motors before you are asked: leave it out")
+        return parameters
 
 
 class LogConfig(Section):

@@ -14,6 +14,7 @@ from typing import Any
 
 from perchctl.mission import Event, ExternalPositions, Tick
 from perchctl.vehicle import (
+    Arm,
     Command,
     EmergencyStop,
     Idle,
@@ -234,4 +235,6 @@ def command_values(command: Command) -> Mapping[str, Any]:
             return {"cmd": "thrust", "cmd_thrust": thrust, **tilt}
         case Land(height_m, duration_s):
             return {"cmd": "land", "cmd_z_m": height_m, "cmd_duration_s": duration_s}
+        case Arm(armed):
+            return {"cmd": "arm" if armed else "disarm"}
     return {"cmd": {Idle: "idle", StopMotors: "stop", EmergencyStop: "emergency"}[type(command)]}

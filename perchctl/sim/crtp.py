@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 MAX_DATA = 30
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.08"
-DEVICE_TYPE = "C21B"
 OK = 0
 """The other answers are the numbers of C's errno."""
 
@@ -239,15 +238,20 @@ class _Block:
 
 
 class CrtpServer:
-    """Serves one firmware to one peer; before protocol 12 the server has no supervisor port."""
+    """Serves one firmware to one peer; before protocol 12 the server has no supervisor port.
+
+    `device_type`: the name that it announces instead of its airframe's.
+    """
 
     def __init__(
         self,
         firmware: Firmware,
         protocol_version: int = PROTOCOL_VERSION,
         missing_log_variables: Sequence[str] = (),
+        device_type: str | None = None,
     ) -> None:
         self._firmware = firmware
+        self._device_type = device_type
         self._version = protocol_version
         self._blocks: dict[int, _Block] = {}
         log_codes = {
@@ -332,7 +336,8 @@ class CrtpServer:
                 return bytes((data[0], 1)) if data[0] < 2 else None
             case Port.PLATFORM, 1 if data[0] < 3:
                 version = bytes((self._version,))
-                names = (FIRMWARE_VERSION.encode() + b"\0", DEVICE_TYPE.encode() + b"\0")
+                device_type = self._device_type or self._firmware.scenario.airframe.device_type
+                names = (FIRMWARE_VERSION.encode() + b"\0", device_type.encode() + b"\0")
                 return data[:1] + (version, *names)[data[0]]
             case Port.SUPERVISOR, _ if self._version < PROTOCOL_VERSION:
                 return None

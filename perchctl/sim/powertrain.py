@@ -19,56 +19,63 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Callable
 from math import cbrt, sqrt
 
 from perchctl.geometry import GRAVITY_MPS2
+from perchctl.sim.airframe import CRAZYFLIE_21, ThrustCurve
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 # --- One motor's thrust against its voltage: what the rotor gives, and what the firmware inverts
-# The curve is the firmware's own for the propellers of the Crazyflie 2.1+ (its platform
-# defaults, release 2026.08, from a thrust stand): a cubic in the motor's mean voltage,
-# which is the duty cycle times the battery's voltage. Below `STANDSTILL_V` the cubic is
+# `perchctl.sim.airframe` has the curves. Below the voltage whose thrust is 0 the cubic is
 # negative: the motor stands still (docs/firmware.md, "Thrust to PWM").
 
 
 FULL_COMMAND = 65535.0
 """Both of the thrust command and of the duty cycle (PWM)."""
-MOTOR_FORCE_N = 0.12
+MOTOR_FORCE_N = CRAZYFLIE_21.thrust.most_n
 """Thrust of one motor at `FULL_COMMAND`, any battery that can still give it."""
-THRUST_MIN_N = 0.012817578393224994
+THRUST_MIN_N = CRAZYFLIE_21.thrust.least_n
 """A command below this is no thrust at all: PWM 0 (a command of 7000)."""
 
-C0, C1, C2, C3 = (
-    -0.02476537915958403,
-    0.06523793527519485,
-    -0.026792504967750107,
-    0.006776789303971145,
-)
-
-# The cubic has one real root for every thrust: Cardano, with all that is constant
-# taken out. q is linear in the thrust.
-_P = -C2 / (3.0 * C3)
-_Q = _P**3 + (C2 * C1 - 3.0 * C3 * C0) / (6.0 * C3 * C3)
-_Q_PER_N = 1.0 / (2.0 * C3)
-_D = (C1 / (3.0 * C3) - _P * _P) ** 3
+VoltageFunction = Callable[[float], float]
 
 
-def motor_voltage(thrust_n: float) -> float:
-    """The motor voltage at which one motor gives `thrust_n`."""
-    q = _Q + _Q_PER_N * thrust_n
-    s = sqrt(q * q + _D)
-    return cbrt(q + s) + cbrt(q - s) + _P
+def inverse_thrust(curve: ThrustCurve) -> VoltageFunction:
+    """Return the function from one motor's thrust, N, to the motor voltage that gives it."""
+    # The cubic has one real root for every thrust: Cardano, with all that is constant
+    # taken out. q is linear in the thrust.
+    c0, c1, c2, c3 = curve.coefficients
+    p = -c2 / (3.0 * c3)
+    q0 = p**3 + (c2 * c1 - 3.0 * c3 * c0) / (6.0 * c3 * c3)
+    q_per_n = 1.0 / (2.0 * c3)
+    d = (c1 / (3.0 * c3) - p * p) ** 3
+
+    def motor_voltage(thrust_n: float) -> float:
+        q = q0 + q_per_n * thrust_n
+        s = sqrt(q * q + d)
+        return cbrt(q + s) + cbrt(q - s) + p
+
+    return motor_voltage
 
 
+def steady_thrust(curve: ThrustCurve) -> VoltageFunction:
+    """Return the function from a motor voltage to one motor's steady thrust, N."""
+    c0, c1, c2, c3 = curve.coefficients
+    standstill_v = inverse_thrust(curve)(0.0)
+
+    def thrust_n(volts: float) -> float:
+        if volts <= standstill_v:
+            return 0.0
+        return c0 + volts * (c1 + volts * (c2 + volts * c3))
+
+    return thrust_n
+
+
+motor_voltage, thrust_n = inverse_thrust(CRAZYFLIE_21.thrust), steady_thrust(CRAZYFLIE_21.thrust)
+"""Those of the Crazyflie 2.1."""
 STANDSTILL_V = motor_voltage(0.0)
 """0.45 V: the dead band."""
-
-
-def thrust_n(volts: float) -> float:
-    """The steady thrust of one motor at a motor voltage."""
-    if volts <= STANDSTILL_V:
-        return 0.0
-    return C0 + volts * (C1 + volts * (C2 + volts * C3))
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
@@ -169,10 +176,8 @@ STANDING_LAG_S = 0.18
 MOTOR_COAST_S = 0.12
 MOTOR_CURRENT_A = 1.1
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
-_HOVER_V = motor_voltage(0.042 * GRAVITY_MPS2 / 4.0)
-# The share of the way in one control period is sqrt(_STANDING + _PER_V * v).
+# The share of the way in one control period is sqrt(_STANDING + per_v * v).
 _STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
-_PER_V = ((CONTROL_PERIOD_S / MOTOR_LAG_S) ** 2 - _STANDING) / _HOVER_V
 
 ForcesN = tuple[float, float, float, float]
 
@@ -193,17 +198,21 @@ class Powertrain:
         self.strength = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
         self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
+        curve = scenario.airframe.thrust
+        self._thrust_n = steady_thrust(curve)
+        hover_v = inverse_thrust(curve)(0.042 * GRAVITY_MPS2 / 4.0)
+        self._per_v = ((CONTROL_PERIOD_S / MOTOR_LAG_S) ** 2 - _STANDING) / hover_v
 
     def step(self, duty_cycles: tuple[float, float, float, float]) -> ForcesN:
         """Advance by a control period at duty cycles 0..65535; return the motors' thrusts, N."""
-        scale = self.cell.battery_v / FULL_COMMAND
+        scale, per_v = self.cell.battery_v / FULL_COMMAND, self._per_v
         for motor, duty in enumerate(duty_cycles):
             speed_v = self._speeds_v[motor]
             missing_v = scale * duty - speed_v
-            share = sqrt(_STANDING + _PER_V * speed_v) if missing_v > 0.0 else self._down
+            share = sqrt(_STANDING + per_v * speed_v) if missing_v > 0.0 else self._down
             self._speeds_v[motor] = speed_v + share * missing_v
         s1, s2, s3, s4 = self.strength
-        f1, f2, f3, f4 = map(thrust_n, self._speeds_v)
+        f1, f2, f3, f4 = map(self._thrust_n, self._speeds_v)
         self.forces_n = f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
         self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
         return self.forces_n

@@ -11,6 +11,7 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile, SimulationConfig
+from perchctl.sim.airframe import CRAZYFLIE_21, Airframe
 
 CONTROL_PERIOD_S = 0.002
 """Step of the physics and of the firmware model (500 Hz)."""
@@ -60,6 +61,7 @@ class Scenario:
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
         neighbours: other vehicles' targets; their downwash is in the draught.
+        airframe: the kind of vehicle; current and resistance of its cell are a 2.1's for each N.
     """
 
     seed: int = 0
@@ -114,6 +116,7 @@ class Scenario:
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
+    airframe: Airframe = CRAZYFLIE_21
 
     def radio_bursts(self) -> RadioBursts | None:
         """The times at which the flight's radio is silent; None without losses."""

@@ -15,11 +15,16 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.check import CheckScope, Verdict, camera, check, session, vehicle
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
+from perchctl.link.crtp import encode
 from perchctl.profile import PositioningConfig, Profile
-from perchctl.sim import SimProcess
+from perchctl.sim import Scenario, SimProcess
+from perchctl.sim.airframe import CRAZYFLIE_21_BRUSHLESS
+from perchctl.vehicle import CAN_ARM, CAN_FLY, Arm
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, options, wait_for
+from tests.helpers.crtp_rig import wired
 from tests.helpers.flights import short_profile
 from tests.helpers.relay import Relay
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -90,6 +95,23 @@ def test_pictures_of_another_size_fail_their_row(
     assert rows["size"].verdict is Verdict.FAIL
     assert rows["lifted"].advice.startswith("add --lift")
     assert rows["loop"].verdict is rows["target"].verdict is Verdict.SKIPPED
+
+
+@pytest.mark.long
+def test_nobody_is_asked_to_lift_a_vehicle_that_is_armed() -> None:
+    asked: list[str] = []
+    wanted = CheckScope(with_lift=True, **QUICK, announce=asked.append)
+    with SimProcess.start(Scenario(airframe=CRAZYFLIE_21_BRUSHLESS)) as brushless:
+        until(lambda: brushless.truth()["supervisor_info"] & CAN_ARM)
+        with wired(brushless.uri) as another:
+            another.send(encode(Arm(True))[0].encode())
+            until(lambda: brushless.truth()["supervisor_info"] & CAN_FLY)
+            rows = {row.name: row for row in check(options(brushless.uri), wanted)}
+        assert brushless.truth()["supervisor_info"] & CAN_FLY  # check commands nothing
+    assert rows["supervisor"].verdict is Verdict.FAIL
+    assert "is armed, and its propellers may turn" in rows["supervisor"].found
+    assert (rows["lifted"].verdict, rows["lifted"].found) == (Verdict.SKIPPED, "it is armed")
+    assert not any("lift it" in text for text in asked)
 
 
 @pytest.mark.long

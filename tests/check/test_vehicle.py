@@ -19,7 +19,19 @@ from perchctl.check.vehicle import VEHICLE, VehicleStatus, query_vehicle
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
-from perchctl.vehicle import CAN_FLY, CRASHED, DECK_FAULT, FLYING, LOCKED, LOW_POWER, TUMBLED
+from perchctl.vehicle import (
+    ARMED,
+    AUTO_ARM,
+    CAN_ARM,
+    CAN_FLY,
+    CRASHED,
+    DECK_FAULT,
+    FLYING,
+    HL_FINISHED,
+    LOCKED,
+    LOW_POWER,
+    TUMBLED,
+)
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
 from tests.helpers.mission import READY
 
@@ -131,6 +143,7 @@ GOOD = VehicleStatus(
 )  # fmt: skip
 
 
+TWO_CELLS_V = (4.5, 6.05, 8.38)  # down to the protection of each cell; empty; full
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("packets", "warn", {"round_trips_s": [0.004] * 97 + [math.inf] * 3}),
     ("packets", "fail", {"round_trips_s": [0.004] * 80 + [math.inf] * 20}),
@@ -139,6 +152,8 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("packets", "fail", {"round_trips_s": [math.inf] * 100}),
     ("telemetry", "fail", {"samples_hz": 40.0}),
     ("telemetry", "fail", {"age_s": 0.5}),
+    ("airframe", "fail", {"device_type": "Crazyflie Bolt"}),
+    ("airframe", "fail", {"device_type": None}),
     ("firmware", "fail", {"protocol": 11}),
     ("firmware", "fail", {"missing_variables": ("stateEstimate.x",)}),
     ("firmware", "fail", {"parameters": {**GOOD.parameters, "system.selftestPassed": 0}}),
@@ -146,7 +161,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
         ("supervisor", "fail", {"telemetry": said(supervisor=bits)})
         for bits in (
             READY | LOCKED, READY | CRASHED, READY | TUMBLED, READY | DECK_FAULT, READY | FLYING,
-            READY | 1 << 12, READY & ~CAN_FLY,
+            READY | 1 << 12, READY & ~CAN_FLY, READY & ~AUTO_ARM, ARMED,
         )
     ),
     ("positioning", "fail", {"decks": ("bcBuzzer",)}),
@@ -160,6 +175,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("level", "fail", {"telemetry": said(pitch_rad=math.radians(-20.0))}),
     ("level", "fail", {"telemetry": said(pitch_rad=math.nan)}),
     ("battery", "fail", {"telemetry": said(battery_v=3.5)}),
+    *(("battery", "fail", {"telemetry": said(battery_v=volts)}) for volts in TWO_CELLS_V),
     ("battery", "warn", {"telemetry": said(battery_v=3.85)}),
     ("battery", "fail", {"telemetry": said(battery_state=LOW_POWER)}),
     ("battery", "skipped", {"telemetry": said(battery_v=math.nan)}),
@@ -175,6 +191,17 @@ def test_a_fault_alone_makes_its_row_and_no_other(
     assert after[name].verdict == verdict
     others = {n for n, row in after.items() if row.verdict in ("warn", "fail")} - {name}
     assert others == set()
+
+
+@pytest.mark.parametrize("volts", [3.95, 4.2, 4.35])
+def test_a_healthy_brushless_fails_nothing(volts: float) -> None:
+    """At rest it waits for the arming that `fly` sends."""
+    at_rest = said(supervisor=CAN_ARM | HL_FINISHED, battery_v=volts)
+    vehicle = replace(GOOD, telemetry=at_rest, device_type="Crazyflie 2.1 Brushless")
+    rows = rows_of(vehicle)
+    assert {row.verdict for row in rows.values()} == {Verdict.PASS}
+    assert rows["supervisor"].found == "ready, armed by fly after your yes (0x0201)"
+    assert rows["airframe"].found == "Crazyflie 2.1 Brushless"
 
 
 def test_a_deck_of_one_s_own_places_the_vehicle_where_the_profile_names_it() -> None:

@@ -154,6 +154,7 @@ AT_ONCE: list[tuple[dict[str, Any], str]] = [
     ({"supervisor": READY | FLYING}, "flying already"),
     ({"supervisor": READY | 1 << 13}, "unknown bits .0x200E"),
     ({"battery_v": 3.4}, r"3\.40 V.*3\.80 V.*charge"),
+    ({"battery_v": 6.05}, r"rests at 6\.05 V, and one cell has at most 4\.40 V"),
     ({"position_m": HANGS}, r"at 2\.10 m.*hangs.*take it down.*safety\.ground_z_m"),
     ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
 ]

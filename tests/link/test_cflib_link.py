@@ -7,6 +7,7 @@ Waiting is always for the vehicle's own simulated time or state, and bounded.
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,16 +20,22 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link import CflibLink, ProbeLink
+from perchctl.link import CflibLink, ProbeLink, firmware
+from perchctl.link.crtp import LAND_TIMES
 from perchctl.link.protocol import LANDING_WAIT_S
 from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario, SimProcess
+from perchctl.sim.airframe import CRAZYFLIE_21_BRUSHLESS
 from perchctl.vehicle import (
+    AIRFRAMES,
+    ARMED,
+    CAN_ARM,
     CAN_FLY,
     FLYING,
     FRESH_S,
     LOCKED,
+    Arm,
     Idle,
     Land,
     PositionSetpoint,
@@ -42,6 +49,8 @@ from tests.helpers.mission import AIRBORNE, READY, telemetry
 
 CONFIG = LinkConfig(parameters={"stabilizer.estimator": 2})
 LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
+BRUSHLESS = Scenario(mass_kg=0.044, ceiling_z_m=0.9, airframe=CRAZYFLIE_21_BRUSHLESS)
+HIGH_LEVEL_PORT, SUPERVISOR_PORT = 8, 9
 RAW_PORT = 3  # raw setpoints: attitude and thrust
 COMMAND_PORTS = (RAW_PORT, 7, 8, 9)
 
@@ -182,6 +191,85 @@ def test_telemetry_is_si_right_handed_and_in_the_loop_s_time(sim: SimProcess) ->
 
 
 # --- In the air, and left ---------------------------------------------------------------------
+
+
+def test_connecting_arms_nothing_and_closing_disarms(sim: SimProcess) -> None:
+    """A vehicle that does not arm itself turns its propellers from its arming on."""
+    sim.replace_vehicle(BRUSHLESS)
+    until(lambda: info(sim) & CAN_ARM)
+    link = CflibLink(sim.uri, CONFIG, time.monotonic)
+    link.connect()
+    sent = commands_sent(link, sim)
+    let_pass(sim, 0.3)
+    assert info(sim) & (CAN_ARM | ARMED) == CAN_ARM
+    assert motors_off(sim)
+    link.send(Arm(True))
+    until(lambda: info(sim) & CAN_FLY)
+    assert not motors_off(sim)
+    link.close()
+    assert info(sim) & (CAN_ARM | ARMED) == CAN_ARM
+    assert motors_off(sim)
+    assert {port for port, _ in sent} == {SUPERVISOR_PORT, RAW_PORT}  # and the farewell
+
+
+@pytest.mark.parametrize(
+    ("device_type", "words"),
+    [
+        ("Crazyflie Bolt", "is a Crazyflie Bolt: perchctl's"),
+        ("Flapper (Bolt 1.1)", "is a Flapper"),
+        ("Roadrunner 1.0", "is a Roadrunner 1.0"),
+        ("", "does not say what kind of vehicle it is"),
+        (None, "does not say"),
+    ],
+)
+def test_another_airframe_is_not_taken_over(
+    device_type: str | None, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(firmware, "read_device_type", lambda cf: device_type)
+    with pytest.raises(ConnectionFailed, match=f"{re.escape(words)}.* or Crazyflie 2.1 Brushless"):
+        firmware.check_airframe(None, "radio://0")
+
+
+@pytest.mark.parametrize("device_type", AIRFRAMES)
+def test_the_airframes_that_the_figures_are_made_for_are_flown(
+    device_type: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(firmware, "read_device_type", lambda cf: device_type)
+    firmware.check_airframe(None, "radio://0")
+
+
+def test_a_bolt_is_refused_by_its_own_word_and_sent_nothing() -> None:
+    with SimProcess.start(LOW_CEILING, link={"device_type": "Crazyflie Bolt"}) as sim:
+        link = CflibLink(sim.uri, CONFIG, time.monotonic)
+        with pytest.raises(ConnectionFailed, match="is a Crazyflie Bolt"):
+            link.connect()
+        assert link.connection is None
+        probe = ProbeLink(sim.uri, CONFIG, time.monotonic)
+        probe.connect()
+        assert probe.device_type() == "Crazyflie Bolt"
+        probe.close()
+
+
+def test_a_driver_that_fails_once_has_lost_no_link(
+    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with linked(sim) as link:
+        driver, times = cf(link).link, 2
+        send_packet = driver.send_packet
+
+        def send(packet: Any) -> None:
+            nonlocal times
+            if packet.port == HIGH_LEVEL_PORT and times:
+                times -= 1
+                raise OSError("no buffer space")
+            send_packet(packet)
+
+        monkeypatch.setattr(driver, "send_packet", send)
+        sent = commands_sent(link, sim)
+        link.send(Land(-0.05, 1.0))
+        until(lambda: [port for port, _ in sent].count(HIGH_LEVEL_PORT) == LAND_TIMES)
+        assert link.problem(time.monotonic()) is None
+        assert "failed 2 times so far" in link.new_notes()[0]
 
 
 def test_what_is_unknown_flies() -> None:

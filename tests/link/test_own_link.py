@@ -8,9 +8,21 @@ from typing import Any
 
 import pytest
 
+from perchctl.errors import Note
 from perchctl.link import GuardedLink
 from perchctl.link.protocol import LANDING_WAIT_S
-from perchctl.vehicle import FLYING, Command, Idle, Land, PositionSetpoint, Telemetry
+from perchctl.vehicle import (
+    ARMED,
+    CAN_ARM,
+    CAN_FLY,
+    FLYING,
+    Arm,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    Telemetry,
+)
 from tests.helpers.waiting import until
 
 LAND, PLACE = Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.0)
@@ -142,6 +154,20 @@ def test_a_sample_of_another_type_or_clock_is_a_lost_link(wrong: Any, vehicle: V
     assert all(each.t_s == 10.0 for each in vehicle.link.telemetry())
 
 
+@pytest.mark.parametrize("name", ["telemetry", "problem", "send"])
+def test_one_error_of_it_is_no_lost_link_for_ever(name: str, vehicle: Vehicle) -> None:
+    vehicle.act[name] = raises(ZeroDivisionError("of its author"))
+    vehicle.link.send(LAND)
+    if name == "send":
+        until(lambda: "of its author" in "".join(vehicle.link.new_notes()))
+    else:
+        until(lambda: "of its author" in vehicle.trouble())
+    vehicle.act.clear()
+    until(lambda: LAND in vehicle.sent and vehicle.trouble() == "")
+    vehicle.now_s += 100.0
+    until(lambda: vehicle.trouble() == "")
+
+
 def test_its_own_word_is_passed_on_and_taken_back(vehicle: Vehicle) -> None:
     vehicle.act["problem"] = lambda: "its antenna is off"
     until(lambda: vehicle.trouble() == "its antenna is off")
@@ -178,3 +204,41 @@ def test_closing_hands_over_what_a_slow_link_has_not_taken_yet(vehicle: Vehicle)
     free.set()
     closing.join(LANDING_WAIT_S / 2)
     assert vehicle.sent == [PLACE, LAND]
+
+
+@pytest.mark.parametrize("bits", [ARMED | CAN_FLY, CAN_ARM], ids=["armed", "not yet"])
+def test_what_was_armed_for_the_flight_is_disarmed_as_the_link_is_closed(bits: int) -> None:
+    vehicle = Vehicle()
+    vehicle.bits = CAN_ARM
+
+    def advance() -> None:
+        vehicle.now_s += 0.01
+
+    vehicle.act["problem"] = advance
+    vehicle.link.connect()
+    vehicle.link.send(Arm(True))
+    until(lambda: Arm(True) in vehicle.sent)
+    vehicle.bits = bits
+    closing = threading.Thread(target=vehicle.link.close)
+    closing.start()
+    until(lambda: Arm(False) in vehicle.sent)
+    assert not vehicle.closed
+    vehicle.bits = CAN_ARM
+    closing.join(5.0)
+    assert vehicle.closed
+    assert {type(command) for command in vehicle.sent} == {Arm}
+
+
+def test_a_vehicle_of_your_own_that_stays_armed_is_told_of() -> None:
+    vehicle = Vehicle()
+    vehicle.bits = ARMED | CAN_FLY
+
+    def advance() -> None:
+        vehicle.now_s += 0.01
+
+    vehicle.act["problem"] = advance
+    vehicle.link.connect()
+    vehicle.link.send(Arm(True))
+    with pytest.warns(Note, match="may still be armed"):
+        vehicle.link.close()
+    assert vehicle.sent[-1] == Arm(False)

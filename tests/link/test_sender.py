@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from perchctl.link.sender import GUARD_PERIOD_S, HANGS_S, STALE_S, Sender
+from perchctl.link.sender import GUARD_PERIOD_S, HANGS_S, NOTED_EVERY_S, STALE_S, Sender
 from perchctl.mission import SentCommand
-from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, StopMotors
+from perchctl.vehicle import Arm, Command, EmergencyStop, Land, PositionSetpoint, StopMotors
 from tests.helpers.waiting import until
 
 LIMIT_S = 5.0
@@ -210,17 +210,46 @@ def test_a_call_that_the_computer_slept_through_is_no_hang(library: Library) -> 
     assert library.taken == [LAND]
 
 
-def test_an_error_of_the_library_is_reported_and_the_order_offered_again(library: Library) -> None:
+def test_an_error_that_lasts_is_a_trouble_until_the_order_is_taken(library: Library) -> None:
     blamed: list[bool] = []
     library.error = RuntimeError("no radio")
     sender = library.sender(tend=lambda stuck_s, hangs: blamed.append(hangs))
     sender.put(LAND)
     until(lambda: library.offered > 1)
-    assert "no radio" in str(sender.problem)
+    assert sender.trouble() is None
     library.now_s += HANGS_S + 0.01
     until(lambda: blamed and blamed[-1])
+    assert "0.5 s: no radio" in str(sender.trouble())
     library.error = None
     library.takes(LAND)
+    assert sender.trouble() is None
+
+
+def test_an_error_that_passes_is_counted_and_no_trouble(library: Library) -> None:
+    sender = library.sender()
+    assert sender.new_notes() == []
+    library.error = RuntimeError("no room\nTraceback")
+    sender.put(LAND)
+    until(lambda: sender.errors > 2)
+    library.error = None
+    library.takes(LAND)
+    (note,) = sender.new_notes()
+    assert note.endswith(f"failed {sender.errors} times so far, and was tried again: no room")
+    library.now_s += 100.0
+    assert sender.trouble() is None
+    assert sender.new_notes() == []
+
+
+def test_errors_are_noted_once_a_second(library: Library) -> None:
+    library.error = RuntimeError("no radio")
+    sender = library.sender()
+    sender.put(LAND)
+    until(lambda: sender.errors)
+    assert len(sender.new_notes()) == 1
+    until(lambda: sender.errors > 3)
+    assert sender.new_notes() == []
+    library.now_s += NOTED_EVERY_S
+    assert len(sender.new_notes()) == 1
 
 
 def test_a_command_that_cannot_be_divided_is_in_nobodys_way(library: Library) -> None:
@@ -233,7 +262,13 @@ def test_a_command_that_cannot_be_divided_is_in_nobodys_way(library: Library) ->
     sender.put(LAND)
     sender.put(StopMotors())
     library.takes(StopMotors())
-    assert "no number" in str(sender.problem)
+    assert sender.errors == 1
+    sender.put(LAND)
+    assert sender.drain(LIMIT_S)
+    until(lambda: "no number" in str(sender.trouble()))  # lost, and not offered again
+    sender.put(StopMotors())
+    library.takes(StopMotors())
+    assert sender.trouble() is None
 
 
 def test_no_error_ends_a_thread(library: Library) -> None:
@@ -248,10 +283,24 @@ def test_no_error_ends_a_thread(library: Library) -> None:
     library.error = SystemExit("of the library")
     sender = library.sender(guard=guard)
     sender.put(LAND)
-    until(lambda: "of the library" in str(sender.problem))
+    until(lambda: sender.errors)
+    assert "of the library" in sender.new_notes()[0]
     library.error = None
     until(lambda: STOP in library.taken)
     assert not asked
+
+
+def test_a_guard_that_raises_is_a_trouble_until_it_works_again(library: Library) -> None:
+    works = threading.Event()
+
+    def guard() -> None:
+        if not works.is_set():
+            raise ZeroDivisionError("of the guard")
+
+    sender = library.sender(guard=guard)
+    until(lambda: "not looked after: of the guard" in str(sender.trouble()))
+    works.set()
+    until(lambda: sender.trouble() is None)
 
 
 # --- The guard --------------------------------------------------------------------------------
@@ -270,7 +319,7 @@ def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(library: Library
     assert sender.drain(LIMIT_S)
     until(lambda: len(told) >= 3)
     assert set(library.taken) == {PLACES[0], STOP}
-    assert sender.problem is None
+    assert sender.trouble() is None
     assert {sent.command for sent in told} == {STOP}
     assert {sent.by for sent in told} == {"watchdog"}
 
@@ -291,3 +340,22 @@ def test_a_guard_is_not_asked_for_what_cannot_go_out(library: Library) -> None:
     assert len(polls) == before
     library.room = True
     until(lambda: len(polls) > before)
+
+
+# --- Arming -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [Arm(True), Arm(False)])
+def test_an_arming_request_is_for_its_moment_only(order: Arm, library: Library) -> None:
+    """Late it would turn the propellers after the session has ended, or stop them in the air."""
+    library.room = False
+    sender = library.sender()
+    sender.put(order)
+    library.now_s += STALE_S + 0.01
+    sender.put(LAND)
+    library.room = True
+    library.takes(LAND)
+    sender.put(order)
+    library.takes(order)
+    sender.repeat_order(0.0)  # the link was lost, and is back
+    library.takes()

@@ -22,7 +22,7 @@ from perchctl.link.telemetry import (
     telemetry_from_log,
 )
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import FLYING
+from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING
 
 
 def test_pitch_and_degrees_turn_at_the_edge() -> None:
@@ -129,9 +129,13 @@ def test_whether_motors_turn_is_the_newest_packet_s() -> None:
     """A link that only listens sends nothing for it."""
     ReadOnlyLink("usb://0", LinkConfig(), float)._prepare(None)  # type: ignore[arg-type]
     link = Listened()
-    for bits in (FLYING, 0, FLYING | 0x2):
+    armed_itself, armed_by_somebody = CAN_FLY | ARMED | AUTO_ARM, CAN_FLY | ARMED
+    for bits, turn in (
+        (FLYING, True), (0, False), (FLYING | ARMED, True),
+        (armed_itself, False), (armed_by_somebody, True),
+    ):  # fmt: skip
         link.hear(**{"supervisor.info": bits, "gyro.x": math.nan})
-        assert link.motors_running == bool(bits)
+        assert link.motors_running == turn
 
 
 def test_samples_are_in_radians_right_handed_and_of_one_moment() -> None:

@@ -12,14 +12,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
-from perchctl.mission.battery import battery_outlook, hover_left_s, read_battery, update_energy
+from perchctl.mission.battery import (
+    BRUSHED,
+    BRUSHLESS,
+    Drive,
+    battery_outlook,
+    hover_left_s,
+    read_battery,
+    update_energy,
+)
 from perchctl.mission.context import Context
 from perchctl.mission.state import EnergyState
 from perchctl.profile import Profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell
-from perchctl.vehicle import FULL_THRUST
+from perchctl.vehicle import AUTO_ARM, FULL_THRUST
 from tests.helpers.mission import (
+    AIRBORNE,
     FINE_BATTERY,
     HOVER_THRUST,
     PROFILE,
@@ -30,6 +39,7 @@ from tests.helpers.mission import (
 from tests.mission.rig import at, fly
 
 PERIOD_S, MAH = 0.02, 250.0
+BRUSHLESS_MAH = 350.0
 LOW_V = 3.2  # under a long load, by the firmware
 HOVER = HOVER_THRUST / FULL_THRUST
 ATTEMPT_S, LANDING_S = 12.0, 10.0
@@ -43,7 +53,12 @@ class Moment:
 
 
 def hovering(
-    rest_v: float, kind: dict[str, float], most_s: float = 120.0, hover: float = HOVER
+    rest_v: float,
+    kind: dict[str, float],
+    most_s: float = 120.0,
+    hover: float = HOVER,
+    drive: Drive = BRUSHED,
+    mah: float = MAH,
 ) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
     cell, energy, reading_v = Cell(rest_v, **kind), EnergyState(), rest_v
@@ -51,9 +66,9 @@ def hovering(
         t_s = PERIOD_S * i
         load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else hover
         for _ in range(round(PERIOD_S / CONTROL_PERIOD_S)):
-            cell.step(4.4 * load)
+            cell.step(drive.full_a * load)
         reading_v += 0.1 * (cell.battery_v - reading_v)  # the firmware's, low-passed
-        energy = update_energy(energy, PERIOD_S, reading_v, load * FULL_THRUST, MAH)
+        energy = update_energy(energy, PERIOD_S, reading_v, load * FULL_THRUST, mah, drive)
         yield Moment(
             t_s, energy, cell.rest_v - (cell.rest_v - cell.battery_v) / (load or 1) * hover
         )
@@ -88,6 +103,21 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
 
 
+@pytest.mark.parametrize("rest_v", [3.9, 3.95])
+def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_v: float) -> None:
+    """Its bits name its motors; the battery holds 350 mAh, and low power is reported sooner."""
+    cell = {"ohm": 0.143 * MAH / BRUSHLESS_MAH, "charge": BRUSHLESS_MAH / MAH}
+    profile, hover, low_v = changed({"vehicle.battery_mah": BRUSHLESS_MAH}), 0.55, 3.35
+    moments = list(hovering(rest_v, cell, 200.0, hover, BRUSHLESS, BRUSHLESS_MAH))
+    end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
+    for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
+        obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
+        state = replace(state_in(Phase.ALIGN), energy=moment.energy, hover_thrust=0.0)
+        left_s = battery_outlook(Context(state, obs, profile)).left_s
+        assert left_s is not None
+        assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
+
+
 def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
@@ -95,7 +125,7 @@ def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) ->
     return energy
 
 
-@pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 5.1, 65.0])
+@pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert hover_left_s(energy, PROFILE, HOVER) is None

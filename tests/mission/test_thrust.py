@@ -44,6 +44,25 @@ def flown(
 
 
 @pytest.mark.parametrize(
+    ("hover", "thrust", "holds"),
+    [
+        (56_000, 33_500, True),
+        (56_000, 33_700, False),  # a magnet is proven below 0.6 of the hover thrust
+        (29_400, 20_000, True),  # strong motors: position mode goes no lower
+        (29_400, 20_100, False),
+        (24_500, 20_000, False),  # so much may be held by the air under the ceiling
+        (24_500, 14_600, True),
+    ],
+)
+def test_how_little_thrust_proves_that_the_magnet_holds(
+    hover: float, thrust: float, holds: bool
+) -> None:
+    hangs = replace(state_in(Phase.COMPLETE), hover_thrust=hover, contact_z_m=CONTACT_Z_M)
+    c = Context(hangs, at(CONTACT_Z_M, thrust=float(thrust))(BEGIN_S), PROFILE)
+    assert CONDITIONS[Condition.MAGNET_HOLDS](c) is holds
+
+
+@pytest.mark.parametrize(
     ("how", "learns"),
     [
         ({}, True),

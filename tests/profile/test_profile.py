@@ -102,6 +102,10 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
         ("planner: {approach_xy_m: [off, 1]}", ["planner.approach_xy_m", "a number"]),
         ("link: {parameters: {a.b: on}}", ["link.parameters", "a number"]),
+        *(
+            (f"link: {{parameters: {{{name}: 1}}}}", ["link.parameters", name, "turns motors"])
+            for name in ("motorPowerSet.enable", "health.startPropTest", "health.startBatTest")
+        ),
         ("", ["empty", "extends: sim"]),
         ("# only a remark\n", ["empty"]),
         ("camera:\nkalman: {}", ["camera", "must hold keys", "None"]),

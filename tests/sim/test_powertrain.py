@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.sim import CONTROL_PERIOD_S
-from perchctl.sim.firmware.controller import MOTORS_OFF, THRUST_MIN, MotorDriver
+from perchctl.sim.firmware.controller import MOTORS_OFF, MotorDriver
 from perchctl.sim.powertrain import MOTOR_FORCE_N, STANDSTILL_V, Cell, motor_voltage, thrust_n
 
 HOVER_A = 3.8
@@ -27,7 +27,7 @@ def test_the_dead_band() -> None:
     assert thrust_n(STANDSTILL_V) == thrust_n(0.1) == 0.0
     assert thrust_n(motor_voltage(MOTOR_FORCE_N)) == pytest.approx(MOTOR_FORCE_N)
     assert MotorDriver().pwm((6999.0,) * 4, 4.1) is MOTORS_OFF
-    assert pytest.approx(7000, abs=1) == THRUST_MIN
+    assert MotorDriver().thrust_min == pytest.approx(7000, abs=1)
 
 
 def after(cell: Cell, seconds: float, current_a: float = HOVER_A) -> float:

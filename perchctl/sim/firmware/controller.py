@@ -1,6 +1,6 @@
 """The cascaded PID controller: position and velocity at 100 Hz, attitude and rate at 500 Hz.
 
-Gains and limits are the firmware's defaults for the Crazyflie 2.x, whatever is written into the
+Gains and limits are the firmware's defaults for the airframe, whatever is written into the
 parameters of the same names. Angles in degrees, pitch nose up, as inside
 the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
 "Setpoint modes"), so the thrust starts again from `thrustBase`. The loops request
@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_voltage
+from perchctl.sim.airframe import CRAZYFLIE_21, ThrustCurve
+from perchctl.sim.powertrain import FULL_COMMAND, inverse_thrust
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 Motors = tuple[float, float, float, float]
@@ -66,7 +67,7 @@ ATTITUDE_DT_S = 0.002
 POSITION_DT_S = 0.01
 POSITION_EVERY = 5
 TILT_MAX_DEG, SPEED_MAX_MPS = 20.0, 1.0  # posCtlPid.rLimit, pLimit, xVelMax, yVelMax, zVelMax
-THRUST_BASE, THRUST_LEAST = 36000.0, 20000.0  # posCtlPid.thrustBase, thrustMin
+THRUST_LEAST = 20000.0  # posCtlPid.thrustMin
 INT16_MAX = 32767.0
 UINT16_MAX = 65535.0
 _OVERHEAD = 1.1  # a loop may request a little more than its successor's limit
@@ -141,10 +142,15 @@ class Estimate:
 class Controller:
     """Computes four thrust requests, in units of the thrust command, from setpoint and estimate."""
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        thrust_base: float = CRAZYFLIE_21.thrust_base,
+        rate_gains: tuple[float, float, float] = CRAZYFLIE_21.rate_gains,
+    ) -> None:
         dt, pt, tilt = ATTITUDE_DT_S, POSITION_DT_S, TILT_MAX_DEG * _OVERHEAD
-        self.roll_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
-        self.pitch_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
+        self._thrust_base = thrust_base
+        self.roll_rate = Pid(*rate_gains, dt, 33.3)
+        self.pitch_rate = Pid(*rate_gains, dt, 33.3)
         self.yaw_rate = Pid(120.0, 16.7, 0.0, dt, 166.7)
         self.roll = Pid(6.0, 3.0, 0.0, dt, 20.0)
         self.pitch = Pid(6.0, 3.0, 0.0, dt, 20.0)
@@ -211,7 +217,7 @@ class Controller:
         roll = -self.vy.update(want_y, now.vy_mps * c - now.vx_mps * s)
         self.desired_pitch_deg = max(-TILT_MAX_DEG, min(TILT_MAX_DEG, pitch))
         self.desired_roll_deg = max(-TILT_MAX_DEG, min(TILT_MAX_DEG, roll))
-        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + THRUST_BASE
+        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + self._thrust_base
         self.thrust = min(UINT16_MAX, max(THRUST_LEAST, thrust))
 
     def _reset(self, now: Estimate) -> None:
@@ -230,24 +236,25 @@ class Controller:
 # --- Power distribution: four thrust requests in, four duty cycles (PWM) out ---
 # In the firmware's order (source: power distribution, motor driver and stabiliser of release
 # 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
-# exceeds the full duty cycle is taken off all four. More than 0.12 N may so be requested of one
-# motor, and is given while the battery suffices: a yaw step at hover costs no height
+# exceeds the full duty cycle is taken off all four. More than the full thrust may so be requested
+# of one motor, and is given while the battery suffices: a yaw step at hover costs no height
 # (docs/firmware.md, "Yaw step").
 
 SUPPLY_AT_BOOT_V = 4.2
 SUPPLY_FILTER = 0.01  # of each sample, at `SUPPLY_RATE_HZ`
 SUPPLY_RATE_HZ = 1000.0
 SUPPLY_LEAST_V = 2.0  # below this the reading is taken for broken: no thrust
-THRUST_MIN = FULL_COMMAND * THRUST_MIN_N / MOTOR_FORCE_N
 
 _KEEP = (1.0 - SUPPLY_FILTER) ** (SUPPLY_RATE_HZ * CONTROL_PERIOD_S)
-_N_PER_COMMAND = MOTOR_FORCE_N / FULL_COMMAND
 
 
 class MotorDriver:
     """Turns thrust requests into duty cycles, by the filtered battery voltage."""
 
-    def __init__(self) -> None:
+    def __init__(self, curve: ThrustCurve = CRAZYFLIE_21.thrust) -> None:
+        self._voltage = inverse_thrust(curve)
+        self._n_per_command = curve.most_n / FULL_COMMAND
+        self.thrust_min = FULL_COMMAND * curve.least_n / curve.most_n
         # Low-passed with 0.1 s: the compensation meets a sagging battery late.
         self._supply_v = SUPPLY_AT_BOOT_V
 
@@ -256,9 +263,10 @@ class MotorDriver:
         self._supply_v = supply_v = battery_v + _KEEP * (self._supply_v - battery_v)
         if requests is MOTORS_OFF or supply_v < SUPPLY_LEAST_V:
             return MOTORS_OFF
-        scale = FULL_COMMAND / supply_v
+        scale, voltage = FULL_COMMAND / supply_v, self._voltage
+        least, n_per_command = self.thrust_min, self._n_per_command
         p1, p2, p3, p4 = (
-            scale * motor_voltage(_N_PER_COMMAND * request) if request >= THRUST_MIN else 0.0
+            scale * voltage(n_per_command * request) if request >= least else 0.0
             for request in requests
         )
         most = max(p1, p2, p3, p4)

@@ -29,7 +29,8 @@ _NULL = Setpoint()
 
 
 class Firmware:
-    """A Crazyflie 2.1 as firmware release 2026.08 (CRTP protocol 12) behaves.
+    """A Crazyflie 2.1, or the scenario's airframe, as firmware release 2026.08 (CRTP protocol 12)
+    behaves.
 
     Every behaviour is a fact of docs/firmware.md. `step` senses, estimates,
     supervises, controls, drives the motors and advances the world by
@@ -57,14 +58,16 @@ class Firmware:
         self._thrust_locked = True
         self.estimator = Estimator(self.scenario, self._parameters)
         self.planner = HighLevelPlanner()
-        self.supervisor = Supervisor()
-        self.controller = Controller()
-        self.driver = MotorDriver()
+        airframe = self.scenario.airframe
+        self._idle_pwm = airframe.idle_pwm
+        self.supervisor = Supervisor(arms_itself=airframe.arms_itself, spin_up_s=airframe.spin_up_s)
+        self.controller = Controller(airframe.thrust_base, airframe.rate_gains)
+        self.driver = MotorDriver(airframe.thrust)
         self.supply_v, self.power_state, self._fine_s = self.world.battery_v, 0, 0.0
         self._pressed = False
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # external positions
-        self._parameters |= self.scenario.parameters
+        self._parameters |= self.scenario.airframe.parameters | self.scenario.parameters
         self.supervisor.emergency = bool(self._parameters["stabilizer.stop"])
         self.estimator.reset(0.0)
 
@@ -92,7 +95,7 @@ class Firmware:
         if step % SUPERVISOR_EVERY == 0:
             ended = supervisor.update(
                 t_s,
-                motors_running=self.motors is not MOTORS_OFF and max(self.motors) > 0.0,
+                motors_running=self.motors is not MOTORS_OFF and max(self.motors) > self._idle_pwm,
                 setpoint_age_s=t_s - self._setpoint_s,
                 acc_g=self.estimator.acc_g,
             )
@@ -111,6 +114,9 @@ class Firmware:
         motors = self.driver.pwm(requests, self.world.battery_v)
         if motors is not MOTORS_OFF:
             self._flown = True
+        if self._idle_pwm and supervisor.motors_allowed:
+            m1, m2, m3, m4 = (max(self._idle_pwm, duty) for duty in motors)
+            motors = (m1, m2, m3, m4)
         self.motors = motors
         self._steps = step + 1
         self.world.step(motors)

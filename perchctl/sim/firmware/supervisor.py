@@ -27,6 +27,7 @@ SILENCE_LEVEL_S = 0.5
 SILENCE_CUT_S = 2.0
 WATCHDOG_S = 1.0
 PREFLIGHT_S = 30.0
+SPIN_UP_S = 2.0
 LANDED_S = 3.0
 TILT_ACC_G, TILT_S = 0.5, 1.0
 UPSIDE_DOWN_ACC_G, UPSIDE_DOWN_S = -0.2, 0.1
@@ -38,6 +39,7 @@ class State(Enum):
     NOT_INITIALIZED = auto()
     CHECKS_NOT_PASSED = auto()
     CHECKS_PASSED = auto()
+    ARMING = auto()
     READY = auto()
     FLYING = auto()
     LANDED = auto()
@@ -48,14 +50,19 @@ class State(Enum):
     CRASHED = auto()
 
 
-MOTORS_ALLOWED = frozenset({State.READY, State.FLYING, State.LEVEL_OUT, State.LANDED})
+CAN_FLY_STATES = frozenset({State.READY, State.FLYING, State.LEVEL_OUT, State.LANDED})
+MOTORS_ALLOWED = CAN_FLY_STATES | {State.ARMING}
 _IN_FLIGHT = frozenset({State.FLYING, State.LEVEL_OUT})
 
 
 class Supervisor:
-    """The firmware's supervisor; `update` runs at 25 Hz, the other methods only record."""
+    """The firmware's supervisor; `update` runs at 25 Hz, the other methods only record.
 
-    def __init__(self) -> None:
+    `arms_itself` and `spin_up_s` as in `perchctl.sim.airframe.Airframe`.
+    """
+
+    def __init__(self, *, arms_itself: bool = True, spin_up_s: float = 0.0) -> None:
+        self._arms_itself, self._spin_up_s = arms_itself, spin_up_s
         self.state = State.NOT_INITIALIZED
         self.armed = False
         self.crashed = False
@@ -110,8 +117,8 @@ class Supervisor:
         bits = {
             CAN_ARM: self.state is State.CHECKS_PASSED,
             ARMED: self.armed,
-            AUTO_ARM: True,
-            CAN_FLY: self.motors_allowed,
+            AUTO_ARM: self._arms_itself,
+            CAN_FLY: self.state in CAN_FLY_STATES,
             FLYING: self.is_flying,
             TUMBLED: self.tumbled,
             LOCKED: self.state is State.LOCKED,
@@ -140,7 +147,13 @@ class Supervisor:
             case State.CHECKS_PASSED | State.READY if self.tumbled:
                 return State.CHECKS_NOT_PASSED
             case State.CHECKS_PASSED if self.armed:
+                return State.READY if self._arms_itself else State.ARMING
+            case State.ARMING if self.tumbled or not self.armed:
+                return State.CHECKS_NOT_PASSED
+            case State.ARMING if t_s - self._entered_s >= self._spin_up_s - _TICK_S:
                 return State.READY
+            case State.ARMING if t_s - self._entered_s > SPIN_UP_S:
+                return State.CHECKS_NOT_PASSED
             case State.READY if flying and self.armed:
                 return State.FLYING
             case State.READY if not self.armed or t_s - self._entered_s > PREFLIGHT_S:
@@ -171,7 +184,7 @@ class Supervisor:
         if self.state is State.CRASHED:
             self.crashed = True
         if self.state not in MOTORS_ALLOWED:
-            self.armed = self.state is State.CHECKS_PASSED  # the airframe arms itself
+            self.armed = self._arms_itself and self.state is State.CHECKS_PASSED
 
     def _check_tumbled(self, t_s: float, acc_g: tuple[float, float, float]) -> bool:
         if max(abs(a) for a in acc_g) < FREE_FALL_G:

@@ -1,0 +1,215 @@
+"""The parts of cflib that perchctl reads or replaces although cflib does not promise them.
+
+They are all here: the list (`INTERNALS`), the check that this cflib has each of them
+(`check_internals`), and the functions through which the rest of the package uses them. A release of
+cflib that renames one would otherwise change what happens when a radio fails, which nobody notices
+before it does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+from perchctl.errors import unfit_cflib
+
+
+@dataclass(frozen=True)
+class Internal:
+    """A part of cflib: `name` of what `owner` returns, and how perchctl uses it."""
+
+    name: str
+    owner: Callable[[], Any]
+    use: str
+
+
+def _crazyflie() -> Any:
+    from cflib.crazyflie import Crazyflie
+
+    return Crazyflie()
+
+
+def _latency() -> Any:
+    return _crazyflie().link_statistics.latency
+
+
+def _log_block() -> Any:
+    from cflib.crazyflie.log import LogConfig
+
+    return LogConfig("checked", period_in_ms=10)
+
+
+def _log_variable() -> Any:
+    from cflib.crazyflie.log import LogVariable
+
+    return LogVariable("checked.variable")
+
+
+def _toc() -> Any:
+    from cflib.crazyflie.toc import Toc
+
+    return Toc()
+
+
+def _radio_driver() -> Any:
+    from cflib.crtp.radiodriver import RadioDriver
+
+    return RadioDriver()
+
+
+def _radio_thread() -> Any:
+    from cflib.crtp import radiodriver
+
+    return radiodriver._RadioDriverThread(*[None] * 7)  # it is not started
+
+
+def _radio_manager() -> Any:
+    from cflib.crtp.radiodriver import RadioManager
+
+    return RadioManager
+
+
+def _radio_module() -> Any:
+    from cflib.crtp import radiodriver
+
+    return radiodriver
+
+
+class _Named:
+    """Has the names that a function looks up, as attributes."""
+
+    def __init__(self, function: Any) -> None:
+        vars(self).update(dict.fromkeys(function.__code__.co_names))
+
+
+INTERNALS = (
+    Internal("_link_error_cb", _crazyflie, "replaced: it joins cflib's threads and deadlocks"),
+    Internal("_send_lock", _crazyflie, "taken without waiting, and replaced with a new driver"),
+    Internal("link", _crazyflie, "replaced where a driver has ended"),
+    Internal("link_uri", _crazyflie, "read to open a new driver"),
+    Internal("link_statistics", _crazyflie, "its callback is handed to a new driver"),
+    Internal("packet_sent", _crazyflie, "called for each packet that is sent past `send_packet`"),
+    Internal("start", _latency, "replaced: its pings wait for the lock while a radio is silent"),
+    Internal("needs_resending", _radio_driver, "false once a radio has agreed on safelink"),
+    Internal("out_queue", _radio_driver, "asked for room: `send_packet` would wait for 2 s"),
+    Internal("_thread", _radio_driver, "asked whether the driver is alive"),
+    Internal("_retry_before_disconnect", _radio_thread, "counts lost packets; a dead dongle stops"),
+    Internal("_radios", _radio_manager, "a dongle's thread that has ended is removed"),
+    Internal("_lock", _radio_manager, "held while it is"),
+    Internal("set_retries_before_disconnect", _radio_module, "a radio is waited for, not given up"),
+    Internal(
+        "print",
+        lambda: _Named(_radio_driver().scan_interface),
+        "replaced: it would print on stdout, amid JSON",
+    ),
+    Internal("variables", _log_block, "read for the packets that start a forgotten block again"),
+    Internal("id", _log_block, "as `variables`"),
+    Internal("period", _log_block, "as `variables`"),
+    Internal("get_storage_and_fetch_byte", _log_variable, "as `variables`"),
+    Internal("get_element_id", _toc, "as `variables`"),
+)
+
+
+def check_internals() -> None:
+    """Raises UsageError, which names the part and cflib's version, unless cflib has all
+    `INTERNALS`."""
+    for internal in INTERNALS:
+        try:
+            found = hasattr(internal.owner(), internal.name)
+        except (ImportError, AttributeError, TypeError):
+            found = False  # its owner is not there, or is made in another way
+        if not found:
+            version = "of an unknown version"
+            with contextlib.suppress(metadata.PackageNotFoundError):
+                version = metadata.version("cflib")
+            raise unfit_cflib(internal.name, version)
+
+
+# --- Their uses ---
+
+
+def replace_error_callback(cf: Any, on_error: Callable[[str], None]) -> None:
+    """Let a driver report its end to `on_error` instead of to cflib's own handler.
+
+    A driver reports its end from inside `send_packet`, where the caller holds cflib's lock, or from
+    its own thread. cflib's handler closes the link there, and joins the thread of its pings, which
+    waits for that lock: then nothing can be sent ever again.
+    """
+    cf._link_error_cb = on_error
+
+
+def stop_pings(cf: Any) -> None:
+    """Keep cflib from its pings; the radio's own null packets keep the link."""
+    cf.link_statistics.latency.start = lambda: None
+
+
+def send_lock(cf: Any) -> Any:
+    """The lock that cflib's `send_packet` holds during the driver's call."""
+    return cf._send_lock
+
+
+def renew_send_lock(cf: Any) -> None:
+    """Replace the lock: whoever hung in the old driver may hold the old one for ever."""
+    cf._send_lock = threading.Lock()
+
+
+def has_room(driver: Any) -> bool:
+    """True if the driver takes a packet without waiting. Only a radio's has a queue, of one."""
+    queue = getattr(driver, "out_queue", None)
+    return queue is None or not queue.full()
+
+
+def has_safelink(driver: Any) -> bool:
+    """True if the driver need not send again: agreed on safelink, or none is needed."""
+    return not getattr(driver, "needs_resending", True)
+
+
+def driver_thread(driver: Any) -> threading.Thread | None:
+    """The driver's thread; None without a driver."""
+    thread: threading.Thread | None = getattr(driver, "_thread", None)
+    return thread
+
+
+def retries_left(thread: threading.Thread | None) -> int | None:
+    """How many more lost packets a radio's thread takes, which counts every one down; None for
+    other drivers."""
+    left: int | None = getattr(thread, "_retry_before_disconnect", None)
+    return left
+
+
+def forget_dead_dongle(uri: str) -> None:
+    """Remove a dongle's thread that has ended; cflib would keep it for good.
+
+    Looked at and removed under cflib's own lock: a second link over the same dongle may have opened
+    it anew meanwhile.
+    """
+    from cflib.crtp.radiodriver import RadioDriver, RadioManager
+
+    try:
+        number = RadioDriver.parse_uri(uri)[0]
+    except Exception:  # no radio's URI, or a dongle by a serial number that is not plugged in
+        return
+    with RadioManager._lock:
+        radios = RadioManager._radios
+        radio = radios[number] if number < len(radios) else None
+        if radio is not None and not radio.is_alive():
+            radios[number] = None
+
+
+def keep_retrying(lost_packets: int) -> None:
+    """Let a radio lose so many packets in a row before it gives up."""
+    from cflib.crtp import radiodriver
+
+    radiodriver.set_retries_before_disconnect(lost_packets)
+
+
+def log_prints(logger: logging.Logger) -> None:
+    """Log what cflib's radio driver would print."""
+    from cflib.crtp import radiodriver
+
+    vars(radiodriver)["print"] = lambda *words: logger.info("%s", words)
