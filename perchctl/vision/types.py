@@ -92,8 +92,8 @@ class Frame:
     `fields` is the picture's kind: ``whole``, of one moment; ``woven`` of two fields; a woven
     picture's ``top`` or ``bottom`` field at full height; None: not classified yet
     (`perchctl.vision.fields`). `repeated`: the source gave the previous picture again, which is no
-    measurement. `encoded`: the source's JPEG, from which `cv2.imdecode(..., IMREAD_GRAYSCALE)`
-    gives exactly `image`; None without one, or for a changed image.
+    measurement. `encoded`: the source's JPEG, from which `cv2.imdecode` with IMREAD_GRAYSCALE and
+    IMREAD_IGNORE_ORIENTATION gives exactly `image`; None without one, or for a changed image.
     """
 
     index: int
