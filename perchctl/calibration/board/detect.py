@@ -33,6 +33,7 @@ class BoardView:
         corners_m: corner positions on the board, z = 0, (n, 3).
         corners_px: corner positions in the picture, (n, 2); the top-left pixel's centre is (0, 0).
         blur_px: median spread of the edges at the corners (tanh width).
+        legacy: the layout that was seen, as in `perchctl.target.Board`.
     """
 
     name: str
@@ -41,6 +42,7 @@ class BoardView:
     corners_m: Array
     corners_px: Array
     blur_px: float = 0.0
+    legacy: bool = False
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -74,7 +76,8 @@ class FoundViews:
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     """The view of a board in a grey picture (h, w), or why no board was found. In an interlaced
-    picture the first field is used, as a moving board has two positions."""
+    picture the first field is used, as a moving board has two positions. Both layouts of a ChArUco
+    board are looked for, whichever `board` has."""
     image = split_fields(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
@@ -86,7 +89,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     found = _chessboard(small, board) if board.kind == "chessboard" else _charuco(small, board)
     if isinstance(found, str):
         return found
-    ids, corners = found
+    ids, corners, legacy = found
     # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
     corners = (corners + 0.5) / scale - 0.5
     # A ChArUco board's markers begin so far inside of its white squares.
@@ -96,11 +99,39 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
         return f"only {int(fit.is_valid.sum())} corners are sharp enough to be measured"
     blur_px = float(np.median(fit.edge_width_px[fit.is_valid]))
     object_m = board.corners_m()[ids]
-    return BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px).select(fit.is_valid)
+    view = BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px, legacy)
+    return view.select(fit.is_valid)
 
 
-def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
-    """The numbers (n,) and places (n, 2) px of a ChArUco board's corners, or why not."""
+_Corners = tuple[NDArray[np.intp], Array, bool]
+"""The numbers (n,) and places (n, 2) px of a board's corners, and whether its layout is the legacy
+one."""
+
+
+def _charuco(image: Grey, board: Board) -> _Corners | str:
+    """The corners of a ChArUco board in either layout, or why there are none.
+
+    The two layouts of a board differ in the squares of its markers, not in its corners: by the
+    wrong one no corner is found, since neighbouring markers contradict each other.
+    """
+    numbers, corners, markers = charuco_corners(image, board)
+    # By the right layout there are more corners than markers, unless little of the board is seen.
+    if board.has_two_layouts and len(numbers) < markers:
+        other = replace(board, legacy=not board.legacy)
+        more, places, _ = charuco_corners(image, other)
+        if len(more) > len(numbers):
+            numbers, corners, board = more, places, other
+    if markers == 0:
+        return _without_board(image)
+    plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
+    if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
+        return f"{markers} markers but too few corners of the board found"
+    return numbers, corners, board.legacy
+
+
+def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array, int]:
+    """The numbers (n,) and places (n, 2) px of the corners by the board's layout, and how many
+    markers were found."""
     # A detector of its own for each call: pictures are searched on several threads.
     detector = cv2.aruco.CharucoDetector(board.cv2_board())
     finding = detector.getDetectorParameters()
@@ -112,16 +143,12 @@ def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
     completing.tryRefineMarkers = True
     detector.setCharucoParameters(completing)
     corners, ids, _, marker_ids = detector.detectBoard(image)
-    if marker_ids is None or len(marker_ids) == 0:
-        return _without_board(image)
     numbers = np.array([] if ids is None else ids, dtype=np.intp).ravel()
-    plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
-    if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
-        return f"{len(marker_ids)} markers but too few corners of the board found"
-    return numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    places = np.array([] if ids is None else corners, dtype=np.float64).reshape(-1, 2)
+    return numbers, places, 0 if marker_ids is None else len(marker_ids)
 
 
-def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
+def _chessboard(image: Grey, board: Board) -> _Corners | str:
     """As `_charuco`, of a chessboard."""
     size = board.corner_count
     found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
@@ -129,7 +156,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
         found, corners = cv2.findChessboardCornersSB(image, size, flags=_SECTORS)
     if not found:
         return _without_board(image)
-    return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
+    return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2), False
 
 
 def _without_board(image: Grey) -> str:
