@@ -114,7 +114,12 @@ def camera(
     file = checked_file(found.views[0].size_px)
     without = f", {len(found.without_board)} without" if found.without_board else ""
     say(f"{len(found.views)} views of the board{without}")
-    result = calibrate_camera(found, layout.notation())
+    seen = found.layout_of(layout)
+    if seen.legacy != layout.legacy:
+        say(f"the board has the layout {'before' if seen.legacy else 'since'} OpenCV 4.6")
+    result = calibrate_camera(found, seen.notation())
+    if found.frames is not None:
+        say(found.frames.text)
     write_files({file: result.file_text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
@@ -261,10 +266,11 @@ def _find_views(
         found = find_views(pictures, board, progress)
     if not found.views:
         first = found.without_board[0]
+        seen = f"they show {found.other_board}"
+        why = f"{first.view}: {first.reason}; is it wholly in view, sharp, and --board its layout?"
         raise InvalidValue(
-            f"none of {len(found.without_board)} pictures of {source} shows the "
-            f"board {board.notation()} ({first.view}: {first.reason}); is it wholly in view, "
-            f"sharp, and --board its true layout?"
+            f"none of {len(found.without_board)} pictures of {source} shows the board "
+            f"{board.notation()}: {seen if found.other_board else why}"
         )
     return found
 
@@ -285,6 +291,17 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
         found = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(
-            f"no view of the board {board.notation()} was taken from {source.describe()}"
+            f"no view of the board {board.notation()} was taken from {source.describe()}: "
+            f"{_no_view_text(found)}"
         )
     return found
+
+
+def _no_view_text(found: FoundViews) -> str:
+    """Why a video or camera gave no view, and what to do."""
+    if found.other_board:
+        return f"it shows {found.other_board}"
+    if found.frames is None:
+        return "no frame came"
+    advice = found.frames.advice or "is it wholly in view, sharp, and --board its layout?"
+    return f"{found.frames.text}; {advice}"

@@ -82,11 +82,12 @@ def check_calibration(camera: CameraModel, found: FoundViews) -> CheckResult:
     Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
     """
     if len(found.views) < MIN_CHECK_VIEWS:
-        raise InvalidValue(
-            f"{len(found.views)} pictures show the board, a check needs at least "
-            f"{MIN_CHECK_VIEWS}: add some with the board tilted by 20 to 45 deg and near the "
-            f"picture's rims"
-        )
+        advice = "add some with the board tilted by 20 to 45 deg and near the picture's rims"
+        seen = f"{len(found.views)} pictures show the board"
+        if found.frames is not None:
+            seen = f"{len(found.views)} usable views ({found.frames.text})"
+            advice = found.frames.advice or advice
+        raise InvalidValue(f"{seen}, a check needs at least {MIN_CHECK_VIEWS}: {advice}")
     free, kept, rejections = robust_fit(found.views)
     fixed = fit_poses(kept, camera)
     if fixed is None:

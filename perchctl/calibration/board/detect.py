@@ -66,12 +66,78 @@ class Rejection:
     corner_ids: tuple[int, ...] = ()  # empty: the whole view
 
 
+@dataclass(frozen=True)
+class FrameCounts:
+    """How many frames of a video or a camera were looked at, and why some of them were no views.
+
+    Attributes:
+        live: a camera, whose user can be told to hold still; else a recording.
+        taken: frames that became views.
+        without_board: frames without a board, or with too little of it.
+        moved: the board moved by more than `still_px` from the frame before, or was not in it.
+        blurred: too blurred for their corners.
+        alike: like a view that was taken already.
+        repeated: frames that the source gave twice.
+    """
+
+    live: bool
+    still_px: float
+    taken: int = 0
+    without_board: int = 0
+    moved: int = 0
+    blurred: int = 0
+    alike: int = 0
+    repeated: int = 0
+
+    @property
+    def with_board(self) -> int:
+        """The number of frames that show the board."""
+        return self.taken + self.moved + self.blurred + self.alike
+
+    @property
+    def text(self) -> str:
+        """What became of the frames, in words."""
+        reasons = (
+            (self.taken, "taken"),
+            (self.moved, f"moved by more than {self.still_px:.2g} px from the frame before"),
+            (self.blurred, "too blurred"),
+            (self.alike, "like a view that was taken"),
+        )
+        counted = ", ".join(f"{count} {reason}" for count, reason in reasons if count)
+        text = f"{self.with_board} of {self.with_board + self.without_board} frames show the board"
+        return text + (f": {counted}" if counted else "")
+
+    @property
+    def advice(self) -> str:
+        """What brings more views: empty if the board has to be shown elsewhere, or at all."""
+        if self.moved + self.blurred <= self.alike:
+            return ""
+        if self.live:
+            return "hold the board still for a moment in each place, in good light"
+        return (
+            "record again and hold still for a moment in each place, in good light, or save sharp "
+            "frames as pictures (images:)"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class FoundViews:
-    """The detected views of a board, and the pictures `without_board`, each with the reason."""
+    """The detected views of a board.
+
+    Attributes:
+        without_board: pictures without a board, each with the reason.
+        frames: of a video or camera, what became of its frames; None for pictures.
+        other_board: if there are no views, the board that is seen instead; empty if none is.
+    """
 
     views: tuple[BoardView, ...]
     without_board: tuple[Rejection, ...] = ()
+    frames: FrameCounts | None = None
+    other_board: str = ""
+
+    def layout_of(self, board: Board) -> Board:
+        """The board that was named, in the layout that was seen."""
+        return replace(board, legacy=self.views[0].legacy) if self.views else board
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
