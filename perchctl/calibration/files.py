@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import codecs
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +23,43 @@ def profile_camera(config: CameraConfig) -> CameraModel:
     return load_calibration(config.calibration)
 
 
+@dataclass(frozen=True)
+class CalibrationNotes:
+    """What a calibration of perchctl says about its origin; empty in files of other programs.
+
+    Attributes:
+        board: the board's notation.
+        picture_hashes: `perchctl.calibration.board.detect.BoardView.picture_hash` of the pictures.
+    """
+
+    board: str
+    picture_hashes: frozenset[str]
+
+
+def load_notes(path: Path) -> CalibrationNotes:
+    """Read a calibration file's notes. Raises as `load_calibration`."""
+    _, values = _parsed(path)
+    return CalibrationNotes(
+        board=str(values.get("board") or ""),
+        picture_hashes=frozenset(str(values.get("picture_hashes") or "").split()),
+    )
+
+
 def load_calibration(file: Path | str) -> CameraModel:
     """Read a camera model from a file, or by the name of one in `calib/`.
 
     Raises:
         NotFound: no file. InvalidValue: wrong content.
     """
-    path = find_calibration(file) if isinstance(file, str) else file
+    camera, _ = _parsed(find_calibration(file) if isinstance(file, str) else file)
+    return camera
+
+
+def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
+    """The camera, and the values of all keys of the file."""
     try:
-        lens, _ = parse_calibration(_text(path))
-        return _checked(lens)
+        lens, values = parse_calibration(_text(path))
+        return _checked(lens), values
     except InvalidValue as error:
         what = " (it is a profile)" if file_kind(path) == "a profile" else ""
         raise InvalidValue(f"{path}: {error}{what}") from None

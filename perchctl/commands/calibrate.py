@@ -22,6 +22,7 @@ from perchctl.calibration import (
     find_views,
     learn_gear_mask,
     load_calibration,
+    load_notes,
 )
 from perchctl.camera import (
     FrameSource,
@@ -62,6 +63,10 @@ BoardOption = Annotated[
         help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
         "(squares); :measured=249.3x174.9mm behind it for the black area as printed.",
     ),
+]
+CheckBoardOption = Annotated[
+    str | None,
+    typer.Option("--board", "-b", help="The board, as for calibrate. Default: the calibration's."),
 ]
 SizeOption = Annotated[
     tuple[int, int] | None,
@@ -176,16 +181,20 @@ def mask(
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
-    board: BoardOption = DEFAULT_BOARD,
+    board: CheckBoardOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source)
-    layout = Board.parse(board)
     model = load_calibration(calibration)
+    notes = load_notes(calibration)
+    layout = Board.parse(board or notes.board or DEFAULT_BOARD)
+    if board is None:
+        origin = "the calibration's" if notes.board else "the default"
+        say(f"the board is {layout.notation()} ({origin})")
     found = _find_views(pictures, model.size_px, layout)
     check_size(found.views[0].size_px, model, without_password(pictures))
-    result = check_calibration(model, found)
+    result = check_calibration(model, found, notes.picture_hashes)
     for item in found.without_board:
         say(f"{item.view}: {item.reason}")
     for item in result.rejections:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +19,8 @@ MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
 SEARCH_PX = 1600
 """Larger pictures are scaled down to it for the search; corners are fitted at full size."""
+_HASH_BYTES = 6
+"""Fewer make it likelier than 1 in 10^8 that two of a thousand pictures have one hash by chance."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
@@ -34,6 +37,7 @@ class BoardView:
         corners_px: corner positions in the picture, (n, 2); the top-left pixel's centre is (0, 0).
         blur_px: median spread of the edges at the corners (tanh width).
         legacy: the layout that was seen, as in `perchctl.target.Board`.
+        picture_hash: equal for pictures of the same pixels, whatever their file; empty if unknown.
     """
 
     name: str
@@ -43,6 +47,7 @@ class BoardView:
     corners_px: Array
     blur_px: float = 0.0
     legacy: bool = False
+    picture_hash: str = ""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -144,6 +149,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     """The view of a board in a grey picture (h, w), or why no board was found. In an interlaced
     picture the first field is used, as a moving board has two positions. Both layouts of a ChArUco
     board are looked for, whichever `board` has."""
+    picture_hash = hashlib.blake2b(image.tobytes(), digest_size=_HASH_BYTES).hexdigest()
     image = split_fields(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
@@ -165,7 +171,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
         return f"only {int(fit.is_valid.sum())} corners are sharp enough to be measured"
     blur_px = float(np.median(fit.edge_width_px[fit.is_valid]))
     object_m = board.corners_m()[ids]
-    view = BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px, legacy)
+    view = BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px, legacy, picture_hash)
     return view.select(fit.is_valid)
 
 

@@ -151,6 +151,7 @@ class Calibration:
                 "rms_px": self.fit.rms_px,
                 "views_used": len(self.views),
                 "views_rejected": len(rejected_view_records(self.rejections)),
+                "picture_hashes": " ".join(v.picture_hash for v in self.views if v.picture_hash),
                 "parameters": " ".join(PARAMETERS[self.camera.model]),
                 "parameter_std": self.parameter_std[None],
                 "parameter_covariance": self.covariance,
