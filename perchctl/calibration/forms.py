@@ -89,8 +89,8 @@ are the same, and mix."""
 CAMERA_MESSAGE = Form(
     name="message sensor_msgs/CameraInfo",
     read={
-        "width": ("width",),
-        "height": ("height",),
+        "width": ("width", "image_width"),
+        "height": ("height", "image_height"),
         "K": ("k",),
         "distortion": ("d",),
         "lens": ("distortion_model",),
@@ -99,7 +99,8 @@ CAMERA_MESSAGE = Form(
     neutral={"binning_x": (0, 1), "binning_y": (0, 1)},
     notes=("header", "r", "p"),
 )
-"""The output of ``ros2 topic echo /camera_info``, or of ``rostopic echo`` with D, K, R and P."""
+"""The output of ``ros2 topic echo /camera_info``, or of ``rostopic echo`` with D, K, R and P; also
+a script's file with K and D."""
 
 KALIBR_CAMERA = Form(
     name="camchain of Kalibr",
@@ -191,7 +192,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
         raise InvalidValue(f"holds the cameras {', '.join(cameras)}: keep the one that flies")
     if cameras:
         return _kalibr_lens(cameras[0], values[cameras[0]]), values
-    is_message = {"k", "d", "width"} <= {_plain_key(key) for key in values}
+    is_message = {"k", "d"} <= {_plain_key(key) for key in values}
     return _camera_lens(values, CAMERA_MESSAGE if is_message else CAMERA_FILE), values
 
 

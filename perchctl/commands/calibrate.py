@@ -174,7 +174,7 @@ def mask(
 
 @command(
     app,
-    "perchctl calibrate check camera.yaml images:board",
+    "perchctl calibrate check camera.yaml images:new",
     "perchctl calibrate check camera.yaml camera:0",
     "perchctl calibrate check camera.yaml video:board.mp4 --json",
 )

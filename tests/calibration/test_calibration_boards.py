@@ -11,6 +11,7 @@ import pytest
 
 from perchctl.calibration import FoundViews, find_views
 from perchctl.calibration.board.detect import BoardView, find_board
+from perchctl.calibration.board.recognise import describe_other_board
 from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
 from perchctl.target import Board
@@ -141,6 +142,13 @@ def test_what_is_unsure_is_not_named(picture: Grey, named: str, said: str, tmp_p
     seen = found([picture], named, tmp_path)
     assert not seen.views
     assert seen.other_board.startswith(said) if said else not seen.other_board
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(64, 230), slice(56, 104)])
+def test_the_named_board_is_no_other_one(rows: slice) -> None:
+    """Nor is a part of it, or the chessboard that its squares make."""
+    board = Board.parse(EVEN)
+    assert describe_other_board([sheet(board)[rows]], board) == ""
 
 
 def test_all_pictures_of_another_size_are_named_before_the_search(tmp_path: Path) -> None:

@@ -118,6 +118,9 @@ def test_a_board_in_the_older_layout_is_calibrated_and_stored(tmp_path: Path) ->
     assert yaml.safe_load(file.read_text())["board"] == board.notation()
     error = np.abs(lens_parameters(load_calibration(file)) - lens_parameters(camera))
     assert error[:4].max() < 2.0
+    own = calibrate("check", file, f"images:{tmp_path / 'board'}")
+    assert f"the board is {board.notation()} (the calibration's)" in own.stderr
+    assert "6 of 6 views" in own.stderr
 
 
 def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Path) -> None:

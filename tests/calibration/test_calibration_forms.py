@@ -184,6 +184,7 @@ FLAT = {"image_width": SIZE_PX[0], "image_height": SIZE_PX[1]}
             json.dumps(FLAT | {"cameraMatrix": ROWS, "distCoeffs": FIVE}, indent="\t").encode(),
             "c.json",
         ),
+        (json.dumps(FLAT | {"K": ROWS, "D": [FIVE]}).encode(), "c.json"),
         (f"# Kamera f\xfcr Drohne\n{ros(FIVE)}".encode("latin-1"), "camera.yaml"),
         (f"# \x93Drohne\x94\n{ros(FIVE)}".encode("latin-1"), "camera.yaml"),
         (opencv(FIVE).encode("utf-8-sig"), "camera.yaml"),
@@ -212,6 +213,8 @@ def test_lists_of_rows_are_read(tmp_path: Path) -> None:
     rows = "\n".join(f"- {row}" for row in ROWS)
     text = f"image_width: 400\nimage_height: 300\ncamera_matrix:\n{rows}\n"
     assert_reads(load(tmp_path, f"{text}distortion_coefficients: {FIVE}\n"), "plumb_bob")
+    with pytest.raises(InvalidValue, match="image size is missing: add image_width"):
+        load(tmp_path, json.dumps({"K": ROWS, "D": [FIVE]}))
     with pytest.raises(InvalidValue, match="image size is missing: add image_width"):
         load(tmp_path, f"camera_matrix:\n{rows}\ndist_coeff:\n- {FIVE}\n")
 

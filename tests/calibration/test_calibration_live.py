@@ -215,6 +215,8 @@ def test_a_film_of_another_board_is_named() -> None:
     found = capture_views(source, squares, lambda guided: None)
     assert not found.views
     assert found.other_board.startswith("a chessboard of 9x6 inner corners, which are 10x7 squares")
+    assert found.frames is not None
+    assert (found.frames.live, found.frames.without_board) == (False, 2)
 
 
 def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(

@@ -79,7 +79,10 @@ def _markers_text(images: Sequence[Grey], named: Board) -> str | None:
     dictionary = _smallest(family, max(ids))
     is_named_family = _stem(str(named.dictionary)) == _stem(dictionary)
     image, _ = max(zip(images, seen, strict=True), key=lambda each: len(each[1][family]))
-    board = _charuco_board(image, replace(named, dictionary=dictionary), max(ids) + 1)
+    alike = [named] if is_named_family else []
+    board = _charuco_board(
+        image, [*alike, *_layouts(replace(named, dictionary=dictionary), max(ids) + 1)]
+    )
     if board is None:
         is_part = is_named_family and max(ids) < named.columns * named.rows // 2
         numbers = f"markers of {dictionary} with the numbers {min(ids)} to {max(ids)}"
@@ -123,25 +126,30 @@ def _stem(dictionary: str) -> str:
     return dictionary.rpartition("_")[0]
 
 
-def _charuco_board(image: Grey, named: Board, markers: int) -> Board | None:
-    """The board with so many markers that has most corners in the picture; None if none fits."""
+def _layouts(named: Board, markers: int) -> list[Board]:
+    """The boards of squares with so many markers."""
+    sizes = [
+        (columns, rows)
+        for columns in range(3, markers)
+        for rows in {2 * markers // columns, (2 * markers + 1) // columns}
+        if rows >= 3 and columns * rows // 2 == markers
+    ]
+    marker_m = named.marker_m or 0.75 * named.square_m
+    return [
+        replace(named, kind="charuco", columns=columns, rows=rows, marker_m=marker_m, legacy=False)
+        for columns, rows in sizes
+    ]
+
+
+def _charuco_board(image: Grey, boards: Sequence[Board]) -> Board | None:
+    """The first of the boards that has most corners in the picture, in either layout; None if none
+    has enough."""
     best, most = None, MIN_GRID_CORNERS - 1
-    for columns in range(3, markers):
-        for rows in {2 * markers // columns, (2 * markers + 1) // columns}:
-            if rows < 3 or columns * rows // 2 != markers:
-                continue
-            board = replace(
-                named,
-                kind="charuco",
-                columns=columns,
-                rows=rows,
-                marker_m=named.marker_m or 0.75 * named.square_m,
-                legacy=False,
-            )
-            for layout in {board, replace(board, legacy=board.has_two_layouts)}:
-                numbers, _, _ = charuco_corners(image, layout)
-                if len(numbers) > most:
-                    best, most = layout, len(numbers)
+    for board in boards:
+        for legacy in {board.legacy, board.has_two_layouts}:
+            numbers, _, _ = charuco_corners(image, replace(board, legacy=legacy))
+            if len(numbers) > most:
+                best, most = board, len(numbers)
     return best
 
 
