@@ -141,7 +141,7 @@ _AS_CAMERA_INFO = (
 _OTHER_FORMS = (
     (
         r"^\[image\]\s*$",
-        "an .ini or ost.txt of ROS, which does not name the lens",
+        "an .ini or ost.txt of ROS without the lens's name",
         "name the ost.yaml beside it",
     ),
     (
@@ -185,7 +185,7 @@ def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
     """
     for pattern, name, advice in _OTHER_FORMS:
         if re.search(pattern, text, re.MULTILINE):
-            raise InvalidValue(f"is {name}, and is not read: {advice}")
+            raise InvalidValue(f"this is {name}, which is not read: {advice}")
     values = _values(text)
     cameras = [key for key in values if re.fullmatch(r"cam\d+", key)]
     if len(cameras) > 1:
@@ -225,13 +225,13 @@ def _values(text: str) -> dict[str, Any]:
 def _xml_values(text: str) -> dict[str, Any]:
     """The values of OpenCV's FileStorage in XML."""
     if "<opencv_storage>" not in text:
-        raise InvalidValue(f"is XML of another program: a calibration is a {READ_FORMS}")
+        raise InvalidValue(f"this is XML of another program: a calibration is a {READ_FORMS}")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         keys = storage.root().keys()
         return {key: _node_value(storage.getNode(key)) for key in keys}
     except (cv2.error, SystemError):
-        raise InvalidValue("is not a readable FileStorage file of OpenCV in XML") from None
+        raise InvalidValue("this is not a readable FileStorage file of OpenCV in XML") from None
 
 
 def _node_value(node: Any) -> Any:

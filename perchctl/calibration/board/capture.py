@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -55,7 +54,8 @@ def find_views(
     views: list[BoardView] = []
     missing: list[Rejection] = []
     with ThreadPoolExecutor() as pool:
-        _check_sizes(dict(zip(names, pool.map(_picture_size, pictures), strict=True)))
+        sizes = list(pool.map(_picture_size, pictures))
+        _check_sizes(dict(zip(names, sizes, strict=True)))
         for name, seen in zip(names, pool.map(search, names, pictures), strict=True):
             if isinstance(seen, BoardView):
                 views.append(seen)
@@ -63,8 +63,11 @@ def find_views(
                 missing.append(Rejection(name, seen))
             progress(len(views) + len(missing), len(pictures))
     views, others = _of_one_layout(views)
-    unseen = (path for path in pictures if not views and _picture_size(path))
-    shown = [decode_picture(path.read_bytes()) for path in islice(unseen, MOST_PICTURES)]
+    shown: list[Grey] = []
+    if not views:
+        readable = [path for path, size in zip(pictures, sizes, strict=True) if size]
+        spread = readable[:: max(1, len(readable) // MOST_PICTURES)][:MOST_PICTURES]
+        shown = [decode_picture(path.read_bytes()) for path in spread]
     return FoundViews(
         tuple(views), (*missing, *others), other_board=describe_other_board(shown, board)
     )

@@ -1,6 +1,6 @@
 """Which board pictures show, when it is not the one that was named.
 
-Of chessboards the largest grid of corners is taken that two pictures agree on; of boards with
+Of chessboards the grid of corners is taken that most pictures show, two at least; of boards with
 markers the dictionary that decodes most of them, and the layout whose corners OpenCV then finds.
 What is unsure is not named.
 """
@@ -19,12 +19,17 @@ from perchctl.camera import Grey
 from perchctl.profile import aruco_dictionary
 from perchctl.target import Board, mm_text
 
-MOST_PICTURES = 3
-"""As many are looked at; each takes about a second."""
+MOST_PICTURES = 5
+"""As many are searched for a chessboard, each within some tenths of a second."""
+MARKER_PICTURES = 3
+"""As many of them are searched for markers, each within about a second."""
 MIN_MARKERS = 4
 """Fewer may be the perching target, or patterns that look like markers."""
-MIN_GRID_CORNERS = 12
-"""Smaller grids are found in keyboards and shelves, too."""
+MIN_MARKER_CORNERS = 12
+"""Corners of a ChArUco board that a layout must explain to be named."""
+GRID_START = (5, 4)
+"""The grid from which OpenCV grows. From a smaller one it stops inside of a board; one that has not
+grown may be a part, or a keyboard."""
 _SIZES = (50, 100, 250)
 """Of the dictionaries of one family. Boards have fewer than 250 markers, and 1000 take longer."""
 _DICTIONARIES = (
@@ -40,18 +45,12 @@ _GRID_FLAGS = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
 def describe_other_board(pictures: Sequence[Grey], named: Board) -> str:
     """The board in the grey pictures, and how to name it; empty if none is plainly visible, or if
     it is the one that was named."""
-    chosen = [pictures[i] for i in _spread(len(pictures))]
-    images = [_small(picture) for picture in chosen]
+    images = [_small(picture) for picture in pictures[:MOST_PICTURES]]
     if not images:
         return ""
-    with_markers = _markers_text(images, named)
+    with_markers = _markers_text(images[:MARKER_PICTURES], named)
     # Of a board with markers a part would pass for a chessboard.
     return _grid_text(images, named) if with_markers is None else with_markers
-
-
-def _spread(count: int) -> list[int]:
-    """At most `MOST_PICTURES` indices below `count`, evenly spread."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, MOST_PICTURES)}) if count else []
 
 
 def _small(picture: Grey) -> Grey:
@@ -144,7 +143,7 @@ def _layouts(named: Board, markers: int) -> list[Board]:
 def _charuco_board(image: Grey, boards: Sequence[Board]) -> Board | None:
     """The first of the boards that has most corners in the picture, in either layout; None if none
     has enough."""
-    best, most = None, MIN_GRID_CORNERS - 1
+    best, most = None, MIN_MARKER_CORNERS - 1
     for board in boards:
         for legacy in {board.legacy, board.has_two_layouts}:
             numbers, _, _ = charuco_corners(image, replace(board, legacy=legacy))
@@ -159,14 +158,14 @@ def _charuco_board(image: Grey, boards: Sequence[Board]) -> Board | None:
 def _grid_text(images: Sequence[Grey], named: Board) -> str:
     grids: Counter[tuple[int, int]] = Counter()
     for image in images:
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), _GRID_FLAGS)
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(image, GRID_START, _GRID_FLAGS)
         if found:
             rows, columns = meta.shape
             grids[max(columns, rows), min(columns, rows)] += 1
-    agreed = [grid for grid, count in grids.items() if count >= min(2, len(images))]
-    columns, rows = max(agreed, key=lambda grid: grid[0] * grid[1], default=(0, 0))
-    if columns * rows < MIN_GRID_CORNERS:
+    (grid, count), *_ = [*grids.most_common(1), ((0, 0), 0)]
+    if count < min(2, len(images)) or grid[0] * grid[1] <= GRID_START[0] * GRID_START[1]:
         return ""
+    columns, rows = grid
     named_grid = max(named.columns, named.rows), min(named.columns, named.rows)
     if named.kind == "chessboard" and named_grid == (columns, rows):
         return ""
