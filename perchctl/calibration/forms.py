@@ -5,7 +5,8 @@ millimetres, and nothing later notices. Therefore the keys decide, by one table 
 
 - keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
 - keys that must be neutral, as another value would change the projection (binning, xi, ...);
-- notes, which say nothing about the projection of the camera's own pictures.
+- notes, which say nothing about the projection of the camera's own pictures: in the table, or made
+  of words about boards, pictures, errors and dates.
 
 A key that is in no table might change the projection, so its file is refused, unless the value is
 0 or empty, by which no term of a lens model does anything. Among the notes are
@@ -52,10 +53,10 @@ class Form:
 
 
 CAMERA_FILE = Form(
-    name="camera_info or FileStorage",
+    name="camera_info or FileStorage file",
     read={
-        "width": ("image_width",),
-        "height": ("image_height",),
+        "width": ("image_width", "width"),
+        "height": ("image_height", "height"),
         "size": ("camera_resolution",),
         "K": ("camera_matrix",),
         "distortion": ("distortion_coefficients", "dist_coeffs", "dist_coeff"),
@@ -63,31 +64,27 @@ CAMERA_FILE = Form(
         "fisheye": ("fisheye_model",),
         "region": ("roi",),
         "rms": ("avg_reprojection_error", "rms_px", "rms"),
+        **{entry: (entry,) for entry in ("fx", "fy", "cx", "cy")},
     },
     neutral={"binning_x": (0, 1), "binning_y": (0, 1), "xi": (0,), "alpha": (0,), "skew": (0,)},
     notes=(
         # ROS
-        *("camera_name", "rectification_matrix", "projection_matrix", "header", "frame_id"),
+        *("rectification_matrix", "projection_matrix", "header", "frame_id", "camera_info_url"),
         # OpenCV's programs
-        *("calibration_time", "calibration_date", "nr_of_frames", "nframes", "frames_count"),
-        *("board_width", "board_height", "square_size", "marker_size"),
-        *("aspect_ratio", "fix_aspect_ratio", "flags", "flag_value"),
-        *("per_view_reprojection_errors", "extrinsic_parameters", "image_points", "grid_points"),
-        *("camera_matrix_std_dev", "dist_coeffs_std_dev"),
+        *("aspect_ratio", "fix_aspect_ratio", "flags", "flag_value", "extrinsic_parameters"),
+        *("grid_points", "image_points", "camera_matrix_std_dev", "dist_coeffs_std_dev"),
         # Python scripts around OpenCV's calibrateCamera
-        *("ret", "error", "mean_error", "reprojection_error", "rvecs", "tvecs"),
-        *("comment", "serial_number", "camera_id", "fps", "camera_info_url", "t_cam_imu"),
+        *("ret", "rvecs", "tvecs", "t_cam_imu"),
         # perchctl
-        *("date", "board", "views_used", "views_rejected", "parameters"),
-        *("parameter_std", "parameter_covariance", "target_error", "target_error_columns"),
-        *("converted_from", "picture_hashes"),
+        *("parameters", "parameter_std", "parameter_covariance", "views_rejected"),
+        *("target_error", "target_error_columns", "converted_from", "picture_hashes"),
     ),
 )
 """A file of ROS's camera_calibration, of OpenCV's calibration programs, or of a script: their keys
 are the same, and mix."""
 
 CAMERA_MESSAGE = Form(
-    name="message sensor_msgs/CameraInfo",
+    name="CameraInfo message",
     read={
         "width": ("width", "image_width"),
         "height": ("height", "image_height"),
@@ -118,6 +115,25 @@ KALIBR_CAMERA = Form(
     ),
 )
 """One camera of a camchain, as Kalibr and OpenVINS write it. Pixel (0, 0) is a pixel's centre."""
+
+_NOTE_WORDS = frozenset(
+    (
+        *("board", "pattern", "square", "squares", "checkerboard", "chessboard", "charuco"),
+        *("aruco", "marker", "markers", "dictionary"),
+        *("corner", "corners", "columns", "cols", "rows", "width", "height", "size", "length"),
+        *("num", "number", "nr", "nframes", "count", "total", "of", "used", "valid"),
+        *("image", "images", "picture", "pictures", "frame", "frames", "view", "views"),
+        *("sample", "samples"),
+        *("rms", "rmse", "reprojection", "error", "errors", "err", "mean", "avg", "average"),
+        *("median", "max", "min", "per", "std"),
+        *("calibration", "calibrated", "date", "time", "timestamp", "created", "hfov", "vfov"),
+        *("dfov", "fps"),
+        *("opencv", "version", "camera", "name", "id", "serial", "device", "author"),
+        *("file", "path", "comment", "comments", "note", "notes", "description"),
+    )
+)
+"""Words about boards, pictures, errors and dates: a key of nothing else is a note, too."""
+_UNITS = frozenset(("px", "mm", "cm", "m", "deg"))
 
 _LENSES = {
     "plumb_bob": "plumb_bob",
@@ -251,7 +267,7 @@ def _node_value(node: Any) -> Any:
 def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
     found = _by_meaning(values, form, needed=("K", "distortion"))
     _check_region(found)
-    size_px = _size(found)
+    size_px = _size(found, form)
     key, value = found["K"][0]
     K = _numbers(key, value)
     if K.size != 9:
@@ -259,6 +275,7 @@ def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
     if not K.any():
         raise InvalidValue(f"{key} is all 0: the camera was not calibrated")
     _check_rms(found, size_px[0])
+    _check_entries(found, K)
     model, distortion = _distortion(found, _named_lens(found))
     return Lens(size_px, K.reshape(3, 3), distortion, model)
 
@@ -282,9 +299,9 @@ def _kalibr_lens(cam: str, camera: Any) -> Lens:
     if lens == "none":
         if np.any(_numbers(*found["distortion"][0])):
             raise InvalidValue("distortion_coeffs are not 0 although distortion_model is none")
-        return Lens(_size(found), K, np.zeros(4), "plumb_bob")
+        return Lens(_size(found, KALIBR_CAMERA), K, np.zeros(4), "plumb_bob")
     model, distortion = _distortion(found, _named_lens(found))
-    return Lens(_size(found), K, distortion, model)
+    return Lens(_size(found, KALIBR_CAMERA), K, distortion, model)
 
 
 _Found = dict[str, list[tuple[str, Any]]]
@@ -294,6 +311,12 @@ _Found = dict[str, list[tuple[str, Any]]]
 def _plain_key(key: str) -> str:
     """A key without underscores and upper case, in which programs and versions differ."""
     return key.replace("_", "").lower()
+
+
+def _is_note(key: str) -> bool:
+    """True if a key consists of words that say nothing about the projection."""
+    words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", key)} - _UNITS
+    return bool(words) and words <= _NOTE_WORDS
 
 
 def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) -> _Found:
@@ -310,7 +333,7 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
             found.setdefault(meanings[plain], []).append((key, value))
         elif plain in neutral:
             _check_neutral(key, value, neutral[plain])
-        elif plain not in notes and value not in (0, None, "", [], {}):
+        elif not (plain in notes or _is_note(key) or value in (0, None, "", [], {})):
             unknown.append(key)
     for meaning, pairs in found.items():
         if len(pairs) > 1 and meaning != "lens":
@@ -321,7 +344,7 @@ def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) 
     if unknown:
         raise InvalidValue(
             f"{'key' if len(unknown) == 1 else 'keys'} {clip_text(', '.join(unknown))} of this "
-            f"{form.name} file may change the projection, and perchctl does not know "
+            f"{form.name} may change the projection, and perchctl does not know "
             f"{'it' if len(unknown) == 1 else 'them'}: remove what is only a note"
         )
     return found
@@ -376,7 +399,17 @@ def _check_rms(found: _Found, width_px: int) -> None:
             )
 
 
-def _size(found: _Found) -> tuple[int, int]:
+def _check_entries(found: _Found, K: NDArray[np.float64]) -> None:
+    """Raise InvalidValue if fx, fy, cx or cy stand beside another camera matrix (9,)."""
+    for entry, i in (("fx", 0), ("fy", 4), ("cx", 2), ("cy", 5)):
+        for key, value in found.get(entry, []):
+            if not np.allclose(_numbers(key, value), K[i]):
+                raise InvalidValue(
+                    f"{key} is {value} but the camera matrix has {K[i]:g}: keep the true one"
+                )
+
+
+def _size(found: _Found, form: Form) -> tuple[int, int]:
     if "size" in found:
         key, value = found["size"][0]
         numbers = _numbers(key, value)
@@ -385,8 +418,8 @@ def _size(found: _Found) -> tuple[int, int]:
         return _pixels(key, numbers[0]), _pixels(key, numbers[1])
     if not {"width", "height"} <= found.keys():
         raise InvalidValue(
-            "the image size is missing: add image_width and image_height, in px, of the pictures "
-            "that the camera was calibrated with"
+            f"the image size is missing in this {form.name}: add {form.read['width'][0]} and "
+            f"{form.read['height'][0]}, in px, of the pictures that the camera was calibrated with"
         )
     width, height = (_pixels(*found[each][0]) for each in ("width", "height"))
     return width, height

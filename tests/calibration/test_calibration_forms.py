@@ -153,6 +153,9 @@ def test_a_file_is_read_as_the_lens_that_it_names(text: str, model: str, tmp_pat
         (ros(FIVE, "lens_type: wide\n"), "key lens_type of this .* may change the projection"),
         (opencv(FIVE, "w: 0.93\ngamma: [1.0, 2.0]\n"), "keys w, gamma of this"),
         (ros(FIVE, f"dist_coeffs: {FIVE}\n"), "has distortion_coefficients and dist_coeffs"),
+        (ros(FIVE, f"fx: {K[0] + 1}\n"), "fx is 211.5 but the camera matrix has 210.5"),
+        (ros(FIVE, "crop_width: 300\n"), "key crop_width of this"),
+        (ros(FIVE, "mm: 3\nfov: 0.9\np: 1\n"), "keys mm, fov, p of this"),
         (ros(FIVE).replace("coefficients", "coefficents"), "is distortion_coefficents meant"),
         (ros(FIVE).replace("image_width: 400", "image_width: 400.5"), "whole number of pixels"),
         (ros(FIVE, matrix=[0.0] * 9), "camera_matrix is all 0"),
@@ -173,6 +176,17 @@ def test_the_whole_picture_without_binning_is_read(tmp_path: Path) -> None:
 
 
 ROWS = [K[:3], K[3:6], K[6:]]
+NOTES = {
+    "board_cols": 9,
+    "square_size_mm": 30.0,
+    "num_images_used": 28,
+    "opencv_rms": 0.22,
+    "mean_reprojection_error_px": 0.18,
+    "hfov_deg": 49.9,
+    "fx": K[0],
+    "cy": K[5],
+    "calibrationTimestamp": "2026-09-28T17:18:22",
+}
 FLAT = {"image_width": SIZE_PX[0], "image_height": SIZE_PX[1]}
 
 
@@ -185,6 +199,10 @@ FLAT = {"image_width": SIZE_PX[0], "image_height": SIZE_PX[1]}
             "c.json",
         ),
         (json.dumps(FLAT | {"K": ROWS, "D": [FIVE]}).encode(), "c.json"),
+        (
+            json.dumps(FLAT | NOTES | {"camera_matrix": ROWS, "dist_coeffs": FIVE}).encode(),
+            "c.json",
+        ),
         (f"# Kamera f\xfcr Drohne\n{ros(FIVE)}".encode("latin-1"), "camera.yaml"),
         (f"# \x93Drohne\x94\n{ros(FIVE)}".encode("latin-1"), "camera.yaml"),
         (opencv(FIVE).encode("utf-8-sig"), "camera.yaml"),
@@ -213,9 +231,9 @@ def test_lists_of_rows_are_read(tmp_path: Path) -> None:
     rows = "\n".join(f"- {row}" for row in ROWS)
     text = f"image_width: 400\nimage_height: 300\ncamera_matrix:\n{rows}\n"
     assert_reads(load(tmp_path, f"{text}distortion_coefficients: {FIVE}\n"), "plumb_bob")
-    with pytest.raises(InvalidValue, match="image size is missing: add image_width"):
+    with pytest.raises(InvalidValue, match="this CameraInfo message: add width and height"):
         load(tmp_path, json.dumps({"K": ROWS, "D": [FIVE]}))
-    with pytest.raises(InvalidValue, match="image size is missing: add image_width"):
+    with pytest.raises(InvalidValue, match="image size is missing in this camera_info or File"):
         load(tmp_path, f"camera_matrix:\n{rows}\ndist_coeff:\n- {FIVE}\n")
 
 
