@@ -3,6 +3,8 @@ last one silently)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import yaml
@@ -30,8 +32,28 @@ def parse_yaml(text: str) -> Any:
 
     Raises ValueError, with a sentence, for what is not YAML or holds a key twice.
     """
-    try:
+    with _errors_in_one_sentence():
         return yaml.load(text, _Loader)
+
+
+def parse_documents(text: str) -> list[Any]:
+    """The values of all documents in the text, which lines of ``---`` separate; empty ones are left
+    out. Raises ValueError as `parse_yaml` does."""
+    with _errors_in_one_sentence():
+        return [value for value in yaml.load_all(text, _Loader) if value is not None]
+
+
+@contextmanager
+def _errors_in_one_sentence() -> Iterator[None]:
+    """Turn the library's errors into a ValueError with one sentence."""
+    try:
+        yield
+    except yaml.constructor.ConstructorError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise ValueError(
+            f"line {line}: only plain numbers, texts, lists and keys are read "
+            f"({clip_text(str(error.problem))})"
+        ) from None
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise ValueError(f"line {line}: not YAML: {clip_text(str(error.problem))}") from None

@@ -77,7 +77,7 @@ FACE = "perchctl"  # the package itself: version and public names, taken from al
 # many names it has at most.
 MOST_NAMES = {
     "analysis": 11,
-    "calibration": 16,
+    "calibration": 17,
     "camera": 17,
     "campaign": 21,
     "check": 8,

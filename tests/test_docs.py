@@ -118,7 +118,7 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "calibrate"] if words[2].startswith("camera:"):
             words.append("--help")
         case ["perchctl", "calibrate"]:
-            words = ["images:board" if word == AIDECK else word for word in words]
+            words = ["images:board" if w in (AIDECK, "images:new") else w for w in words]
         case ["python", "docs/tables.py"]:
             words.append("--check")
         case ["python", "docs/pictures/make.py"]:

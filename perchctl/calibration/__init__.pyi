@@ -5,6 +5,7 @@ from .board.detect import FoundViews as FoundViews
 from .board.solve import calibrate_camera as calibrate_camera
 from .files import calibration_text as calibration_text
 from .files import load_calibration as load_calibration
+from .files import load_notes as load_notes
 from .files import profile_camera as profile_camera
 from .gear import learn_gear_mask as learn_gear_mask
 from .live import GuidedFrame as GuidedFrame

@@ -2,30 +2,47 @@
 
 from __future__ import annotations
 
-import re
+import codecs
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from perchctl.calibration.forms import Lens, parse_calibration
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.files import file_kind
 from perchctl.geometry import Array
-from perchctl.plain_yaml import parse_yaml
 from perchctl.profile import CameraConfig, find_calibration
 from perchctl.vision import CameraModel
-
-KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
-"""Kalibr's distortion models and their names in ROS; its radtan is k1 k2 p1 p2, k3 = 0."""
-MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "equidistant": (4,)}
 
 
 def profile_camera(config: CameraConfig) -> CameraModel:
     """The calibrated camera of a profile. Raises as `load_calibration`."""
     return load_calibration(config.calibration)
+
+
+@dataclass(frozen=True)
+class CalibrationNotes:
+    """What a calibration of perchctl says about its origin; empty in files of other programs.
+
+    Attributes:
+        board: the board's notation.
+        picture_hashes: `perchctl.calibration.board.detect.BoardView.picture_hash` of the pictures.
+    """
+
+    board: str
+    picture_hashes: frozenset[str]
+
+
+def load_notes(path: Path) -> CalibrationNotes:
+    """Read a calibration file's notes. Raises as `load_calibration`."""
+    _, values = _parsed(path)
+    return CalibrationNotes(
+        board=str(values.get("board") or ""),
+        picture_hashes=frozenset(str(values.get("picture_hashes") or "").split()),
+    )
 
 
 def load_calibration(file: Path | str) -> CameraModel:
@@ -34,130 +51,55 @@ def load_calibration(file: Path | str) -> CameraModel:
     Raises:
         NotFound: no file. InvalidValue: wrong content.
     """
-    path = find_calibration(file) if isinstance(file, str) else file
+    camera, _ = _parsed(find_calibration(file) if isinstance(file, str) else file)
+    return camera
+
+
+def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
+    """The camera, and the values of all keys of the file."""
     try:
-        text = path.read_text(encoding="utf-8")
+        lens, values = parse_calibration(_text(path))
+        return _checked(lens), values
+    except InvalidValue as error:
+        what = " (it is a profile)" if file_kind(path) == "a profile" else ""
+        raise InvalidValue(f"{path}: {error}{what}") from None
+
+
+def _text(path: Path) -> str:
+    """The text of a file, in UTF-8 or, of some editors, UTF-16 or Latin-1. Raises NotFound, and
+    InvalidValue for bytes that are no text."""
+    try:
+        data = path.read_bytes()
     except FileNotFoundError:
         raise NotFound(f"calibration file {path} does not exist") from None
-    except UnicodeDecodeError:
-        raise InvalidValue(
-            f"{path} is {file_kind(path)}, no camera calibration: name the .yaml of perchctl "
-            f"calibrate, or one of ROS, OpenCV or Kalibr"
-        ) from None
     except OSError as error:
-        raise InvalidValue(f"{path}: cannot be read as a calibration: {error}") from None
-    is_opencv = "opencv-matrix" in text or "<opencv_storage>" in text
+        raise InvalidValue(f"cannot be read as a calibration: {error.strerror}") from None
     try:
-        raw = {} if is_opencv else parse_yaml(text)
-    except ValueError as error:
-        raise InvalidValue(f"{path}: {error}") from None
-    try:
-        return _checked(*_values(path, raw, is_opencv))
-    except InvalidValue as error:
-        raise InvalidValue(f"{path}: {error}") from None
-    except KeyError as error:
-        kind = file_kind(path)
-        what = "" if "calibration" in kind else f" (it is {kind})"
-        raise InvalidValue(f"{path}: key {error.args[0]} is missing{what}") from None
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidValue(f"{path}: a value is not a number: {error}") from None
-
-
-_Values = tuple[Any, NDArray[Any], NDArray[Any], str]
-"""Size (width, height) in px, camera matrix (9 numbers), distortion, its model."""
-
-
-def _values(path: Path, raw: Any, is_opencv: bool) -> _Values:
-    if not isinstance(raw, dict):
-        raise InvalidValue(
-            "must hold camera_info keys (image_width, camera_matrix, ...) or a Kalibr "
-            "camchain (cam0: ...)"
-        )
-    cameras = [key for key in raw if re.fullmatch(r"cam\d+", str(key))]
-    if len(cameras) > 1:
-        raise InvalidValue(f"holds the cameras {', '.join(cameras)}: keep the one that flies")
-    if cameras:
-        return _kalibr_values(cameras[0], raw[cameras[0]])
-    if is_opencv:
-        return _opencv_values(path)
-    return (
-        (raw.get("image_width"), raw.get("image_height")),
-        np.array(raw["camera_matrix"]["data"], dtype=float),
-        np.array(raw["distortion_coefficients"]["data"], dtype=float),
-        str(raw.get("distortion_model", "plumb_bob")),
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return data.decode("utf-16")
+        if b"\0" not in data:
+            return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if file_kind(path) in ("another kind of file", "a camera calibration", "a profile"):
+            return data.decode("cp1252", errors="replace")  # Latin-1, and quotes of Windows
+    raise InvalidValue(
+        f"this is {file_kind(path)}, no camera calibration: name the .yaml of perchctl calibrate, "
+        f"or one of ROS, OpenCV or Kalibr"
     )
 
 
-def _kalibr_values(cam: str, camera: Any) -> _Values:
-    """The values of a camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
-    if not isinstance(camera, dict):
-        raise InvalidValue(f"{cam} must hold keys (intrinsics, resolution, ...)")
-    projection = camera.get("camera_model", "pinhole")
-    lens = str(camera.get("distortion_model", "none"))
-    if projection != "pinhole" or lens not in KALIBR_MODELS:
-        named = lens if projection == "pinhole" else projection
-        raise InvalidValue(
-            f"Kalibr's model {named!r} is not supported; calibrate as pinhole-radtan or "
-            f"pinhole-equi"
-        )
-    intrinsics = np.array(camera["intrinsics"], dtype=float)
-    if intrinsics.shape != (4,):
-        raise InvalidValue(f"intrinsics needs fu, fv, pu, pv, found {intrinsics.size}")
-    fu, fv, pu, pv = intrinsics
-    dist = np.zeros(4) if lens == "none" else np.array(camera["distortion_coeffs"], dtype=float)
-    K = np.array([fu, 0.0, pu, 0.0, fv, pv, 0.0, 0.0, 1.0])
-    width, height = camera["resolution"]
-    return (width, height), K, dist, KALIBR_MODELS[lens]
-
-
-def _opencv_values(path: Path) -> _Values:
-    keys = ("image_width", "image_height", "fisheye_model")
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        K, dist = (storage.getNode(k).mat() for k in ("camera_matrix", "distortion_coefficients"))
-        # The last one is written by OpenCV's calibration program where the lens is its fisheye's.
-        width, height, fisheye = (
-            None if (node := storage.getNode(key)).empty() else node.real() for key in keys
-        )
-    except (cv2.error, SystemError):
-        raise InvalidValue("not a readable OpenCV FileStorage file") from None
-    if K is None or dist is None:
-        raise InvalidValue("camera_matrix and distortion_coefficients are needed in an OpenCV file")
-    return (width, height), np.array(K), np.array(dist), "fisheye" if fisheye else "plumb_bob"
-
-
-def _checked(size: Any, K: NDArray[Any], dist: NDArray[Any], model: str) -> CameraModel:
-    width, height = size
-    if width is None or height is None:
-        raise InvalidValue(
-            "the image size is missing: add image_width and image_height, in px, of the "
-            "pictures that the camera was calibrated with"
-        )
-    width = int(width)
-    height = int(height)
-    dist = dist.ravel()
-    if model not in MODELS:
-        raise InvalidValue(
-            f"distortion_model {model!r} is unknown; allowed are {', '.join(MODELS)}"
-        )
-    if K.size != 9:
-        raise InvalidValue(f"camera_matrix needs 9 numbers, found {K.size}")
-    K = K.reshape(3, 3)
-    if not (np.isfinite(K).all() and np.isfinite(dist).all()):
-        raise InvalidValue("camera_matrix or distortion holds NaN or infinity")
-    if model == "plumb_bob" and dist.size == 8:
-        model = "rational_polynomial"
-    if dist.size not in MODELS[model]:
-        raise InvalidValue(
-            f"{model} needs {' or '.join(map(str, MODELS[model]))} distortion "
-            f"coefficients, found {dist.size}"
-        )
-    if not (0 < K[0, 2] < width and 0 < K[1, 2] < height and K[0, 0] > 0 and K[1, 1] > 0):
+def _checked(lens: Lens) -> CameraModel:
+    """The camera of a lens. Raises InvalidValue for a camera matrix that cannot be meant."""
+    camera = CameraModel(lens.size_px, lens.K, lens.distortion, lens.model)
+    K = lens.K.copy()
+    K[0, 1] = 0.0  # a skew that `CameraModel` allows, and that no computation uses
+    (width, height), (cx, cy) = camera.size_px, K[:2, 2]
+    if not (0 < cx < width and 0 < cy < height and K[0, 0] > 0 and K[1, 1] > 0):
         raise InvalidValue(
             f"camera_matrix does not fit a {width}x{height} picture: focal lengths "
             f"must be positive and the centre inside the picture"
         )
-    return CameraModel((width, height), K, dist, "fisheye" if model == "equidistant" else model)
+    return replace(camera, K=K)
 
 
 # --- Writing ---

@@ -76,6 +76,7 @@ class VideoSource(RecordedSource):
             raise NotFound(f"video file {without_password(str(path))} was not found")
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # one sentence is enough
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the sensor's grid, as of pictures
         rate_hz, count = (
             float(self._capture.get(key)) if self._capture.isOpened() else 0.0
             for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT)
@@ -132,7 +133,7 @@ class ImagesSource(RecordedSource):
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8]:
-    """The grey picture of a file's bytes.
+    """The grey picture of a file's bytes, on the sensor's grid whatever orientation they note.
 
     Raises ValueError for a picture that is cut off, or that OpenCV does not read.
     """

@@ -1,4 +1,4 @@
-"""A JPEG's structure: where it ends, what size it says, and its pixels; pure.
+"""A JPEG's structure: where it ends, what size it says, and its pixels; any picture's pixels; pure.
 
 What a radio delivers may be damaged anywhere. Two bytes that say a size of 32000x32000 cost a
 decoder gigabytes and minutes, so the size is read before anything of a stream is decoded.
@@ -7,6 +7,7 @@ decoder gigabytes and minutes, so the size is read before anything of a stream i
 from __future__ import annotations
 
 import re
+import struct
 
 import cv2
 import numpy as np
@@ -97,12 +98,41 @@ class JpegSplitter:
             self._buffer.clear()
 
 
+SENSOR_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+"""OpenCV's flags for a grey picture on the sensor's grid: an orientation that a camera notes for a
+viewer says how the camera was held, and turning by it would give each picture another lens."""
+
+
 def decode_grey(data: bytes) -> NDArray[np.uint8] | None:
-    """The grey picture of any bytes, None if OpenCV cannot decode them; raises nothing."""
+    """The grey picture of any bytes, on the sensor's grid whatever orientation they note; None if
+    OpenCV cannot decode them; raises nothing."""
     if not data:
         return None  # of an empty array OpenCV makes an error
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(np.frombuffer(_as_stored(data), np.uint8), SENSOR_GREY)
     except cv2.error:
         return None
     return None if image is None else np.asarray(image, np.uint8)
+
+
+_TIFF_BYTE_ORDER = {b"II*\0": "<", b"MM\0*": ">"}
+_TIFF_ORIENTATION = 274
+
+
+def _as_stored(data: bytes) -> bytes:
+    """A TIFF with the orientation tag 1, as its reader turns the picture in spite of the flag; any
+    other picture unchanged."""
+    order = _TIFF_BYTE_ORDER.get(bytes(data[:4]))
+    if order is None:
+        return data
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (entries,) = struct.unpack_from(f"{order}H", data, start)
+        for at in range(start + 2, start + 2 + 12 * entries, 12):
+            if struct.unpack_from(f"{order}H", data, at) == (_TIFF_ORIENTATION,):
+                upright = bytearray(data)
+                struct.pack_into(f"{order}H", upright, at + 8, 1)
+                return bytes(upright)
+    except struct.error:
+        pass  # damaged: OpenCV decides
+    return data

@@ -22,6 +22,7 @@ from perchctl.calibration import (
     find_views,
     learn_gear_mask,
     load_calibration,
+    load_notes,
 )
 from perchctl.camera import (
     FrameSource,
@@ -62,6 +63,10 @@ BoardOption = Annotated[
         help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
         "(squares); :measured=249.3x174.9mm behind it for the black area as printed.",
     ),
+]
+CheckBoardOption = Annotated[
+    str | None,
+    typer.Option("--board", "-b", help="The board, as for calibrate. Default: the calibration's."),
 ]
 SizeOption = Annotated[
     tuple[int, int] | None,
@@ -114,7 +119,12 @@ def camera(
     file = checked_file(found.views[0].size_px)
     without = f", {len(found.without_board)} without" if found.without_board else ""
     say(f"{len(found.views)} views of the board{without}")
-    result = calibrate_camera(found, layout.notation())
+    seen = found.layout_of(layout)
+    if seen.legacy != layout.legacy:
+        say(f"the board has the layout {'before' if seen.legacy else 'since'} OpenCV 4.6")
+    result = calibrate_camera(found, seen.notation())
+    if found.frames is not None:
+        say(found.frames.text)
     write_files({file: result.file_text(file.stem, _now()).encode()})
     for line in result.lines():
         say(line)
@@ -164,23 +174,27 @@ def mask(
 
 @command(
     app,
-    "perchctl calibrate check camera.yaml images:board",
+    "perchctl calibrate check camera.yaml images:new",
     "perchctl calibrate check camera.yaml camera:0",
     "perchctl calibrate check camera.yaml video:board.mp4 --json",
 )
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
     source: SourceArgument,
-    board: BoardOption = DEFAULT_BOARD,
+    board: CheckBoardOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
     pictures = _source(source)
-    layout = Board.parse(board)
     model = load_calibration(calibration)
+    notes = load_notes(calibration)
+    layout = Board.parse(board or notes.board or DEFAULT_BOARD)
+    if board is None:
+        origin = "the calibration's" if notes.board else "the default"
+        say(f"the board is {layout.notation()} ({origin})")
     found = _find_views(pictures, model.size_px, layout)
     check_size(found.views[0].size_px, model, without_password(pictures))
-    result = check_calibration(model, found)
+    result = check_calibration(model, found, notes.picture_hashes)
     for item in found.without_board:
         say(f"{item.view}: {item.reason}")
     for item in result.rejections:
@@ -261,10 +275,11 @@ def _find_views(
         found = find_views(pictures, board, progress)
     if not found.views:
         first = found.without_board[0]
+        seen = f"they show {found.other_board}"
+        why = f"{first.view}: {first.reason}; is it wholly in view, sharp, and --board its layout?"
         raise InvalidValue(
-            f"none of {len(found.without_board)} pictures of {source} shows the "
-            f"board {board.notation()} ({first.view}: {first.reason}); is it wholly in view, "
-            f"sharp, and --board its true layout?"
+            f"none of {len(found.without_board)} pictures of {source} shows the board "
+            f"{board.notation()}: {seen if found.other_board else why}"
         )
     return found
 
@@ -285,6 +300,17 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
         found = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(
-            f"no view of the board {board.notation()} was taken from {source.describe()}"
+            f"no view of the board {board.notation()} was taken from {source.describe()}: "
+            f"{_no_view_text(found)}"
         )
     return found
+
+
+def _no_view_text(found: FoundViews) -> str:
+    """Why a video or camera gave no view, and what to do."""
+    if found.other_board:
+        return f"it shows {found.other_board}"
+    if found.frames is None:
+        return "no frame came"
+    advice = found.frames.advice or "is it wholly in view, sharp, and --board its layout?"
+    return f"{found.frames.text}; {advice}"

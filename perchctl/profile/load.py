@@ -151,7 +151,7 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     """Return where the vehicle covers a picture of that width and height: booleans (height, width),
     true where the file is white. Errors: NotFound, InvalidValue."""
     path = find_mask(name)
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InvalidValue(f"camera.mask: {path} cannot be read as a picture")
     height, width = image.shape[:2]

@@ -3,7 +3,8 @@
 ``chessboard:9x6:25mm``
     inner corners (columns x rows) and the side of a square; 10x7 squares are printed.
 ``charuco:10x7:25mm:18mm:DICT_5X5_100``
-    squares (columns x rows), side of a square, side of a marker, dictionary.
+    squares (columns x rows), side of a square, side of a marker, dictionary; ``:legacy`` behind it
+    is the layout of OpenCV before 4.6, which many shops still sell.
 
 Both count as OpenCV's own calls do. Behind each ``:measured=249.3x174.6mm`` may say what the
 print's black area measures.
@@ -38,7 +39,7 @@ _MEASURED = ":measured="
 _CHESSBOARD = re.compile(r"chessboard:(?P<columns>\d+)x(?P<rows>\d+):(?P<square>[^:]+)")
 _CHARUCO = re.compile(
     r"charuco:(?P<columns>\d+)x(?P<rows>\d+):(?P<square>[^:]+):(?P<marker>[^:]+)"
-    r":(?P<dictionary>[^:]+)"
+    r":(?P<dictionary>[^:]+)(?P<legacy>:legacy)?"
 )
 
 
@@ -51,6 +52,8 @@ class Board:
         square_m: side of the squares whose corners meet.
         marker_m, dictionary: the markers' side and dictionary; None on a chessboard.
         scale: measured over nominal size of the print, along width and height.
+        legacy: of a charuco board with an even number of rows: the top left square is white, as in
+            OpenCV before 4.6; other boards have one layout, and False here.
     """
 
     kind: BoardKind
@@ -60,6 +63,12 @@ class Board:
     marker_m: float | None = None
     dictionary: str | None = None
     scale: tuple[float, float] = (1.0, 1.0)
+    legacy: bool = False
+
+    @property
+    def has_two_layouts(self) -> bool:
+        """True if the board looks different in OpenCV before and since 4.6 (`legacy`)."""
+        return self.kind == "charuco" and self.rows % 2 == 0
 
     @property
     def squares(self) -> tuple[int, int]:
@@ -98,6 +107,8 @@ class Board:
         text = f"{self.kind}:{self.columns}x{self.rows}:{mm_text(self.square_m)}mm"
         if self.marker_m is not None:
             text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
+        if self.legacy:
+            text += ":legacy"
         if self.scale == (1.0, 1.0):
             return text
         width, height = (m * s for m, s in zip(self.size_m, self.scale, strict=True))
@@ -115,7 +126,8 @@ class Board:
             raise _wrong(
                 text,
                 "it is neither chessboard:COLUMNSxROWS:SQUARE nor "
-                "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY",
+                "charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY, with :legacy for the layout of "
+                "OpenCV before 4.6",
             )
         columns = int(found["columns"])
         rows = int(found["rows"])
@@ -127,6 +139,7 @@ class Board:
             marker_m = parse_length(found["marker"], f"board {text}: marker")
             board = cls("charuco", columns, rows, square_m, marker_m, found["dictionary"])
             _check_markers(board, text)
+            board = replace(board, legacy=bool(found["legacy"]) and board.has_two_layouts)
         return board.with_measured_sides(measured)[0] if measured else board
 
     def with_measured_sides(self, text: str) -> tuple[Board, list[str]]:
@@ -149,7 +162,9 @@ class Board:
             raise ValueError("only a charuco board is one of OpenCV's own")
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         size = (self.columns, self.rows)
-        return cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
+        board.setLegacyPattern(self.legacy)
+        return board
 
 
 def _check_markers(board: Board, text: str) -> None:
@@ -201,4 +216,4 @@ def board_rectangles(board: Board) -> list[Rectangle]:
 def black_squares(board: Board) -> NDArray[np.bool_]:
     """A mask (rows, columns) of the black squares, row 0 on top; markers are in the white ones."""
     columns, rows = board.squares
-    return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
+    return np.asarray(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == board.legacy)

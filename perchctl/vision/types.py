@@ -34,9 +34,12 @@ class CameraModel:
 
     Attributes:
         size_px: width, height.
-        K: camera matrix (3, 3), px.
+        K: camera matrix (3, 3), px: (fx, 0, cx), (0, fy, cy), (0, 0, 1).
         dist: distortion coefficients in OpenCV's order, shape (n,).
         model: ``plumb_bob`` (5), ``rational_polynomial`` (8) or ``fisheye`` (4).
+
+    Raises InvalidValue for another form of `K`: OpenCV's functions compute with fx, fy, cx and cy
+    only, and pass over the other entries in silence.
     """
 
     size_px: tuple[int, int]
@@ -44,11 +47,39 @@ class CameraModel:
     dist: Array
     model: str = "plumb_bob"
 
+    def __post_init__(self) -> None:
+        check_camera_matrix(np.asarray(self.K, np.float64))
+
     @property
     def calibration_key(self) -> tuple[tuple[int, int], str, bytes, bytes]:
         """A hashable value, equal for cameras with the same calibration."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
+
+
+MAX_SKEW_PX = 0.3
+"""A skew of s px moves a pixel sideways by s y/z. With this much it is 0.2 px at the lower rim of
+the example camera, 0.5 mm at 1 m; more is an error that nothing else notices."""
+
+
+def check_camera_matrix(K: Array) -> None:
+    """Raise InvalidValue if the camera matrix (3, 3) has entries that no computation here uses."""
+    if K.shape != (3, 3):
+        raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
+    if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
+        if abs(K[0, 1]) > MAX_SKEW_PX:
+            raise InvalidValue(
+                f"the camera matrix has a skew of {K[0, 1]:g} px (row 1, column 2), at most "
+                f"{MAX_SKEW_PX:g} px is allowed: calibrate without skew (OpenCV's CALIB_FIX_SKEW, "
+                f"--fisheye-fix-skew of ROS)"
+            )
+        return
+    if (K[:2, 2] == 0.0).all() and K[0, 1] == 0.0 and K[2, 2] == 1.0:
+        raise InvalidValue("the camera matrix is transposed: write it row by row, fx 0 cx first")
+    raise InvalidValue(
+        f"the camera matrix must be fx 0 cx, 0 fy cy, 0 0 1; found "
+        f"{', '.join(' '.join(f'{value:g}' for value in row) for row in K)}"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +92,8 @@ class Frame:
     `fields` is the picture's kind: ``whole``, of one moment; ``woven`` of two fields; a woven
     picture's ``top`` or ``bottom`` field at full height; None: not classified yet
     (`perchctl.vision.fields`). `repeated`: the source gave the previous picture again, which is no
-    measurement. `encoded`: the source's JPEG, from which `cv2.imdecode(..., IMREAD_GRAYSCALE)`
-    gives exactly `image`; None without one, or for a changed image.
+    measurement. `encoded`: the source's JPEG, from which `cv2.imdecode` with IMREAD_GRAYSCALE and
+    IMREAD_IGNORE_ORIENTATION gives exactly `image`; None without one, or for a changed image.
     """
 
     index: int

@@ -13,6 +13,7 @@ from typer.testing import Result
 
 from perchctl.calibration import load_calibration
 from perchctl.calibration.board.adjust import lens_parameters
+from perchctl.target import Board
 from perchctl.vision import CameraModel
 from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 from tests.helpers.calibrating import calibrate, refused
@@ -60,11 +61,12 @@ def test_pictures_become_a_file(calibrated: Result, rendered: Rendered) -> None:
     assert "GOOD TO FLY" in calibrated.stderr
 
 
-def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
+def test_new_pictures_pass_the_check_and_another_camera_s_fail(
     calibrated: Result, rendered: Rendered, tmp_path: Path
 ) -> None:
     file = Path(json.loads(calibrated.stdout)["file"])
-    source = f"images:{rendered[0]}"
+    render_folder(tmp_path / "new", rendered[1], CHARUCO, 10, seed=6)
+    source = f"images:{tmp_path / 'new'}"
     passed = calibrate("check", str(file), source, "-b", BOARD, "--json")
     assert passed.exit_code == 0
     assert json.loads(passed.stdout)["pass"] is True
@@ -85,6 +87,40 @@ def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
         del raw[key]
     other.write_text(yaml.safe_dump(raw))
     assert "image size is missing" in refused(calibrate("check", str(other), source), 30)
+
+
+def test_a_calibration_is_not_judged_by_its_own_pictures(
+    calibrated: Result, rendered: Rendered, tmp_path: Path
+) -> None:
+    """Under whatever name; the board is the calibration's if none is named."""
+    file = Path(json.loads(calibrated.stdout)["file"])
+    for i, path in enumerate(sorted(rendered[0].iterdir())):
+        cv2.imwrite(f"{tmp_path}/copy_{i}.png", np.asarray(cv2.imread(str(path), 0)))
+    said = calibrate("check", file, f"images:{tmp_path}")
+    assert said.exit_code == 30
+    assert f"the board is {BOARD} (the calibration's)" in said.stderr
+    assert "10 of 10 views are those that the calibration was made from" in said.stderr
+    render_folder(tmp_path, rendered[1], CHARUCO, 8, seed=6)
+    passed = calibrate("check", file, f"images:{tmp_path}")
+    assert passed.exit_code == 0, passed.output
+    assert "left out copy_3.png: the calibration was made from it" in passed.stderr
+
+
+def test_a_board_in_the_older_layout_is_calibrated_and_stored(tmp_path: Path) -> None:
+    board = Board.parse("charuco:8x6:30mm:22mm:DICT_4X4_50:legacy")
+    camera = draw_camera(np.random.default_rng(5), (480, 360))
+    render_folder(tmp_path / "board", camera, board, 6, seed=5)
+    named = board.notation().removesuffix(":legacy")
+    file = tmp_path / "camera.yaml"
+    result = calibrate(f"images:{tmp_path / 'board'}", "-b", named, "-o", file)
+    assert result.exit_code == 0, result.output
+    assert "the board has the layout before OpenCV 4.6" in result.stderr
+    assert yaml.safe_load(file.read_text())["board"] == board.notation()
+    error = np.abs(lens_parameters(load_calibration(file)) - lens_parameters(camera))
+    assert error[:4].max() < 2.0
+    own = calibrate("check", file, f"images:{tmp_path / 'board'}")
+    assert f"the board is {board.notation()} (the calibration's)" in own.stderr
+    assert "6 of 6 views" in own.stderr
 
 
 def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Path) -> None:
@@ -110,7 +146,7 @@ def test_broken_pictures_are_left_out_and_named(rendered: Rendered, tmp_path: Pa
     [
         (["images:{board}", "-o", "mine.yaml"], 30, ["--force"]),
         (["{board}/board_0[01].png"], 30, ["only 2 pictures", "add 3"]),
-        (["images:sizes"], 30, ["480x300", "480x360"]),
+        (["images:sizes"], 30, ["3 of 4 pictures are 480x360", "board_02.png is 480x300 px"]),
         (["{one}", "-b", "chessboard:9x6:25mm"], 30, ["none of 1 pictures"]),
     ],
 )

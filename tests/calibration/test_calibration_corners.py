@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import learn_gear_mask
+from perchctl.calibration import find_views, learn_gear_mask
 from perchctl.calibration.board.detect import BoardView, find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
@@ -15,6 +17,7 @@ from perchctl.target import Board
 from perchctl.vision import project, split_fields
 from tests.helpers.boards import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera, draw_poses
 from tests.helpers.gear import SIZE_PX, Pictures, legs, turned_about
+from tests.helpers.orientation import turned_picture
 from tests.helpers.recording import VIEWS, picture
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
@@ -113,6 +116,18 @@ def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
 
 
 # --- interlaced pictures -------------------------------------------------------------------
+
+
+def test_pictures_of_a_camera_that_was_held_both_ways_have_one_grid(tmp_path: Path) -> None:
+    pose = np.array([0.1, -0.2, 0.05, -0.11, -0.08, 0.42])
+    rendered = BoardRenderer(CAMERA, CHARUCO).render(pose, np.random.default_rng(0), noise=1.0)
+    for orientation in (1, 3, 6):
+        data = turned_picture(rendered, "PNG", orientation)
+        (tmp_path / f"{orientation}.png").write_bytes(data)
+    views = find_views(sorted(tmp_path.iterdir()), CHARUCO).views
+    assert len(views) == 3
+    for view in views:
+        np.testing.assert_array_equal(view.corners_px, views[0].corners_px)
 
 
 def test_the_corners_of_an_interlaced_picture_are_its_first_fields() -> None:

@@ -112,10 +112,14 @@ def test_kalibr_s_file_of_one_camera_is_read(tmp_path: Path) -> None:
     ("pinhole", "omni", "'omni' is not supported"),
     ("[300.0, 300.0, 320.0, 240.0]", "[380.0, 1.0]", "fu, fv, pu, pv"),
     ("  resolution: [640, 480]\n", "", "key resolution is missing"),
-    ("resolution: [640, 480]", "resolution: 640", "not a number"),
-    ("resolution: [640, 480]", "resolution: [.inf, 480]", "not a number"),
+    ("resolution: [640, 480]", "resolution: 640", "needs width and height, found 1"),
+    ("resolution: [640, 480]", "resolution: [.inf, 480]", "holds NaN or infinity"),
     ("intrinsics: [300.0,", "intrinsics: [wide,", "not a number"),
-    ("-0.002]", "-0.002, 0.0, 0.0]", "found 6"),
+    ("-0.002]", "-0.002, 0.1, 0.2]", "found 6"),
+    ("  distortion_model: radtan\n", "", "key distortion_model is missing"),
+    ("  camera_model: pinhole\n", "", "key camera_model is missing"),
+    ("radtan", "none", "are not 0 although distortion_model is none"),
+    ("  resolution", "  xi: 0.9\n  resolution", "key xi of this camchain of Kalibr may"),
 ])  # fmt: skip
 def test_other_camchains_are_refused(tmp_path: Path, old: str, new: str, expected: str) -> None:
     chain = tmp_path / "camchain.yaml"

@@ -12,7 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import GuidedFrame, capture_views
+from perchctl.calibration import (
+    FoundViews,
+    GuidedFrame,
+    calibrate_camera,
+    capture_views,
+    check_calibration,
+)
 from perchctl.calibration.board.capture import (
     GuidedCapture,
     covered_shares,
@@ -21,7 +27,8 @@ from perchctl.calibration.board.capture import (
 )
 from perchctl.camera import Grey
 from perchctl.display import LivePage, Sketch
-from perchctl.errors import TimedOut
+from perchctl.errors import InvalidValue, TimedOut
+from perchctl.target import Board
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -132,6 +139,84 @@ def test_a_board_s_farther_side_is_known() -> None:
             assert (corners[:, 2] @ corners[:, 1 - about] > 0) == (sign > 0)
             view = corner_view(rng, camera, CHARUCO, pose, 0.0, "v")
             assert sign * view_signature(view, CHARUCO)[part] > 0.1
+
+
+def captured(live: bool) -> FoundViews:
+    """Frames of a board: two of nothing, six that move, two still, three that stay, two blurred."""
+    rng = np.random.default_rng(4)
+    camera, capture = draw_camera(rng), GuidedCapture(CHARUCO, live)
+    poses = draw_poses(rng, camera, CHARUCO, 8)
+    views = [corner_view(rng, camera, CHARUCO, pose, 0.05, "v") for pose in poses]
+    still, other = views[6:]
+    blurred = dataclasses.replace(other, blur_px=8.0)
+    for seen in ("no board", "no board", *views[:6], still, still, still, still, still, blurred):
+        capture.update(seen)
+    capture.update(blurred)
+    capture.count_repeated()
+    return FoundViews(tuple(capture.taken), frames=capture.counts)
+
+
+def test_what_became_of_each_frame_is_counted() -> None:
+    frames = captured(live=False).frames
+    assert frames is not None
+    assert (frames.taken, frames.without_board, frames.repeated) == (1, 2, 1)
+    # The first still frame and the first blurred one moved, too.
+    assert (frames.moved, frames.alike, frames.blurred) == (8, 3, 1)
+    assert frames.text == (
+        "13 of 15 frames show the board: 1 taken, 8 moved by more than 1.5 px from the frame "
+        "before, 1 too blurred, 3 like a view that was taken"
+    )
+
+
+@pytest.mark.parametrize(
+    ("live", "advised"),
+    [(True, "hold the board still for a moment in each place"), (False, "record again .*images:")],
+)
+def test_too_few_views_of_a_film_are_not_said_to_be_too_few_boards(
+    live: bool, advised: str
+) -> None:
+    found = captured(live)
+    said = rf"only 1 usable views, .* \(13 of 15 frames show the board: .*\): {advised}"
+    with pytest.raises(InvalidValue, match=said):
+        calibrate_camera(found, CHARUCO.notation())
+    said = rf"1 usable views \(13 of 15 frames .*\), a check needs at least 3: {advised}"
+    with pytest.raises(InvalidValue, match=said):
+        check_calibration(draw_camera(np.random.default_rng(4)), found)
+    assert found.frames is not None
+    # Where frames are left out as like others, the board has to be shown elsewhere.
+    found = dataclasses.replace(found, frames=dataclasses.replace(found.frames, alike=20))
+    with pytest.raises(InvalidValue, match="show the board tilted by 20 to 45 deg"):
+        calibrate_camera(found, CHARUCO.notation())
+
+
+def test_a_recording_is_not_told_what_to_do() -> None:
+    rng = np.random.default_rng(4)
+    camera, capture = draw_camera(rng), GuidedCapture(CHARUCO, live=False)
+    view = corner_view(rng, camera, CHARUCO, draw_poses(rng, camera, CHARUCO, 1)[0], 0.05, "v")
+    said = [capture.advice]
+    for seen in (view, dataclasses.replace(view, blur_px=8.0), view, view):
+        capture.update(seen)
+        said.append(capture.advice)
+    assert said == [
+        "no board found yet",
+        "moved since the frame before",
+        "too blurred",
+        "taken, 1 views",
+        "like a view that was taken",
+    ]
+
+
+def test_a_film_of_another_board_is_named() -> None:
+    camera = draw_camera(np.random.default_rng(3), (320, 240))
+    rng, renderer = np.random.default_rng(2), BoardRenderer(camera, CHESSBOARD)
+    image = renderer.render(draw_poses(rng, camera, CHESSBOARD, 1)[0], rng, noise=1.0)
+    source = Pictures([image] * 2)
+    squares = Board.parse("chessboard:10x7:25mm")
+    found = capture_views(source, squares, lambda guided: None)
+    assert not found.views
+    assert found.other_board.startswith("a chessboard of 9x6 inner corners, which are 10x7 squares")
+    assert found.frames is not None
+    assert (found.frames.live, found.frames.without_board) == (False, 2)
 
 
 def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(

@@ -19,6 +19,7 @@ from perchctl.errors import NotFound, TimedOut
 from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, jpeg, level, next_frame, part, resized
 from tests.helpers.mjpeg import MjpegServer
+from tests.helpers.orientation import turned_picture
 from tests.helpers.waiting import until
 
 
@@ -62,6 +63,16 @@ def test_the_newest_frame_is_stamped_at_arrival_less_the_latency_and_given_once(
     assert second.t_arrival_s == 102.5
     assert source.poll(0.0) is None
     assert source.problem(clock.t_s) is None
+
+
+def test_a_stream_s_pictures_stay_on_the_sensor_s_grid(
+    server: MjpegServer, opened: list[LiveSource]
+) -> None:
+    upright = np.full((48, 64), 90, np.uint8)
+    server.scripts.put([part(turned_picture(upright, "JPEG", 6)), threading.Event()])
+    source = stream(server, Clock(), opened)
+    assert next_frame(source).image.shape == upright.shape
+    assert source.size_px == (64, 48)
 
 
 @pytest.mark.parametrize("bad", [

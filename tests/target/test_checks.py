@@ -68,19 +68,21 @@ def test_pages() -> None:
 
 
 boards = st.builds(
-    lambda is_charuco, columns, rows, tenths, share: Board(
+    lambda is_charuco, columns, rows, tenths, share, is_legacy: Board(
         "charuco" if is_charuco else "chessboard",
         columns,
         rows,
         tenths / 1e4,
         round(tenths / 1e4 * share, 5) if is_charuco else None,
         "DICT_6X6_1000" if is_charuco else None,
+        legacy=is_legacy and is_charuco and rows % 2 == 0,
     ),
     st.booleans(),
     st.integers(3, 20),
     st.integers(3, 20),
     st.integers(50, 900),
     st.floats(0.4, 0.94),
+    st.booleans(),
 )
 
 

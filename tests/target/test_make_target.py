@@ -189,7 +189,15 @@ def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: 
     assert target_pdf(sized(large, 25.0), named[1], MAGNET_M)
 
 
-@pytest.mark.parametrize("notation", ["charuco:10x7:25mm:18mm:DICT_5X5_100", "chessboard:9x6:25mm"])
+@pytest.mark.parametrize(
+    "notation",
+    [
+        "charuco:10x7:25mm:18mm:DICT_5X5_100",
+        "charuco:8x6:30mm:22mm:DICT_4X4_50",
+        "charuco:8x6:30mm:22mm:DICT_4X4_50:legacy",
+        "chessboard:9x6:25mm",
+    ],
+)
 def test_a_printed_board_is_found_and_true_to_size(notation: str) -> None:
     board = Board.parse(notation)
     picture = page_picture(board_pdf(board, "a4"), 0, 200)
@@ -198,6 +206,7 @@ def test_a_printed_board_is_found_and_true_to_size(notation: str) -> None:
     assert isinstance(view, BoardView)
     columns, rows = board.corner_count
     assert len(view) == columns * rows
+    assert view.legacy == board.legacy
     corners, expected = view.corners_px * 25.4 / 200, view.corners_m[:, :2] * 1e3
     if corners[0, 0] > corners[-1, 0]:  # a chessboard found from its other end
         corners = corners[::-1]

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from perchctl.calibration.board.detect import BoardView, FoundViews, Rejection, find_board
+from perchctl.calibration.board.detect import (
+    BoardView,
+    FoundViews,
+    FrameCounts,
+    Rejection,
+    find_board,
+)
+from perchctl.calibration.board.recognise import MOST_PICTURES, describe_other_board
 from perchctl.calibration.board.solve import MIN_VIEWS
 from perchctl.calibration.live import GuidedFrame, poll_frames
-from perchctl.camera import FrameSource, decode_picture
+from perchctl.camera import FrameSource, Grey, decode_picture
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 from perchctl.target import Board
@@ -30,7 +39,7 @@ def find_views(
     """Detect the board in picture files; pictures that are broken or show no board are returned
     apart. `progress` is called with the number of pictures done, and of all.
 
-    Raises InvalidValue: unequal sizes.
+    Raises InvalidValue, before the search: unequal sizes.
     """
     names = [path.name for path in pictures]
     if len(set(names)) < len(names):  # a glob reached into several folders
@@ -45,20 +54,54 @@ def find_views(
     views: list[BoardView] = []
     missing: list[Rejection] = []
     with ThreadPoolExecutor() as pool:
+        sizes = list(pool.map(_picture_size, pictures))
+        _check_sizes(dict(zip(names, sizes, strict=True)))
         for name, seen in zip(names, pool.map(search, names, pictures), strict=True):
             if isinstance(seen, BoardView):
                 views.append(seen)
             else:
                 missing.append(Rejection(name, seen))
             progress(len(views) + len(missing), len(pictures))
-    for view in views:
-        if view.size_px != views[0].size_px:
-            (w, h), (first_w, first_h) = view.size_px, views[0].size_px
-            raise InvalidValue(
-                f"{view.name} is {w}x{h} px but {views[0].name} is {first_w}x{first_h} px: a "
-                f"calibration belongs to one size, keep pictures of one only"
-            )
-    return FoundViews(tuple(views), tuple(missing))
+    views, others = _of_one_layout(views)
+    shown: list[Grey] = []
+    if not views:
+        readable = [path for path, size in zip(pictures, sizes, strict=True) if size]
+        spread = readable[:: max(1, len(readable) // MOST_PICTURES)][:MOST_PICTURES]
+        shown = [decode_picture(path.read_bytes()) for path in spread]
+    return FoundViews(
+        tuple(views), (*missing, *others), other_board=describe_other_board(shown, board)
+    )
+
+
+def _picture_size(path: Path) -> tuple[int, int] | None:
+    """Width and height in px; None if the file cannot be read."""
+    try:
+        height, width = decode_picture(path.read_bytes()).shape
+    except (OSError, ValueError):
+        return None
+    return width, height
+
+
+def _check_sizes(sizes: Mapping[str, tuple[int, int] | None]) -> None:
+    """Raise InvalidValue, which names all pictures that differ in size from most."""
+    counts = Counter(size for size in sizes.values() if size)
+    if len(counts) < 2:
+        return
+    (most, count), *_ = counts.most_common()
+    odd = {name: size for name, size in sizes.items() if size not in (most, None)}
+    named = ", ".join(f"{name} is {size[0]}x{size[1]} px" for name, size in odd.items() if size)
+    raise InvalidValue(
+        f"{count} of {counts.total()} pictures are {most[0]}x{most[1]} px, but {named}: a "
+        f"calibration belongs to one size, remove those of another"
+    )
+
+
+def _of_one_layout(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Rejection]]:
+    """The views of the layout that most show, and the others as rejected: there is one board."""
+    legacy = 2 * sum(view.legacy for view in views) > len(views)
+    reason = "its markers stand in another layout than in most pictures"
+    others = [Rejection(view.name, reason) for view in views if view.legacy != legacy]
+    return [view for view in views if view.legacy == legacy], others
 
 
 # --- How alike two views are ---
@@ -112,6 +155,8 @@ def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
 
 _STILL_SHARE = 1.5 / 640.0  # of the width, between two frames
 _BLUR_SHARE = 2.5 / 640.0
+_UNSEEN_EVERY = 15
+"""Of the frames without a board every so many is kept, to name the board that they show."""
 _ADVICE = (
     (0.5, "move the board to the right rim", "move the board to the left rim"),
     (0.5, "move the board to the bottom rim", "move the board to the top rim"),
@@ -135,39 +180,53 @@ def capture_views(
 
     Raises TimedOut: the camera is lost before there are `MIN_VIEWS` views.
     """
-    capture = GuidedCapture(board)
+    capture = GuidedCapture(board, source.live)
+    unseen: list[Grey] = []
     try:
         for _, frame in poll_frames(source, clock, sleep):
             if stopped():
                 break
-            if frame is None or frame.repeated:  # a repeated one would look still
+            if frame is None:
+                continue
+            if frame.repeated:  # it would look still
+                capture.count_repeated()
                 continue
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")
             taken = capture.update(seen)
+            if isinstance(seen, str) and frame.index % _UNSEEN_EVERY == 0:
+                unseen = [*unseen[1 - MOST_PICTURES :], frame.image]
             show(capture.guided_frame(frame, seen, taken))
             if capture.is_finished:
                 break
     except TimedOut as gone:
         if len(capture.taken) < MIN_VIEWS:
             raise TimedOut(f"{gone}; only {len(capture.taken)} views were taken") from None
-    return FoundViews(tuple(capture.taken))
+    views, others = _of_one_layout(capture.taken)
+    other_board = "" if views else describe_other_board(unseen, board)
+    return FoundViews(tuple(views), tuple(others), capture.counts, other_board)
 
 
 class GuidedCapture:
-    """State of a guided capture: the views `taken`, and `advice` on the next view."""
+    """State of a guided capture: the views `taken`, `advice` on the next view (of a recording: what
+    became of the frame), and `counts` of what became of all frames."""
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, live: bool = True) -> None:
         self._board = board
         self._signatures: list[Array] = []
         self._last: BoardView | None = None
         self.taken: list[BoardView] = []
-        self.advice = "show the board to the camera"
+        self.counts = FrameCounts(live=live, still_px=0.0)
+        self.advice = "show the board to the camera" if live else "no board found yet"
 
     @property
     def is_finished(self) -> bool:
         """True if enough, varied views or `MOST_VIEWS` were taken."""
         covered = min(covered_shares(self._signatures).values()) >= 1.0
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
+
+    def count_repeated(self) -> None:
+        """Count a frame that the source gave twice."""
+        self._count("repeated")
 
     def update(self, view_or_reason: BoardView | str) -> bool:
         """Process the next picture: its view of the board, or why it has none.
@@ -176,24 +235,34 @@ class GuidedCapture:
         """
         before, seen = self._last, view_or_reason
         self._last = seen if isinstance(seen, BoardView) else None
+        live = self.counts.live
         if isinstance(seen, str):
+            self._count("without_board")
             self.advice = seen
             return False
         width = seen.size_px[0]
+        self.counts = replace(self.counts, still_px=_STILL_SHARE * width)
         sharpest_px = min((view.blur_px for view in self.taken), default=np.inf)
         here = view_signature(seen, self._board)
-        if before is None or _moved_px(before, seen) > _STILL_SHARE * width:
-            self.advice = "hold still"
+        if before is None or _moved_px(before, seen) > self.counts.still_px:
+            self._count("moved")
+            self.advice = "hold still" if live else "moved since the frame before"
         elif seen.blur_px > min(max(_BLUR_SHARE * width, 1.0), 2.5 * sharpest_px):
-            self.advice = "too blurred: more light, or hold still"
+            self._count("blurred")
+            self.advice = "too blurred: more light, or hold still" if live else "too blurred"
         elif any(signature_distance(here, there) <= NEW_BEYOND for there in self._signatures):
-            self.advice = next_advice(self._signatures)
+            self._count("alike")
+            self.advice = next_advice(self._signatures) if live else "like a view that was taken"
         else:
+            self._count("taken")
             self.taken.append(seen)
             self._signatures.append(here)
             self.advice = f"taken, {len(self.taken)} views"
             return True
         return False
+
+    def _count(self, what: str) -> None:
+        self.counts = replace(self.counts, **{what: getattr(self.counts, what) + 1})
 
     def guided_frame(
         self, frame: Frame, view_or_reason: BoardView | str, taken: bool

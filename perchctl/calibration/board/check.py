@@ -13,8 +13,8 @@ Pictures whose 95 % line is above twice the limit cannot judge: the check is ref
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +76,34 @@ class CheckResult:
         }
 
 
-def check_calibration(camera: CameraModel, found: FoundViews) -> CheckResult:
+def check_calibration(
+    camera: CameraModel, found: FoundViews, own_hashes: Collection[str] = ()
+) -> CheckResult:
     """Judge a calibration by new views of a board.
+
+    Args:
+        own_hashes: `BoardView.picture_hash` of the pictures that the calibration was made from.
+            They are left out: a calibration fits its own pictures whatever is wrong with both.
 
     Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
     """
-    if len(found.views) < MIN_CHECK_VIEWS:
+    own = [view for view in found.views if view.picture_hash in own_hashes]
+    found = replace(found, views=tuple(view for view in found.views if view not in own))
+    if own and len(found.views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
-            f"{len(found.views)} pictures show the board, a check needs at least "
-            f"{MIN_CHECK_VIEWS}: add some with the board tilted by 20 to 45 deg and near the "
-            f"picture's rims"
+            f"{len(own)} of {len(own) + len(found.views)} views are those that the calibration was "
+            f"made from, which cannot judge it: take new pictures"
         )
-    free, kept, rejections = robust_fit(found.views)
+    if len(found.views) < MIN_CHECK_VIEWS:
+        advice = "add some with the board tilted by 20 to 45 deg and near the picture's rims"
+        seen = f"{len(found.views)} pictures show the board"
+        if found.frames is not None:
+            seen = f"{len(found.views)} usable views ({found.frames.text})"
+            advice = found.frames.advice or advice
+        raise InvalidValue(f"{seen}, a check needs at least {MIN_CHECK_VIEWS}: {advice}")
+    free, kept, outliers = robust_fit(found.views)
+    reason = "the calibration was made from it"
+    rejections = [*(Rejection(view.name, reason) for view in own), *outliers]
     fixed = fit_poses(kept, camera)
     if fixed is None:
         reason = "the calibration cannot see the boards where they are: it is another camera's"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +19,8 @@ MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
 SEARCH_PX = 1600
 """Larger pictures are scaled down to it for the search; corners are fitted at full size."""
+_HASH_BYTES = 6
+"""Fewer make it likelier than 1 in 10^8 that two of a thousand pictures have one hash by chance."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
@@ -33,6 +36,8 @@ class BoardView:
         corners_m: corner positions on the board, z = 0, (n, 3).
         corners_px: corner positions in the picture, (n, 2); the top-left pixel's centre is (0, 0).
         blur_px: median spread of the edges at the corners (tanh width).
+        legacy: the layout that was seen, as in `perchctl.target.Board`.
+        picture_hash: equal for pictures of the same pixels, whatever their file; empty if unknown.
     """
 
     name: str
@@ -41,6 +46,8 @@ class BoardView:
     corners_m: Array
     corners_px: Array
     blur_px: float = 0.0
+    legacy: bool = False
+    picture_hash: str = ""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -64,17 +71,85 @@ class Rejection:
     corner_ids: tuple[int, ...] = ()  # empty: the whole view
 
 
+@dataclass(frozen=True)
+class FrameCounts:
+    """How many frames of a video or a camera were looked at, and why some of them were no views.
+
+    Attributes:
+        live: a camera, whose user can be told to hold still; else a recording.
+        taken: frames that became views.
+        without_board: frames without a board, or with too little of it.
+        moved: the board moved by more than `still_px` from the frame before, or was not in it.
+        blurred: too blurred for their corners.
+        alike: like a view that was taken already.
+        repeated: frames that the source gave twice.
+    """
+
+    live: bool
+    still_px: float
+    taken: int = 0
+    without_board: int = 0
+    moved: int = 0
+    blurred: int = 0
+    alike: int = 0
+    repeated: int = 0
+
+    @property
+    def with_board(self) -> int:
+        """The number of frames that show the board."""
+        return self.taken + self.moved + self.blurred + self.alike
+
+    @property
+    def text(self) -> str:
+        """What became of the frames, in words."""
+        reasons = (
+            (self.taken, "taken"),
+            (self.moved, f"moved by more than {self.still_px:.2g} px from the frame before"),
+            (self.blurred, "too blurred"),
+            (self.alike, "like a view that was taken"),
+        )
+        counted = ", ".join(f"{count} {reason}" for count, reason in reasons if count)
+        text = f"{self.with_board} of {self.with_board + self.without_board} frames show the board"
+        return text + (f": {counted}" if counted else "")
+
+    @property
+    def advice(self) -> str:
+        """What brings more views: empty if the board has to be shown elsewhere, or at all."""
+        if self.moved + self.blurred <= self.alike:
+            return ""
+        if self.live:
+            return "hold the board still for a moment in each place, in good light"
+        return (
+            "record again and hold still for a moment in each place, in good light, or save sharp "
+            "frames as pictures (images:)"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class FoundViews:
-    """The detected views of a board, and the pictures `without_board`, each with the reason."""
+    """The detected views of a board.
+
+    Attributes:
+        without_board: pictures without a board, each with the reason.
+        frames: of a video or camera, what became of its frames; None for pictures.
+        other_board: if there are no views, the board that is seen instead; empty if none is.
+    """
 
     views: tuple[BoardView, ...]
     without_board: tuple[Rejection, ...] = ()
+    frames: FrameCounts | None = None
+    other_board: str = ""
+
+    def layout_of(self, board: Board) -> Board:
+        """The board that was named, in the layout that was seen."""
+        return replace(board, legacy=self.views[0].legacy) if self.views else board
 
 
 def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     """The view of a board in a grey picture (h, w), or why no board was found. In an interlaced
-    picture the first field is used, as a moving board has two positions."""
+    picture the first field is used, as a moving board has two positions. Both layouts of a ChArUco
+    board are looked for, whichever `board` has."""
+    picture_hash = hashlib.blake2b(image.tobytes(), digest_size=_HASH_BYTES).hexdigest()
     image = split_fields(image)[0]
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
@@ -86,7 +161,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     found = _chessboard(small, board) if board.kind == "chessboard" else _charuco(small, board)
     if isinstance(found, str):
         return found
-    ids, corners = found
+    ids, corners, legacy = found
     # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
     corners = (corners + 0.5) / scale - 0.5
     # A ChArUco board's markers begin so far inside of its white squares.
@@ -96,11 +171,39 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
         return f"only {int(fit.is_valid.sum())} corners are sharp enough to be measured"
     blur_px = float(np.median(fit.edge_width_px[fit.is_valid]))
     object_m = board.corners_m()[ids]
-    return BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px).select(fit.is_valid)
+    view = BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px, legacy, picture_hash)
+    return view.select(fit.is_valid)
 
 
-def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
-    """The numbers (n,) and places (n, 2) px of a ChArUco board's corners, or why not."""
+_Corners = tuple[NDArray[np.intp], Array, bool]
+"""The numbers (n,) and places (n, 2) px of a board's corners, and whether its layout is the legacy
+one."""
+
+
+def _charuco(image: Grey, board: Board) -> _Corners | str:
+    """The corners of a ChArUco board in either layout, or why there are none.
+
+    The two layouts of a board differ in the squares of its markers, not in its corners: by the
+    wrong one no corner is found, since neighbouring markers contradict each other.
+    """
+    numbers, corners, markers = charuco_corners(image, board)
+    # By the right layout there are more corners than markers, unless little of the board is seen.
+    if board.has_two_layouts and len(numbers) < markers:
+        other = replace(board, legacy=not board.legacy)
+        more, places, _ = charuco_corners(image, other)
+        if len(more) > len(numbers):
+            numbers, corners, board = more, places, other
+    if markers == 0:
+        return _without_board(image)
+    plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
+    if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
+        return f"{markers} markers but too few corners of the board found"
+    return numbers, corners, board.legacy
+
+
+def charuco_corners(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array, int]:
+    """The numbers (n,) and places (n, 2) px of the corners by the board's layout, and how many
+    markers were found."""
     # A detector of its own for each call: pictures are searched on several threads.
     detector = cv2.aruco.CharucoDetector(board.cv2_board())
     finding = detector.getDetectorParameters()
@@ -112,16 +215,12 @@ def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
     completing.tryRefineMarkers = True
     detector.setCharucoParameters(completing)
     corners, ids, _, marker_ids = detector.detectBoard(image)
-    if marker_ids is None or len(marker_ids) == 0:
-        return _without_board(image)
     numbers = np.array([] if ids is None else ids, dtype=np.intp).ravel()
-    plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
-    if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
-        return f"{len(marker_ids)} markers but too few corners of the board found"
-    return numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    places = np.array([] if ids is None else corners, dtype=np.float64).reshape(-1, 2)
+    return numbers, places, 0 if marker_ids is None else len(marker_ids)
 
 
-def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
+def _chessboard(image: Grey, board: Board) -> _Corners | str:
     """As `_charuco`, of a chessboard."""
     size = board.corner_count
     found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
@@ -129,7 +228,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
         found, corners = cv2.findChessboardCornersSB(image, size, flags=_SECTORS)
     if not found:
         return _without_board(image)
-    return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
+    return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2), False
 
 
 def _without_board(image: Grey) -> str:

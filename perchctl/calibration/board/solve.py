@@ -151,6 +151,7 @@ class Calibration:
                 "rms_px": self.fit.rms_px,
                 "views_used": len(self.views),
                 "views_rejected": len(rejected_view_records(self.rejections)),
+                "picture_hashes": " ".join(v.picture_hash for v in self.views if v.picture_hash),
                 "parameters": " ".join(PARAMETERS[self.camera.model]),
                 "parameter_std": self.parameter_std[None],
                 "parameter_covariance": self.covariance,
@@ -174,11 +175,10 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
         InvalidValue: too few views, all frontal, most of the image empty, focal length
         not fixed, or too many views that fit no camera.
     """
-    pictures = len(found.views) + len(found.without_board)
-    _check_count(found.views, pictures)
+    _check_count(found.views, found)
     models = MODEL_NAMES if model == "auto" else (model,)
     fit, kept, rejections = robust_fit(found.views, models)
-    _check_count(kept, pictures)
+    _check_count(kept, found)
     # Tilt and coverage first: their messages name best what to add.
     covered = covered_cells(kept)
     _check_variety(fit, covered)
@@ -250,14 +250,27 @@ _NAMES = (
 )
 
 
-def _check_count(views: Sequence[BoardView], pictures: int) -> None:
-    if len(views) < MIN_VIEWS:
-        of = f"of {pictures} pictures" if pictures > len(views) else "pictures"
+def _check_count(views: Sequence[BoardView], found: FoundViews) -> None:
+    """Raises InvalidValue if the usable `views` are too few."""
+    if len(views) >= MIN_VIEWS:
+        return
+    missing = MIN_VIEWS - len(views)
+    variety = (
+        "with the board tilted by 20 to 45 deg in all directions, near and far, and in every "
+        "corner of the picture"
+    )
+    if found.frames is not None:
+        advice = found.frames.advice or f"show the board {variety.removeprefix('with the board ')}"
         raise InvalidValue(
-            f"only {len(views)} {of} show the board, at least {MIN_VIEWS} are needed: add "
-            f"{MIN_VIEWS - len(views)} or more (15 to 25 are good) with the board tilted by 20 to "
-            f"45 deg in all directions, near and far, and in every corner of the picture"
+            f"only {len(views)} usable views, at least {MIN_VIEWS} are needed "
+            f"({found.frames.text}): {advice}"
         )
+    pictures = len(found.views) + len(found.without_board)
+    of = f"of {pictures} pictures" if pictures > len(views) else "pictures"
+    raise InvalidValue(
+        f"only {len(views)} {of} show the board, at least {MIN_VIEWS} are needed: add "
+        f"{missing} or more (15 to 25 are good) {variety}"
+    )
 
 
 def _check_variety(fit: CameraFit, covered: NDArray[np.bool_]) -> None:

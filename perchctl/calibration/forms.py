@@ -1,0 +1,496 @@
+"""Calibration files of other programs: the form is recognised, and each key has a meaning.
+
+A lens that is taken for another one moves the target by centimetres at a standard deviation of
+millimetres, and nothing later notices. Therefore the keys decide, by one table for each form:
+
+- keys that are read: size, camera matrix, distortion, and the lens (the distortion model);
+- keys that must be neutral, as another value would change the projection (binning, xi, ...);
+- notes, which say nothing about the projection of the camera's own pictures: in the table, or made
+  of words about boards, pictures, errors and dates.
+
+A key that is in no table might change the projection, so its file is refused, unless the value is
+0 or empty, by which no term of a lens model does anything. Among the notes are
+`rectification_matrix` and `projection_matrix`: by sensor_msgs/CameraInfo they describe rectified
+pictures, while K and D belong to the camera's own.
+
+Forms of programs that are known, but not read, are refused by their name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue
+from perchctl.plain_yaml import clip_text, parse_documents
+
+READ_FORMS = "camera_info of ROS, FileStorage of OpenCV, or camchain of Kalibr"
+
+
+@dataclass(frozen=True)
+class Form:
+    """The keys of one form of calibration file.
+
+    Attributes:
+        name: the form's name in messages.
+        read: the keys of each meaning. The keys of ``lens`` must agree; of the others one is there.
+        neutral: keys that change the projection, and their values that do not.
+        notes: keys that say nothing about the projection.
+    """
+
+    name: str
+    read: Mapping[str, tuple[str, ...]]
+    neutral: Mapping[str, tuple[float, ...]]
+    notes: tuple[str, ...]
+
+
+CAMERA_FILE = Form(
+    name="camera_info or FileStorage file",
+    read={
+        "width": ("image_width", "width"),
+        "height": ("image_height", "height"),
+        "size": ("camera_resolution",),
+        "K": ("camera_matrix",),
+        "distortion": ("distortion_coefficients", "dist_coeffs", "dist_coeff"),
+        "lens": ("distortion_model", "camera_model"),
+        "fisheye": ("fisheye_model",),
+        "region": ("roi",),
+        "rms": ("avg_reprojection_error", "rms_px", "rms"),
+        **{entry: (entry,) for entry in ("fx", "fy", "cx", "cy")},
+    },
+    neutral={"binning_x": (0, 1), "binning_y": (0, 1), "xi": (0,), "alpha": (0,), "skew": (0,)},
+    notes=(
+        # ROS
+        *("rectification_matrix", "projection_matrix", "header", "frame_id", "camera_info_url"),
+        # OpenCV's programs
+        *("aspect_ratio", "fix_aspect_ratio", "flags", "flag_value", "extrinsic_parameters"),
+        *("grid_points", "image_points", "camera_matrix_std_dev", "dist_coeffs_std_dev"),
+        # Python scripts around OpenCV's calibrateCamera
+        *("ret", "rvecs", "tvecs", "t_cam_imu"),
+        # perchctl
+        *("parameters", "parameter_std", "parameter_covariance", "views_rejected"),
+        *("target_error", "target_error_columns", "converted_from", "picture_hashes"),
+    ),
+)
+"""A file of ROS's camera_calibration, of OpenCV's calibration programs, or of a script: their keys
+are the same, and mix."""
+
+CAMERA_MESSAGE = Form(
+    name="CameraInfo message",
+    read={
+        "width": ("width", "image_width"),
+        "height": ("height", "image_height"),
+        "K": ("k",),
+        "distortion": ("d",),
+        "lens": ("distortion_model",),
+        "region": ("roi",),
+    },
+    neutral={"binning_x": (0, 1), "binning_y": (0, 1)},
+    notes=("header", "r", "p"),
+)
+"""The output of ``ros2 topic echo /camera_info``, or of ``rostopic echo`` with D, K, R and P; also
+a script's file with K and D."""
+
+KALIBR_CAMERA = Form(
+    name="camchain of Kalibr",
+    read={
+        "size": ("resolution",),
+        "projection": ("camera_model",),
+        "intrinsics": ("intrinsics",),
+        "distortion": ("distortion_coeffs",),
+        "lens": ("distortion_model",),
+    },
+    neutral={},
+    notes=(
+        *("cam_overlaps", "rostopic", "timeshift_cam_imu"),
+        *("T_cam_imu", "T_imu_cam", "T_cn_cnm1"),
+    ),
+)
+"""One camera of a camchain, as Kalibr and OpenVINS write it. Pixel (0, 0) is a pixel's centre."""
+
+_NOTE_WORDS = frozenset(
+    (
+        *("board", "pattern", "square", "squares", "checkerboard", "chessboard", "charuco"),
+        *("aruco", "marker", "markers", "dictionary"),
+        *("corner", "corners", "columns", "cols", "rows", "width", "height", "size", "length"),
+        *("num", "number", "nr", "nframes", "count", "total", "of", "used", "valid"),
+        *("image", "images", "picture", "pictures", "frame", "frames", "view", "views"),
+        *("sample", "samples"),
+        *("rms", "rmse", "reprojection", "error", "errors", "err", "mean", "avg", "average"),
+        *("median", "max", "min", "per", "std"),
+        *("calibration", "calibrated", "date", "time", "timestamp", "created", "hfov", "vfov"),
+        *("dfov", "fps"),
+        *("opencv", "version", "camera", "name", "id", "serial", "device", "author"),
+        *("file", "path", "comment", "comments", "note", "notes", "description"),
+    )
+)
+"""Words about boards, pictures, errors and dates: a key of nothing else is a note, too."""
+_UNITS = frozenset(("px", "mm", "cm", "m", "deg"))
+
+_LENSES = {
+    "plumb_bob": "plumb_bob",
+    "radtan": "plumb_bob",
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
+"""The lenses that are read, by their names in ROS, OpenCV and Kalibr."""
+_COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,)}
+_OPENCV_LONG = (12, 14)
+"""Coefficients of OpenCV's thin prism and tilted sensor models."""
+
+_MAX_RMS_SHARE = 0.01
+"""Of the picture's width: a calibration that says to miss its own board by more is none."""
+
+_AS_CAMERA_INFO = (
+    "write its numbers into a file with image_width, image_height, camera_matrix, "
+    "distortion_model and distortion_coefficients"
+)
+_OTHER_FORMS = (
+    (
+        r"^\[image\]\s*$",
+        "an .ini or ost.txt of ROS without the lens's name",
+        "name the ost.yaml beside it",
+    ),
+    (
+        r"^\d+ [A-Z_]+ \d+ \d+(?: [-+\d.e]+){3,}\s*$",
+        "a cameras.txt of COLMAP",
+        f"{_AS_CAMERA_INFO}, its cx and cy less 0.5 px",
+    ),
+    (
+        r"^\s*Camera\d?\.fx\s*:",
+        "a settings file of ORB-SLAM",
+        f"{_AS_CAMERA_INFO}; PinHole is plumb_bob, KannalaBrandt8 is equidistant",
+    ),
+    (
+        r"^\s*model_type\s*:",
+        "a camera of VINS or camodocal",
+        f"{_AS_CAMERA_INFO}; PINHOLE is plumb_bob, KANNALA_BRANDT is equidistant, others are not "
+        f"supported",
+    ),
+    (r"^sensor_type\s*:\s*camera", "a sensor.yaml of the EuRoC data set", _AS_CAMERA_INFO),
+    (r'"camera_type"\s*:', "a calibration of Basalt", _AS_CAMERA_INFO),
+    (r'"cameraData"\s*:', "a calibration of DepthAI (OAK)", _AS_CAMERA_INFO),
+)
+"""Forms that are known and not read: a pattern in the text, the name, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Content of a calibration file: picture size, camera matrix (3, 3), and distortion of the
+    `model` of `perchctl.vision.CameraModel`."""
+
+    size_px: tuple[int, int]
+    K: NDArray[np.float64]
+    distortion: NDArray[np.float64]
+    model: str
+
+
+def parse_calibration(text: str) -> tuple[Lens, dict[str, Any]]:
+    """The lens that a calibration file's text describes, and the values of all its keys.
+
+    Raises InvalidValue, with the form that was found and what is needed.
+    """
+    for pattern, name, advice in _OTHER_FORMS:
+        if re.search(pattern, text, re.MULTILINE):
+            raise InvalidValue(f"this is {name}, which is not read: {advice}")
+    values = _values(text)
+    cameras = [key for key in values if re.fullmatch(r"cam\d+", key)]
+    if len(cameras) > 1:
+        raise InvalidValue(f"holds the cameras {', '.join(cameras)}: keep the one that flies")
+    if cameras:
+        return _kalibr_lens(cameras[0], values[cameras[0]]), values
+    is_message = {"k", "d"} <= {_plain_key(key) for key in values}
+    return _camera_lens(values, CAMERA_MESSAGE if is_message else CAMERA_FILE), values
+
+
+# --- From text to values ---
+
+
+def _values(text: str) -> dict[str, Any]:
+    """The values by key of a text in YAML, JSON, or OpenCV's XML."""
+    if text.lstrip().startswith("<"):
+        return _xml_values(text)
+    # The first line and the tags of OpenCV are not YAML; the keys say the same.
+    plain = re.sub(r"^%YAML.*$", "", text, count=1, flags=re.MULTILINE)
+    plain = re.sub(r"!!opencv-(?:nd-)?matrix", "", plain)
+    try:
+        documents = [json.loads(plain)]
+    except ValueError:
+        try:
+            documents = parse_documents(plain)
+        except ValueError as error:
+            raise InvalidValue(str(error)) from None
+    if not documents or not all(isinstance(each, dict) for each in documents):
+        raise InvalidValue(f"holds no keys: a calibration is a {READ_FORMS}")
+    # Of a topic each message is a document, with a time of its own.
+    first, *others = ({str(k): v for k, v in d.items() if k != "header"} for d in documents)
+    if any(other != first for other in others):
+        raise InvalidValue(f"holds {len(documents)} documents that differ: keep one")
+    return first
+
+
+def _xml_values(text: str) -> dict[str, Any]:
+    """The values of OpenCV's FileStorage in XML."""
+    if "<opencv_storage>" not in text:
+        raise InvalidValue(f"this is XML of another program: a calibration is a {READ_FORMS}")
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        keys = storage.root().keys()
+        return {key: _node_value(storage.getNode(key)) for key in keys}
+    except (cv2.error, SystemError):
+        raise InvalidValue("this is not a readable FileStorage file of OpenCV in XML") from None
+
+
+def _node_value(node: Any) -> Any:
+    if node.isMap():
+        keys = node.keys()
+        return {key: _node_value(node.getNode(key)) for key in keys}
+    if node.isSeq():
+        return [_node_value(node.at(i)) for i in range(node.size())]
+    if node.isString():
+        return node.string()
+    return None if node.isNone() else node.real()
+
+
+# --- From values to a lens ---
+
+
+def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
+    found = _by_meaning(values, form, needed=("K", "distortion"))
+    _check_region(found)
+    size_px = _size(found, form)
+    key, value = found["K"][0]
+    K = _numbers(key, value)
+    if K.size != 9:
+        raise InvalidValue(f"{key} needs 9 numbers, found {K.size}")
+    if not K.any():
+        raise InvalidValue(f"{key} is all 0: the camera was not calibrated")
+    _check_rms(found, size_px[0])
+    _check_entries(found, K)
+    model, distortion = _distortion(found, _named_lens(found))
+    return Lens(size_px, K.reshape(3, 3), distortion, model)
+
+
+def _kalibr_lens(cam: str, camera: Any) -> Lens:
+    if not isinstance(camera, dict):
+        raise InvalidValue(f"{cam} must hold keys (intrinsics, resolution, ...)")
+    found = _by_meaning(camera, KALIBR_CAMERA, needed=tuple(KALIBR_CAMERA.read))
+    projection, lens = str(found["projection"][0][1]), str(found["lens"][0][1])
+    if projection != "pinhole" or (lens != "none" and lens not in _LENSES):
+        raise InvalidValue(
+            f"Kalibr's model {lens if projection == 'pinhole' else projection!r} is not "
+            f"supported; calibrate as pinhole-radtan or pinhole-equi"
+        )
+    key, value = found["intrinsics"][0]
+    intrinsics = _numbers(key, value)
+    if intrinsics.size != 4:
+        raise InvalidValue(f"{key} needs fu, fv, pu, pv, found {intrinsics.size} numbers")
+    fu, fv, pu, pv = intrinsics
+    K = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+    if lens == "none":
+        if np.any(_numbers(*found["distortion"][0])):
+            raise InvalidValue("distortion_coeffs are not 0 although distortion_model is none")
+        return Lens(_size(found, KALIBR_CAMERA), K, np.zeros(4), "plumb_bob")
+    model, distortion = _distortion(found, _named_lens(found))
+    return Lens(_size(found, KALIBR_CAMERA), K, distortion, model)
+
+
+_Found = dict[str, list[tuple[str, Any]]]
+"""Of each meaning that a file has: its keys and their values."""
+
+
+def _plain_key(key: str) -> str:
+    """A key without underscores and upper case, in which programs and versions differ."""
+    return key.replace("_", "").lower()
+
+
+def _is_note(key: str) -> bool:
+    """True if a key consists of words that say nothing about the projection."""
+    words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", key)} - _UNITS
+    return bool(words) and words <= _NOTE_WORDS
+
+
+def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) -> _Found:
+    """The values of the keys that are read. Raises InvalidValue for a key that is missing, not
+    neutral or in no table."""
+    meanings = {_plain_key(k): meaning for meaning, keys in form.read.items() for k in keys}
+    neutral = {_plain_key(k): allowed for k, allowed in form.neutral.items()}
+    notes = {_plain_key(k) for k in form.notes}
+    found: _Found = {}
+    unknown = []
+    for key, value in values.items():
+        plain = _plain_key(key)
+        if plain in meanings:
+            found.setdefault(meanings[plain], []).append((key, value))
+        elif plain in neutral:
+            _check_neutral(key, value, neutral[plain])
+        elif not (plain in notes or _is_note(key) or value in (0, None, "", [], {})):
+            unknown.append(key)
+    for meaning, pairs in found.items():
+        if len(pairs) > 1 and meaning != "lens":
+            raise InvalidValue(f"has {' and '.join(key for key, _ in pairs)}: keep one")
+    for meaning in needed:
+        if meaning not in found:
+            raise InvalidValue(_missing(form.read[meaning][0], values, unknown))
+    if unknown:
+        raise InvalidValue(
+            f"{'key' if len(unknown) == 1 else 'keys'} {clip_text(', '.join(unknown))} of this "
+            f"{form.name} may change the projection, and perchctl does not know "
+            f"{'it' if len(unknown) == 1 else 'them'}: remove what is only a note"
+        )
+    return found
+
+
+def _missing(key: str, values: Mapping[str, Any], unknown: list[str]) -> str:
+    """The sentence about a missing key, with the one that may have been meant."""
+    if close := difflib.get_close_matches(key, unknown, 1):
+        return f"key {key} is missing: is {close[0]} meant?"
+    return (
+        f"key {key} is missing, found {clip_text(', '.join(values))}: a calibration is a "
+        f"{READ_FORMS}"
+    )
+
+
+def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
+    if value in allowed:
+        return
+    if _plain_key(key) == "xi":
+        raise InvalidValue(
+            f"xi = {value} is an omnidirectional lens, which is not supported: calibrate as "
+            f"plumb_bob, rational_polynomial or fisheye"
+        )
+    raise InvalidValue(
+        f"{key} = {value} changes the projection, and is not supported: calibrate with pictures "
+        f"as the camera gives them, and {key} {' or '.join(f'{a:g}' for a in allowed)}"
+    )
+
+
+def _check_region(found: _Found) -> None:
+    """Raise InvalidValue if the pictures are a part of those that were calibrated."""
+    for key, region in found.get("region", []):
+        if not isinstance(region, dict):
+            raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")
+        offset = region.get("x_offset", 0), region.get("y_offset", 0)
+        size = region.get("width", 0), region.get("height", 0)
+        whole = tuple(found[each][0][1] for each in ("width", "height") if each in found)
+        if offset != (0, 0) or size not in ((0, 0), whole):
+            raise InvalidValue(
+                f"{key} is a part of the picture, {size[0]}x{size[1]} px at {offset}: calibrate "
+                f"with pictures as the camera gives them"
+            )
+
+
+def _check_rms(found: _Found, width_px: int) -> None:
+    """Raise InvalidValue if the file itself says that it fits nothing."""
+    for key, value in found.get("rms", []):
+        if (_numbers(key, value) > _MAX_RMS_SHARE * width_px).any():
+            raise InvalidValue(
+                f"{key} = {value:g} px: the calibration misses its own pictures by more than "
+                f"{100 * _MAX_RMS_SHARE:g} % of their width, calibrate again"
+            )
+
+
+def _check_entries(found: _Found, K: NDArray[np.float64]) -> None:
+    """Raise InvalidValue if fx, fy, cx or cy stand beside another camera matrix (9,)."""
+    for entry, i in (("fx", 0), ("fy", 4), ("cx", 2), ("cy", 5)):
+        for key, value in found.get(entry, []):
+            if not np.allclose(_numbers(key, value), K[i]):
+                raise InvalidValue(
+                    f"{key} is {value} but the camera matrix has {K[i]:g}: keep the true one"
+                )
+
+
+def _size(found: _Found, form: Form) -> tuple[int, int]:
+    if "size" in found:
+        key, value = found["size"][0]
+        numbers = _numbers(key, value)
+        if numbers.size != 2:
+            raise InvalidValue(f"{key} needs width and height, found {numbers.size} numbers")
+        return _pixels(key, numbers[0]), _pixels(key, numbers[1])
+    if not {"width", "height"} <= found.keys():
+        raise InvalidValue(
+            f"the image size is missing in this {form.name}: add {form.read['width'][0]} and "
+            f"{form.read['height'][0]}, in px, of the pictures that the camera was calibrated with"
+        )
+    width, height = (_pixels(*found[each][0]) for each in ("width", "height"))
+    return width, height
+
+
+def _pixels(key: str, value: Any) -> int:
+    number = _numbers(key, value)
+    if number.size != 1 or number[0] < 1 or number[0] != np.floor(number[0]):
+        raise InvalidValue(f"{key} must be a whole number of pixels, found {value}")
+    return int(number[0])
+
+
+def _named_lens(found: _Found) -> str | None:
+    """The model that the file names; None if it names none."""
+    named: dict[str, str] = {}
+    for key, value in found.get("lens", []):
+        name = re.sub(r"[\s-]+", "_", str(value or "").strip().lower())
+        if not name:
+            raise InvalidValue(f"{key} is empty: the camera was not calibrated")
+        if name == "pinhole":
+            continue  # the projection; the distortion has a key of its own, or stays unnamed
+        if name not in _LENSES:
+            raise InvalidValue(f"{key} {value!r} is unknown; allowed are {', '.join(_LENSES)}")
+        named[key] = _LENSES[name]
+    for key, value in found.get("fisheye", []):
+        if _numbers(key, value).any():
+            named[key] = "fisheye"
+        elif "fisheye" in named.values():
+            named[key] = "no fisheye"
+    if len(set(named.values())) > 1:
+        raise InvalidValue(f"{' and '.join(named)} name different lenses: keep the true one")
+    return next(iter(named.values()), None)
+
+
+def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float64]]:
+    """The lens model and its coefficients: as many as it has, without the zeros behind them."""
+    key, value = found["distortion"][0]
+    given = _numbers(key, value)
+    model = named
+    if model is None:
+        if given.size == 4 and "fisheye" not in found:  # OpenCV writes that key as 0 or 1
+            raise InvalidValue(
+                f"{key} has 4 numbers, which plumb_bob and fisheye both have: add "
+                f"distortion_model with plumb_bob or equidistant"
+            )
+        model = "plumb_bob" if given.size < 8 else "rational_polynomial"
+    counts = _COEFFICIENTS[model]
+    kept = given
+    while kept.size > counts[-1] and kept[-1] == 0.0:
+        kept = kept[:-1]
+    if model == "rational_polynomial" and kept.size in _COEFFICIENTS["plumb_bob"]:
+        return "plumb_bob", kept  # the further ones are 0
+    if kept.size in counts:
+        return model, kept
+    if given.size in _OPENCV_LONG and model != "fisheye":
+        raise InvalidValue(
+            f"{key} has {given.size} numbers, which describe a thin prism or a tilted sensor: that "
+            f"is not supported, calibrate with 5 or 8"
+        )
+    raise InvalidValue(
+        f"{model} needs {' or '.join(map(str, counts))} distortion coefficients, found {given.size}"
+    )
+
+
+def _numbers(key: str, value: Any) -> NDArray[np.float64]:
+    """The numbers of a matrix, (n,): of its ``data``, of a list, or of a list of rows."""
+    data = value.get("data") if isinstance(value, dict) else value
+    try:
+        numbers = np.array([] if data is None else data, dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidValue(f"a value of {key} is not a number: {clip_text(str(data))}") from None
+    if not np.isfinite(numbers).all():
+        raise InvalidValue(f"{key} holds NaN or infinity")
+    return numbers
