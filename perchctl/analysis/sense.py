@@ -146,7 +146,13 @@ def replay_inputs(
     with _one_thread():
         for turn in turns:
             given.turn(turn)
-            inputs.poll_inputs(turn.began_s, search=turn.taken.look)
+            taken = turn.taken
+            inputs.poll_inputs(
+                turn.began_s,
+                search=taken.look,
+                sends_sights=taken.sends_sights,
+                drops_sightings=taken.drops_sightings,
+            )
             if turn.t_s != turn.began_s:
                 inputs.catch_up(turn.began_s, turn.t_s)
             yield ReplayedInputs(turn, inputs.poses, _observed(turn, inputs))

@@ -62,6 +62,7 @@ class FlightInputs:
         "turned_rad",
         "disagreeing_frames",
         "delay_s",
+        "delay_sigma_s",
         "target_refused",
         "imu",
         "felt",
@@ -80,7 +81,7 @@ class FlightInputs:
     perception: Perception = field(init=False)
     # Hands the vehicle's places to `send`, where the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
-    sends_sights: bool = True  # until the way down goes on without them
+    sends_sights: bool = True
     output: PipelineOutput | None = None  # of this tick's frame, if it was searched
     taken: TurnInputs = field(default_factory=TurnInputs)  # in this tick
     is_blind: bool = False
@@ -99,10 +100,26 @@ class FlightInputs:
     def history(self) -> History:
         return self.perception.history
 
-    def poll_inputs(self, now_s: float, *, search: bool = True) -> None:
-        """Read telemetry and at most one frame; without `search` the frame is not searched for the
-        target, and only shows that the camera works."""
+    def poll_inputs(
+        self,
+        now_s: float,
+        *,
+        search: bool = True,
+        sends_sights: bool = True,
+        drops_sightings: bool = False,
+    ) -> None:
+        """Read telemetry and at most one frame.
+
+        Args:
+            search: look for the target; otherwise the frame only shows that the camera works.
+            sends_sights: send the positions that the target gives, where it is the positioning
+                system; False once the way down goes on without them.
+            drops_sightings: forget the sights from which the vehicle's motion is estimated.
+        """
+        self.sends_sights = sends_sights
         perception, positioning = self.perception, self._positioning
+        if drops_sightings:
+            perception.drop_sightings()
         samples = self.link.telemetry()
         perception.history = add_samples(self.history, samples, self.profile.safety)
         if positioning is not None:
@@ -121,6 +138,8 @@ class FlightInputs:
             ended=self.source.finished,
             live=self.source.live,
             look=search,
+            sends_sights=sends_sights,
+            drops_sightings=drops_sightings,
         )
         used_s = perception.calibration.applied_delay_s
         if frame is not None and used_s:
@@ -180,6 +199,7 @@ class FlightInputs:
             turned_rad=self.history.turned_rad,
             disagreeing_frames=perception.state.disagreeing_frames,
             delay_s=perception.calibration.applied_delay_s,
+            delay_sigma_s=perception.latency_sigma_s,
             target_refused=perception.refused,
             imu=self.history.imu,
             felt=perception.motion.motion,

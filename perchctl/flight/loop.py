@@ -196,13 +196,19 @@ def _mission(
     due_s = clock.now()
     state: PlannerState | None = None
     passed: list[Event] = []
-    redone = log_noted = False
+    redone = log_noted = drops_sightings = False
     logged = inputs.perception.calibration.newest
     while True:
         began_s = now_s = clock.now()
         turns.begin_turn(began_s)
-        # Against the ceiling the picture shows no target and steers nothing.
-        inputs.poll_inputs(began_s, search=state is None or state.phase is not Phase.COMPLETE)
+        inputs.poll_inputs(
+            began_s,
+            # Against the ceiling the picture shows no target and steers nothing.
+            search=state is None or state.phase is not Phase.COMPLETE,
+            sends_sights=state is None or state.blind_s is None,
+            drops_sightings=drops_sightings,
+        )
+        drops_sightings = False
         if clock.now() - began_s > HUNG_S:  # a setpoint for the time before the hang is stale
             now_s = clock.now()
             inputs.catch_up(began_s, now_s)
@@ -222,10 +228,9 @@ def _mission(
         if not isinstance(command, Idle):
             parts.link.send(command)
         watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
-        inputs.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
-            inputs.perception.drop_sightings()
+            drops_sightings = True
         events = Event.of_tick(before, state, obs, parts.profile)
         notes = [*parts.remarks()]
         if obs.log_problem is not None and not log_noted:

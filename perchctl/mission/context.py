@@ -12,7 +12,13 @@ from perchctl.values import replace
 
 FAR_BELOW_M = 0.5
 PUT_RIGHT_S = 0.5  # the estimate is drawn back to new positions for so long
-CORRECTED_S, BLOWN_MPS = 0.2, 0.2  # 0.06 m/s in flights without a fault
+CORRECTED_S = 0.13
+"""Positions by pictures correct the estimate while the newest is at most so much older than the
+camera's latency: three pictures at 30 a second. Larger: a blow counts later."""
+BLOWN_MPS = 0.2  # 0.06 m/s in flights without a fault
+SWINGS_BY_LATENCY = 2.0
+"""Speed in m/s that the estimate misses for each second of the latency's sigma: by 0.1 s that
+pictures are later than assumed a vehicle swings. Larger: a blow by unknown latency counts less."""
 ANSWER_S = 0.2  # within it the telemetry shows an ordered raw thrust
 HANGING_S = 1.0  # to prove the magnet
 
@@ -40,6 +46,7 @@ class Context:
         located: the estimated position and speed are believed: positions have come for a while,
             and fit the accelerometer if they are from pictures; `placed`: located,
             and the telemetry `proves`.
+        is_corrected: positions come, and correct the estimated velocity.
         is_blown: after a blow or gust that only the accelerometer has measured, until a sight
             corrects the estimate: the firmware's estimator ignores sideways forces.
         climb_mps: vertical speed, by the estimate where that is believed and fresh, else by the
@@ -91,10 +98,14 @@ class Context:
         just_again = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
         self.located = not (doubted or self.position_is_stale or just_again)
         self.placed = self.located and self.proves
-        reckoning, (x_mps, y_mps, climb_mps) = state.reckoning, tel.velocity_mps
-        is_reckoned, (rx_mps, ry_mps, _) = reckoning.imu is not None, reckoning.velocity_mps
-        uncorrected = self.by_sight and is_reckoned and self.position_age_s > CORRECTED_S
-        self.is_blown = uncorrected and math.hypot(rx_mps - x_mps, ry_mps - y_mps) > BLOWN_MPS
+        reckoning, climb_mps = state.reckoning, tel.velocity_mps[2]
+        is_reckoned = reckoning.imu is not None
+        # On its arrival a frame is as old as the camera's latency.
+        latency_s = profile.camera.start_latency_s + obs.delay_s
+        self.is_corrected = self.position_age_s <= latency_s + CORRECTED_S
+        uncorrected = self.by_sight and is_reckoned and not self.is_corrected
+        blown_mps = BLOWN_MPS + SWINGS_BY_LATENCY * obs.delay_sigma_s
+        self.is_blown = uncorrected and math.hypot(*reckoning.missed_mps) > blown_mps
         by_imu = is_reckoned and (state.blind_s is not None or not self.placed)
         self.climb_mps = reckoning.velocity_mps[2] if by_imu else climb_mps
         self.contact_goal_z_m = math.inf
@@ -111,8 +122,6 @@ class Context:
             if target.world_m is not None:
                 gear_z_m = profile.vehicle.gear_body_m[2]
                 self.contact_goal_z_m = float(target.world_m[2]) - gear_z_m
-            # On its arrival a frame is as old as the camera's latency.
-            latency_s = profile.camera.start_latency_s + obs.delay_s
             limit_s = ascend.fresh_s + latency_s
             self.fresh = target.tracked and self.target_age_s <= limit_s
             self.small_is_fresh = obs.t_s - target.small_measured_s <= limit_s

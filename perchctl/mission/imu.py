@@ -39,6 +39,9 @@ MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5  # more is a blow, or a correction of
 CLIMB_SPARE_MPS = 0.1  # it may climb faster than reckoned
 MOST_CLIMB_MPS = 1.0  # in a silence, by the position mode's own limit
 REACH_M = 0.04  # a gear so near below the target may have been caught by its magnet
+MISSED_MEMORY_S = 1.0
+"""In so long positions correct a speed that the estimate has missed. Larger: what a wrong attitude
+adds in seconds looks like a blow. Smaller: a blow just before the last sight is forgotten."""
 BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.06, 1.5
 """A push from the side shows in the estimate a second or two later."""
 PUSH_MEMORY_S = 0.05  # turning motors shake single samples by as much as a push gives
@@ -346,6 +349,7 @@ class DeadReckoning:
     bias_mps2: Vector = ZERO  # excess of accelerometer and attitude
     estimated_mps: Vector = ZERO
     beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
+    missed_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the accelerometer alone
     below_m: float = math.inf  # gear below the target; inf if unseen or fallen
     nearest_m: float = math.inf  # the same with a climb in silences; a fall only adds to it
     unsure_s: float = -math.inf  # end of the newest silence that may have led to the magnet
@@ -358,10 +362,17 @@ class DeadReckoning:
 
 
 def advance_reckoning(
-    old: DeadReckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
+    old: DeadReckoning,
+    imu: ImuMotion,
+    sample: Telemetry,
+    *,
+    believed: bool,
+    astray: bool = False,
+    corrected: bool = False,
 ) -> DeadReckoning:
     """The reckoning one tick later.
 
+    `corrected`: positions have come lately, and correct the estimated velocity;
     `believed`: the sample's estimated velocity is true; `astray`: that velocity may be in other
     axes, so the reckoned velocity is kept even after a silence.
     """
@@ -385,7 +396,12 @@ def advance_reckoning(
             )
             velocity_mps = (vx, vy, vz)
         unknown = replace(
-            old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated, beside_mps=(0.0, 0.0)
+            old,
+            imu=imu,
+            velocity_mps=velocity_mps,
+            estimated_mps=estimated,
+            beside_mps=(0.0, 0.0),
+            missed_mps=(0.0, 0.0),
         )
         if old.imu is not None and imu.silent_s > old.imu.t_s:
             # Not with motors that were off around the silence, nor started anew.
@@ -407,12 +423,16 @@ def advance_reckoning(
     dt_s = imu.t_s - old.imu.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias, beside = [], [], [0.0, 0.0]
+    velocity, bias, beside, missed = [], [], [0.0, 0.0], [0.0, 0.0]
+    remembers = math.exp(-dt_s / MISSED_MEMORY_S) if corrected else 1.0
     keeps = math.exp(-dt_s / BESIDE_MEMORY_S)
     calm = believed and imu.t_s - imu.pushed_s > PUSHED_S
     for i in range(3):
         gained = imu.velocity_mps[i] - old.imu.velocity_mps[i]
         v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
+        if i < 2:
+            alone = gained - b * dt_s - (estimated[i] - old.estimated_mps[i])
+            missed[i] = remembers * old.missed_mps[i] + alone
         if believed:
             v += (estimated[i] - v) * min(1.0, dt_s / SPEED_MEMORY_S)
             wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
@@ -437,6 +457,7 @@ def advance_reckoning(
         bias_mps2=(bias[0], bias[1], bias[2]),
         estimated_mps=estimated,
         beside_mps=(beside[0], beside[1]),
+        missed_mps=(missed[0], missed[1]),
         below_m=math.inf if fell else old.below_m - (vz + CLIMB_SPARE_MPS) * dt_s,
         nearest_m=old.nearest_m - vz * dt_s,
         aside_m=(ex - vx * dt_s, ey - vy * dt_s),

@@ -331,7 +331,12 @@ def _reckon(c: Context) -> PlannerState:
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     astray = state.astray and not c.by_sight
     new = advance_reckoning(
-        state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray
+        state.reckoning,
+        obs.imu,
+        obs.telemetry,
+        believed=believed,
+        astray=astray,
+        corrected=c.is_corrected,
     )
     if c.located and not c.by_sight and state.last is not None:
         new = add_position_step(new, state.last, obs.telemetry)

@@ -118,7 +118,9 @@ class FrameRecord:
 @dataclass(frozen=True)
 class TurnInputs:
     """The samples that the link, and the frame that the camera gave in one turn. `late`: samples
-    that came while camera or vision hung; `look`: the frame was to be searched."""
+    that came while camera or vision hung; `look`: the frame was to be searched; `sends_sights`: the
+    target's sights were the vehicle's position; `drops_sightings`: the sights before this turn were
+    forgotten, since positions had led astray."""
 
     samples: tuple[Telemetry, ...] = ()  # in the order in which they came
     late: tuple[Telemetry, ...] = ()  # those that came while camera or vision hung
@@ -126,7 +128,9 @@ class TurnInputs:
     problem: str | None = None  # problem, ended, live: the source's own
     ended: bool = False
     live: bool = True
-    look: bool = True  # the frame was to be searched
+    look: bool = True
+    sends_sights: bool = True
+    drops_sightings: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,6 +173,7 @@ class Observation:
     operator: Operator = Operator.NONE
     log_problem: str | None = None  #: the flight log cannot be written
     delay_s: float = 0.0  #: off the frames' times beyond the profile's latency (`measured`)
+    delay_sigma_s: float = 0.0  #: standard deviation of the latency (`measured`); 0 if it is given
     target_refused: str | None = None  #: why the last target seen is another vehicle's
     position_age_s: float = 0.0  #: of the newest external position sent; 0 where decks measure
     position_problem: str | None = None  #: why none is sent; None while they are

@@ -42,6 +42,7 @@ from perchctl.mission.state import (
     Phase,
     Severity,
 )
+from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, FRESH_S, LOCKED, TUMBLED, EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
@@ -84,6 +85,9 @@ BEFORE_COMPLETION = BY_CAMERA | {P.PERCH}
 KNOCKED_S = 0.04  # more than one sample of telemetry
 LIFTED_M, SIDEWAYS_M = 0.05, 0.12
 LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
+ASIDE_BY_LATENCY_MPS = 4.0
+"""How far aside a take-off by the target may run for each second of the latency's sigma: by 0.1 s
+that pictures are later than assumed, up to 0.2 m. Larger: a turned camera leads farther away."""
 ABOVE_START_M = 0.1
 OTHERWISE_S, BELOW_S, WEAK_S, UNSTOPPED_S = 0.1, 0.3, 2.0, 10.0
 SWINGS_MPS = 0.5  # only swings of position control sink so fast
@@ -109,8 +113,9 @@ def is_astray(c: Context) -> bool:
     if phase is P.LANDING:
         touched = c.state.contact_z_m is not None or c.state.stopped_s is not None
         return not touched and _away_m(c) > ASTRAY_LANDING_M
+    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s
     if phase is P.APPROACH and c.height_m < LIFTED_M:
-        return _away_m(c) > SIDEWAYS_M
+        return _away_m(c) > SIDEWAYS_M + spare_m
     ground = c.state.ground_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < ABOVE_START_M
@@ -118,7 +123,7 @@ def is_astray(c: Context) -> bool:
     only_climbs = above_start and phase in (P.APPROACH, P.SEARCH, P.ESTIMATE)
     is_pushed = c.obs.imu.t_s - c.obs.imu.pushed_s <= PUSHED_S  # by moving air
     stays = c.height_m < LOW_M or (only_climbs and not is_pushed)
-    return _away_m(c) > (ASTRAY_LOW_M if stays else ASTRAY_M)
+    return _away_m(c) > (ASTRAY_LOW_M + spare_m if stays else ASTRAY_M)
 
 
 def _swings(c: Context) -> bool:
@@ -177,11 +182,16 @@ def is_outside_fence(c: Context) -> bool:
 
 
 def latency_reason(c: Context) -> str:
-    assumed_s = c.profile.camera.start_latency_s + c.obs.delay_s
-    return (
-        f"the pictures are {1e3 * (assumed_s + c.mismatch.later_s):.0f} ms old, not "
-        f"{1e3 * assumed_s:.0f} as camera.latency_s has it: find what delays them"
-    )
+    camera = c.profile.camera
+    assumed_s = camera.start_latency_s + c.obs.delay_s
+    found = f"the pictures are {1e3 * (assumed_s + c.mismatch.later_s):.0f} ms old"
+    if isinstance(camera.latency_s, str):
+        least_s, most_s = USED_LATENCY_S
+        return (
+            f"{found}; a measured latency (camera.latency_s) can be {1e3 * least_s:.0f} to "
+            f"{1e3 * most_s:.0f} ms: find what delays them"
+        )
+    return f"{found}, not {1e3 * assumed_s:.0f} as camera.latency_s says: find what delays them"
 
 
 def is_mounting_wrong(c: Context) -> bool:

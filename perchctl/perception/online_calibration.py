@@ -15,7 +15,7 @@ import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.perception.history import History, attitude_at, velocity_at
-from perchctl.profile import USED_LATENCY_S, CameraConfig
+from perchctl.profile import USED_LATENCY_S
 from perchctl.values import replace
 from perchctl.vision import Attitude, CameraErrors, MarkerPose, PoseSetup
 
@@ -26,6 +26,13 @@ USED_SIGMA_S = 0.008
 """A delay that is less sure is not used: 30 ms make an alignment swing."""
 SLEW = 0.02
 """Seconds a second: at 0.4 m/s the target moves by 8 mm/s, as a drift does."""
+FAST_SLEW = 0.5
+"""The same while pictures and accelerometer agree on quite another latency: below 1, or the
+pictures' times would go back. Smaller: a vehicle swings for longer by positions that are late."""
+CHANGED_S = 0.05
+"""A latency that differs from a sure estimate by more has changed in flight."""
+UNKNOWN_SIGMA_S = (USED_LATENCY_S[1] - USED_LATENCY_S[0]) / math.sqrt(12.0)
+"""Standard deviation of a latency that may be anywhere in `USED_LATENCY_S`."""
 LONGEST_STEP_S = 0.1
 
 
@@ -34,13 +41,15 @@ class OnlineCalibration:
     """Estimate of the camera's latency and mounting from pictures and telemetry.
 
     `newest` is the solution of `sums` at `solved_s`; `applied_delay_s` is the latency beyond the
-    profile's that is subtracted from the pictures' times, since the picture of `last_picture_s`.
+    profile's that is subtracted from the pictures' times, since the picture of `last_picture_s`;
+    `coarse_delay_s` is where a correction is taking it, None once it is there.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
     newest: CameraErrors | None = None
     solved_s: float = -math.inf
     applied_delay_s: float = 0.0
+    coarse_delay_s: float | None = None
     last_picture_s: float = -math.inf
 
 
@@ -50,7 +59,6 @@ def update_calibration(
     pose: MarkerPose,
     history: History,
     setup: PoseSetup,
-    camera: CameraConfig,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
     """The estimate with one more picture in its sums, and once a second with the sums' solution.
@@ -71,15 +79,36 @@ def update_calibration(
         if t_s - old.solved_s >= SOLVE_EVERY_S:
             newest = solve_consistency(new.sums, attitude_sigma_rad)
             new = replace(new, newest=newest, solved_s=t_s)
-    if camera.latency_s != "measured":
-        return new
-    used_s = new.applied_delay_s
-    if new.newest is not None and new.newest.delay_sigma_s <= USED_SIGMA_S:
-        (least_s, most_s), start_s = USED_LATENCY_S, camera.start_latency_s
-        goal_s = max(least_s, min(most_s, start_s + new.newest.delay_s)) - start_s
-        step_s = SLEW * max(0.0, min(t_s - old.last_picture_s, LONGEST_STEP_S))
+    return new
+
+
+def apply_latency(
+    old: OnlineCalibration, t_s: float, start_latency_s: float, correction_s: float | None
+) -> OnlineCalibration:
+    """The calibration with the latency that the next picture's time is corrected by, for
+    `camera.latency_s: measured`; `t_s` as in `update_calibration`.
+
+    `correction_s`, quite another latency by the accelerometer
+    (`VisualInertialWindow.correction_s`), is taken over within half a second: the sums need
+    seconds, and in these a vehicle that flies by the target alone swings. A sure solution of the
+    sums, which is finer, is followed slowly. Sums that contradict the correction are of an earlier
+    latency, and begin anew.
+    """
+    new, coarse_s, found = old, old.coarse_delay_s, old.newest
+    sure_s = found.delay_s if found is not None and found.delay_sigma_s <= USED_SIGMA_S else None
+    if correction_s is not None:
+        coarse_s = correction_s
+        if sure_s is not None and abs(sure_s - correction_s) > CHANGED_S:
+            new = replace(new, sums=ConsistencySums(), newest=None)
+    delay_s, slew = (sure_s, SLEW) if coarse_s is None else (coarse_s, FAST_SLEW)
+    used_s = old.applied_delay_s
+    if delay_s is not None:
+        least_s, most_s = USED_LATENCY_S
+        goal_s = max(least_s, min(most_s, start_latency_s + delay_s)) - start_latency_s
+        step_s = slew * max(0.0, min(t_s - old.last_picture_s, LONGEST_STEP_S))
         used_s += max(-step_s, min(step_s, goal_s - used_s))
-    return replace(new, last_picture_s=t_s, applied_delay_s=used_s)
+        coarse_s = None if used_s == goal_s else coarse_s
+    return replace(new, last_picture_s=t_s, applied_delay_s=used_s, coarse_delay_s=coarse_s)
 
 
 # --- What a flight tells about the latency and the mounting ---

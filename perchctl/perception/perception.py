@@ -14,16 +14,19 @@ from dataclasses import dataclass, field
 from perchctl.camera import FrameHealth
 from perchctl.perception.history import History, attitude_at
 from perchctl.perception.online_calibration import (
+    UNKNOWN_SIGMA_S,
     OnlineCalibration,
+    apply_latency,
     solve_consistency,
     update_calibration,
 )
 from perchctl.perception.visual_inertial import (
+    MeasuredLatency,
     VisualInertialWindow,
     drop_sightings,
     estimate_motion,
 )
-from perchctl.profile import Profile
+from perchctl.profile import USED_LATENCY_S, Profile
 from perchctl.vision import (
     Attitude,
     CameraErrors,
@@ -103,6 +106,14 @@ class Perception:
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
+    @property
+    def latency_sigma_s(self) -> float:
+        """Standard deviation of the latency in use; 0 for one that the profile gives."""
+        newest = self.calibration.newest
+        if self._measured_latency is None:
+            return 0.0
+        return UNKNOWN_SIGMA_S if newest is None else newest.delay_sigma_s
+
     def camera_errors(self) -> CameraErrors | None:
         """Errors of latency and mounting by all pictures so far; None after too few pictures."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
@@ -112,24 +123,45 @@ class Perception:
         self.motion = drop_sightings(self.motion)
 
     def _calibrate(self, output: PipelineOutput, applied_delay_s: float) -> None:
-        pose = self.state.measured.surest
-        if pose is not None and pose.t_s == output.detections.t_s:
+        pose, t_s = self.state.measured.surest, output.detections.t_s + applied_delay_s
+        if pose is None:
+            return
+        measured = self._measured_latency
+        if pose.t_s == output.detections.t_s:
             T_body_cam, history = self.pipeline.pose.T_body_cam, self.history
             x_m, y_m, z_m = (T_body_cam[:3, :3] @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
             self.motion = estimate_motion(
-                self.motion, pose.t_s, (x_m, y_m, z_m), history.samples, history.imu.offset_g
+                self.motion,
+                t_s,
+                (x_m, y_m, z_m),
+                history.samples,
+                history.imu.offset_g,
+                measured,
             )
-        if pose is None or output.target is None or not output.target.measured:
-            return
-        self.calibration = update_calibration(
-            self.calibration,
-            output.detections.t_s + applied_delay_s,
-            pose,
-            self.history,
-            self.pipeline.pose,
-            self.profile.camera,
-            self._attitude_sigma_rad,
-        )
+        if output.target is not None and output.target.measured:
+            self.calibration = update_calibration(
+                self.calibration,
+                t_s,
+                pose,
+                self.history,
+                self.pipeline.pose,
+                self._attitude_sigma_rad,
+            )
+        if measured is not None:
+            start_s = self.profile.camera.start_latency_s
+            self.calibration = apply_latency(
+                self.calibration, t_s, start_s, self.motion.correction_s
+            )
+
+    @property
+    def _measured_latency(self) -> MeasuredLatency | None:
+        """The latency in use where the flight measures it, else None."""
+        camera, (least_s, most_s) = self.profile.camera, USED_LATENCY_S
+        if camera.latency_s != "measured":
+            return None
+        start_s = camera.start_latency_s
+        in_use_s = self.calibration.applied_delay_s
+        return MeasuredLatency(in_use_s, least_s - start_s, most_s - start_s)
 
     @property
     def _attitude_sigma_rad(self) -> float:

@@ -101,8 +101,11 @@ def _eighths(angle: float) -> int:
 
 
 MOST_LATENCY_S = 1.0
-START_LATENCY_S = 0.07
-"""Where a flight begins that measures it: most cameras are 60 to 100 ms late."""
+USUAL_LATENCY_S = 0.07
+"""Most cameras are 60 to 100 ms late."""
+START_LATENCY_S = 0.1
+"""Where a flight begins that measures its latency: in the middle of what it can use, so that
+until it knows more, positions are at most 0.1 s newer or older than they are taken for."""
 USED_LATENCY_S = (0.02, 0.2)
 """What such a flight uses: no camera takes less; later pictures are not to be steered by."""
 
@@ -120,7 +123,7 @@ class CameraConfig(Section):
     )
     cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
     latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = key(
-        START_LATENCY_S, "time from exposure to arrival; `measured`: each flight measures it"
+        USUAL_LATENCY_S, "time from exposure to arrival; `measured`: each flight measures it"
     )
     mount: Mounting = Mounting()
     start_timeout_s: float = key(8.0, "longest wait for the first good picture", gt=0, le=60)

@@ -150,6 +150,21 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         assert flight.command.roll_rad * aside_g >= -1e-3
 
 
+@given(later_s=st.floats(0.0, 0.13), lost=st.integers(0, 2))
+def test_pictures_that_come_late_are_no_blow(later_s: float, lost: int) -> None:
+    """At ten pictures a second the newest sight is as old as the latency and a tenth of a second,
+    and older where one is lost: what the accelerometer adds up meanwhile is a wrong attitude."""
+    period_s = 0.1 * (1 + lost)
+    slow = {"acc_x_g": 0.02}
+
+    def look(t_s: float) -> Observation:
+        age_s = 0.07 + later_s + (t_s - BEGIN_S) % period_s
+        return at(obs={"position_age_s": age_s, "delay_s": later_s}, **slow)(t_s)
+
+    flight = fly(state_in(Phase.ALIGN), look, 3.0, PROFILE, feels=True, one_phase=True)
+    assert flight.state.phase is not Phase.LANDING
+
+
 def test_a_landing_that_loses_it_goes_on_blindly() -> None:
     ordered = at(obs={"operator": Operator.LAND})
     state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
@@ -170,7 +185,9 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     state = replace(
         state_in(Phase.LANDING, z_m=1.9), contact_z_m=1.9, released_s=BEGIN_S - 1.0,
         reach_s=BEGIN_S - 6.0, blind_s=BEGIN_S - 3.0,
-        reckoning=DeadReckoning(imu=imu, velocity_mps=(x_mps, y_mps, -0.5)),
+        reckoning=DeadReckoning(
+            imu=imu, velocity_mps=(x_mps, y_mps, -0.5), missed_mps=(x_mps, y_mps)
+        ),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
     obs = replace(falls(BEGIN_S + TICK_S), imu=replace(imu, t_s=BEGIN_S + TICK_S))

@@ -11,14 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
+from perchctl.mission import Mismatch
 from perchctl.perception.visual_inertial import (
+    BEYOND_S,
     LEAST_LATER_S,
+    MEASURED_LATER_S,
     STEP_S,
+    MeasuredLatency,
     VisualInertialWindow,
     estimate_motion,
 )
 from perchctl.vehicle import Telemetry
 
+LEAST_S, MOST_S = -0.08, 0.1  # of a latency that the flight measures
 TARGET_M = np.array([0.3, -0.2, 1.9])
 RATE_HZ, FLOWN_S = 30.0, 1.5
 LATENCY_S = 0.2  # so much newer is the telemetry than the exposure is taken to be
@@ -70,18 +75,24 @@ class Swing:
 
 
 def watched(
-    swing: Swing, *, later_s: float = 0.0, turned_rad: float = 0.0, offset_g: float = 0.0
+    swing: Swing,
+    *,
+    later_s: float = 0.0,
+    turned_rad: float = 0.0,
+    offset_g: float = 0.0,
+    rate_hz: float = RATE_HZ,
+    measured: MeasuredLatency | None = None,
 ) -> VisualInertialWindow:
     rng = np.random.default_rng(0)
     watch = VisualInertialWindow()
     flown = [swing.sample(0.01 * k, offset_g) for k in range(int((FLOWN_S + 2.2) * 100) + 1)]
-    for i in range(int(FLOWN_S * RATE_HZ)):
-        t_s = 2.0 + i / RATE_HZ
+    for i in range(int(FLOWN_S * rate_hz)):
+        t_s = 2.0 + i / rate_hz
         newest = int((t_s + LATENCY_S) * 100.0)
         samples = tuple(flown[newest - 200 : newest + 1])
         x, y, z = swing.way_m(t_s - later_s, turned_rad)
         x, y = x + float(rng.normal(0.0, 1e-3)), y + float(rng.normal(0.0, 1e-3))
-        watch = estimate_motion(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0))
+        watch = estimate_motion(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0), measured)
     return watch
 
 
@@ -104,6 +115,43 @@ def test_a_delay_is_found_and_the_speed_with_it(
     *true_mps, true_climb_mps = swing.velocity_mps(motion.t_s)
     assert motion.velocity_mps == pytest.approx(true_mps, abs=0.05)
     assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.05)
+
+
+@given(
+    later_s=st.floats(LEAST_S, MOST_S),
+    in_use_s=st.floats(LEAST_S, MOST_S),
+    rate_hz=st.sampled_from([10.0, 30.0]),
+    size_m=st.floats(0.03, 0.06),
+    heading_rad=st.floats(-3.0, 3.0),
+)
+def test_an_error_of_a_measured_latency_is_found_and_ends_when_it_is_corrected(
+    later_s: float, in_use_s: float, rate_hz: float, size_m: float, heading_rad: float
+) -> None:
+    """To 10 ms, which is half of the grid, also at ten pictures a second."""
+    swing = Swing(size_m, heading_rad=heading_rad)
+    measured = MeasuredLatency(in_use_s, LEAST_S, MOST_S)
+    watch = watched(swing, later_s=later_s, rate_hz=rate_hz, measured=measured)
+    off_s = abs(later_s - in_use_s)
+    assert watch.mismatch is None
+    if off_s > MEASURED_LATER_S + 2.0 * STEP_S:
+        assert watch.correction_s == pytest.approx(later_s, abs=0.01)
+    elif off_s < MEASURED_LATER_S - STEP_S / 2.0:
+        assert watch.correction_s is None
+
+
+@given(later_s=st.floats(MOST_S + BEYOND_S + STEP_S, 0.4), in_use_s=st.floats(-0.08, 0.1))
+def test_a_latency_that_cannot_be_measured_is_the_planner_s_matter(
+    later_s: float, in_use_s: float
+) -> None:
+    """And so is a camera that is turned."""
+    measured = MeasuredLatency(in_use_s, LEAST_S, MOST_S)
+    watch = watched(Swing(0.05), later_s=later_s, measured=measured)
+    assert watch.correction_s is None
+    assert watch.mismatch is not None
+    assert watch.mismatch.later_s == pytest.approx(later_s - in_use_s, abs=0.02)
+    turned = watched(Swing(0.05), later_s=in_use_s, turned_rad=math.pi, measured=measured)
+    assert turned.correction_s is None
+    assert turned.mismatch == Mismatch(0.0, math.pi)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, -1])

@@ -133,7 +133,7 @@ def test_a_latency_is_a_time_or_measured(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("camera: {latency_s: measured}")
     camera = load_profile(str(path)).camera
-    assert (camera.latency_s, camera.start_latency_s) == ("measured", 0.07)
+    assert (camera.latency_s, camera.start_latency_s) == ("measured", 0.1)
     assert camera.model_validate(camera.model_dump(mode="json")) == camera
     path.write_text("camera: {latency_s: 0.05}")
     assert load_profile(str(path)).camera.start_latency_s == 0.05

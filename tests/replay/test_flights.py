@@ -10,6 +10,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import replay
 from perchctl.analysis.replayer import Replay
+from perchctl.campaign import seed_log_path
 from perchctl.campaign.flights import fly_seed
 from perchctl.faults import FAULTS, fly_fault_in_folder
 from perchctl.profile import apply_settings
@@ -66,6 +67,24 @@ def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
     found = replay(log, recorded_pictures(path), nearer)
     assert found.changed_keys == ("vehicle.gear_body_m",)
     assert found.differences[0].field.startswith(("command.", "phase"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("positioning", "fault", "seed"),
+    [("target", "target-covered", 5), ("mocap", "external-mirrored", 2)],
+)
+def test_a_landing_without_positions_is_seen_again(
+    tmp_path: Path, positioning: str, fault: str, seed: int
+) -> None:
+    """From when on the sights are not sent, and whether earlier ones were forgotten, decides what
+    the planner is shown: both are in the log."""
+    profile = apply_settings(short_profile(), [f"positioning.by={positioning}"])
+    fly_fault_in_folder(profile, (fault,), tmp_path, True, seed)
+    path = seed_log_path(seed, tmp_path)
+    log = read_log(path)
+    assert any(not turn.taken.sends_sights or turn.taken.drops_sightings for turn in log.turns)
+    check_seen(replay(log, recorded_pictures(path)))
 
 
 @pytest.mark.campaign
