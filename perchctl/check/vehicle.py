@@ -160,14 +160,15 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
     if profile.positioning.by != "deck" and not vehicle.position_decks(profile):
         return skipped(BY_FLY)
-    problem = GroundCriteria(t, profile).estimate_unsettled
+    criteria = GroundCriteria(t, profile, vehicle.decks)
+    problem = criteria.estimate_unsettled
     if problem is not None:
         return failed(problem.found, "is there a positioning system? wait a little")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
-    if t.position_variance_m2 is None:
+    if t.velocity_variance_m2ps2 is None:
         return skipped("its variance is not logged")
-    found = f"variance {t.position_variance_m2:.2g} m^2"
+    found = f"variance {', '.join(each.text for each in criteria.variances)}"
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
         return warned(f"{ESTIMATOR} {kind:g} has no position", advice)

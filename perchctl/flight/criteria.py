@@ -23,6 +23,7 @@ from perchctl.geometry import (
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import (
+    ABSOLUTE_DECKS,
     CAN_FLY,
     CRASHED,
     DECK_FAULT,
@@ -66,11 +67,30 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Variance:
+    """A variance that the vehicle's estimator claims (None: it reports none) for `what`, in `unit`,
+    and the `most` with which it may take off."""
+
+    what: str
+    value: float | None
+    most: float
+    unit: str
+
+    @property
+    def text(self) -> str:
+        return (
+            f"of {self.what} {'unknown' if self.value is None else f'{self.value:.2g}'} {self.unit}"
+        )
+
+
+@dataclass(frozen=True)
 class GroundCriteria:
-    """Criteria for a vehicle at rest; each returns the problem that it finds, or None."""
+    """Criteria for a vehicle at rest; each returns the problem that it finds, or None. `decks`: the
+    vehicle's, by the firmware's names."""
 
     telemetry: Telemetry
     profile: Profile
+    decks: Sequence[str] = ()
 
     @property
     def supervisor_fault(self) -> Problem | None:
@@ -106,17 +126,43 @@ class GroundCriteria:
         )
 
     @property
+    def variances(self) -> tuple[Variance, ...]:
+        """The variances by which the state estimate is judged (docs/firmware.md, "Variances").
+
+        The velocity's shows whether anything corrects the estimate, the position's whether anything
+        has placed it since the estimator last started. A Flow deck measures the height alone.
+        """
+        telemetry, safety = self.telemetry, self.profile.safety
+        is_placed = self.profile.positioning.by != "deck" or {*self.decks} & {*ABSOLUTE_DECKS}
+        return (
+            Variance(
+                what="velocity",
+                value=telemetry.velocity_variance_m2ps2,
+                most=safety.estimator_velocity_variance_m2ps2,
+                unit="(m/s)^2",
+            ),
+            Variance(
+                what="position" if is_placed else "height",
+                value=telemetry.position_variance_m2 if is_placed else telemetry.height_variance_m2,
+                most=safety.estimator_variance_m2,
+                unit="m^2",
+            ),
+        )
+
+    @property
     def estimate_unsettled(self) -> Problem | None:
-        """Problem: the variance of the state estimate is too large, or NaN."""
-        variance = self.telemetry.position_variance_m2
-        most = self.profile.safety.estimator_variance_m2
-        if variance is None or variance <= most:
-            return None
+        """Problem: a variance of the state estimate is too large, or NaN."""
         advice = "is there a positioning system?"
         if self.profile.positioning.by == "target":
             advice = "do the positions arrive, and does the target stay in view?"
-        found, allowed = distinct_texts(variance, most, 2)
-        return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
+        for each in self.variances:
+            if each.value is not None and not each.value <= each.most:
+                found, allowed = distinct_texts(each.value, each.most, 2)
+                return Problem(
+                    f"the {each.what}'s variance is {found} {each.unit}, at most {allowed} allowed",
+                    advice,
+                )
+        return None
 
     @property
     def off_ground(self) -> Problem | None:

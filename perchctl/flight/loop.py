@@ -137,6 +137,7 @@ def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
 
 def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnReporter) -> None:
     refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
+    decks = parts.link.decks()
     started_s, at_rest = parts.clock.now(), RestCheck()
     while True:
         now_s = parts.clock.now()
@@ -157,6 +158,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
             inputs.target(now_s),
             0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
             feed,
+            decks,
         )
         if parts.source.finished:
             raise NotFound(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -86,6 +86,7 @@ def still_waiting_for(
     target: TargetEstimate | None = None,
     telemetry_age_s: float = 0.0,
     feed: FeedStatus | None = None,
+    decks: Sequence[str] = (),
 ) -> str:
     """Return in words what take-off still waits for; empty when ready. Errors: TimedOut after too
     long a wait, SafetyAbort off the ground or too near to the target."""
@@ -94,7 +95,7 @@ def still_waiting_for(
         return _bounded("telemetry", waited_s, limit_s)
     if telemetry_age_s > profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {telemetry_age_s:.1f} s old)", waited_s, limit_s)
-    criteria = GroundCriteria(telemetry, profile)
+    criteria = GroundCriteria(telemetry, profile, decks)
     unsent = None if feed is None else unsent_problem(feed, profile)
     seen = None if feed is None else feed.measured
     waiting = _first(

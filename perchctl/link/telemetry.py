@@ -10,7 +10,7 @@ import math
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from perchctl.errors import NotFound, TimedOut
@@ -35,8 +35,11 @@ ATTITUDE_BLOCK: dict[str, str] = {
 BATTERY_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
 """Without it the battery is unknown, which the flight copes with (fault 7)."""
 
-VARIANCE_BLOCK = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
-"""Only where the Kalman estimator runs; a firmware without it is not refused."""
+POSITION_VARIANCES = tuple(f"kalman.var{axis}" for axis in "XYZ")
+VELOCITY_VARIANCES = tuple(f"kalman.varP{axis}" for axis in "XYZ")
+"""`P` is the filter's letter for the velocity, in body axes (docs/firmware.md, "Variances")."""
+VARIANCE_BLOCK = dict.fromkeys((*POSITION_VARIANCES, *VELOCITY_VARIANCES), "float")
+"""24 bytes; only where the firmware has the Kalman estimator."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
@@ -47,7 +50,6 @@ def telemetry_from_log(
     """Return telemetry from log variables by name; `behind_s` and `start` as in `Telemetry`.
     Raises KeyError when a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
-    variances = [values[name] for name in VARIANCE_BLOCK if name in values]
     return Telemetry(
         t_s=t_s,
         position_m=(x_m, y_m, z_m),
@@ -60,13 +62,24 @@ def telemetry_from_log(
         battery_v=values.get("pm.vbat", 0.0),
         supervisor=int(values["supervisor.info"]),
         battery_state=int(values.get("pm.state", 0)),
-        position_variance_m2=max(variances) if variances else None,
-        climb_variance_m2ps2=values.get("kalman.varPZ"),
+        position_variance_m2=_largest(values, POSITION_VARIANCES),
+        climb_variance_m2ps2=_largest(values, VELOCITY_VARIANCES[2:]),
         behind_s=behind_s,
         acc_x_g=values["acc.x"],
         acc_y_g=values["acc.y"],
         start=start,
+        velocity_variance_m2ps2=_largest(values, VELOCITY_VARIANCES),
+        height_variance_m2=_largest(values, POSITION_VARIANCES[2:]),
     )
+
+
+def _largest(values: Mapping[str, float], names: Sequence[str]) -> float | None:
+    """The largest of these variances, NaN if one is; None where one is missing, or zero: a filter
+    that runs keeps each at 1e-6 at least, one that never ran has zeros (source)."""
+    found = [values.get(name, 0.0) for name in names]
+    if any(variance == 0.0 for variance in found):
+        return None
+    return math.nan if any(map(math.isnan, found)) else max(found)
 
 
 # --- The vehicle's milliseconds on the loop's clock ---

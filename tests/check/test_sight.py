@@ -66,7 +66,7 @@ def test_a_latency_that_is_written_down_is_doubted() -> None:
 
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
-    away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
+    away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), velocity_variance_m2ps2=50.0)
     vehicle = VehicleStatus("radio://0/80/2M", telemetry=away)
     rows = {row.name: row for row in evaluate_rows(VEHICLE, vehicle, TARGET)}
     assert rows["positioning"].found == "by the target, see in view"

@@ -150,9 +150,10 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
         )
     ),
     ("positioning", "fail", {"decks": ("bcBuzzer",)}),
-    ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
-    ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
-    ("estimator", "skipped", {"telemetry": said(position_variance_m2=None)}),
+    ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=0.5)}),
+    ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=math.nan)}),
+    ("estimator", "fail", {"telemetry": said(height_variance_m2=1.0)}),
+    ("estimator", "skipped", {"telemetry": said(velocity_variance_m2ps2=None)}),
     ("estimator", "warn", {"displacement_m": 0.2}),
     ("ground", "fail", {"telemetry": said(position_m=(0.0, 0.0, 2.1))}),
     ("ground", "fail", {"telemetry": said(position_m=(math.nan, 0.0, 0.0))}),
@@ -188,3 +189,18 @@ def test_an_old_profile_s_limit_is_the_flight_s() -> None:
     strict = Profile.model_validate({"safety": {"min_rest_v": 4.1}})
     vehicle = replace(GOOD, telemetry=said(battery_v=4.0))
     assert rows_of(vehicle, strict)["battery"].verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(("decks", "verdict"), [
+    (("bcFlow2",), "pass"),
+    (("bcFlow2", "bcLighthouse4"), "fail"),
+    (("bcLoco",), "fail"),
+])  # fmt: skip
+def test_the_position_s_variance_counts_where_a_deck_measures_it(
+    decks: tuple[str, ...], verdict: str
+) -> None:
+    """A Flow deck measures the speed over ground: the place level with it is never measured."""
+    status = replace(GOOD, decks=decks, telemetry=said(position_variance_m2=100.0))
+    row = rows_of(status)["estimator"]
+    assert row.verdict == verdict
+    assert ("the position's variance is 100" in row.found) is (verdict == "fail")

@@ -158,9 +158,11 @@ AT_ONCE: list[tuple[dict[str, Any], str]] = [
     ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
 ]
 IN_TIME: list[tuple[dict[str, Any], str]] = [
-    ({"position_variance_m2": 0.5}, r"settle.*variance 0\.5.*positioning"),
-    ({"position_variance_m2": math.nan}, "settle"),
-    ({"position_variance_m2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
+    ({"velocity_variance_m2ps2": 0.5}, r"settle.*velocity's variance is 0\.50 \(m/s\)\^2, at most"),
+    ({"velocity_variance_m2ps2": math.nan}, r"settle.*is there a positioning system"),
+    ({"height_variance_m2": 1.0}, r"settle.*height's variance is 1\.00 m\^2, at most 0\.01"),
+    ({"height_variance_m2": math.nan}, "settle"),
+    ({"velocity_variance_m2ps2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
     ({"supervisor": 0x06}, "0x0006"),
     ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
     ({"pitch_rad": -0.2}, "tilted by 11 deg"),
