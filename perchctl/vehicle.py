@@ -25,7 +25,9 @@ class Telemetry:
     `t_s` is on the loop's clock; `thrust` is the commanded 0..65535; `acc_x_g`, `acc_y_g` and
     `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
     `behind_s`: by how much position and velocity, which come by a packet of their own, are older
-    than `t_s`. `start`: how often the vehicle has started anew since it was first heard.
+    than `t_s`; `battery_behind_s` and `variance_behind_s` say the same of battery and variances,
+    and are infinite before their first packet. `start`: how often the vehicle has started anew
+    since it was first heard.
 
     The variances are those that the vehicle's estimator itself claims; None if it reports none.
     With a deck that only measures the speed over ground, as a Flow deck does, nothing measures the
@@ -50,6 +52,8 @@ class Telemetry:
     acc_x_g: float = 0.0
     acc_y_g: float = 0.0
     start: int = 0
+    battery_behind_s: float = 0.0
+    variance_behind_s: float = 0.0
     velocity_variance_m2ps2: float | None = None  # of the estimated velocity: largest of three axes
     height_variance_m2: float | None = None  # of the estimated height
 

@@ -21,7 +21,7 @@ from perchctl.check.row import (
 from perchctl.flight import GroundCriteria
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
-from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, POSITION_DECKS, Telemetry
+from perchctl.vehicle import LOW_POWER, POSITION_DECKS, Telemetry, is_battery_reading
 
 LISTEN_S = 5.0
 MOVED_WARN_M = 0.05
@@ -30,6 +30,7 @@ KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 """By a motion capture, or by the target."""
+UNREPORTED = "by link.unreported this vehicle reports none"
 
 Wait = Callable[[float], None]
 
@@ -163,11 +164,11 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     criteria = GroundCriteria(t, profile, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:
-        return failed(problem.found, "is there a positioning system? wait a little")
+        return failed(problem.found, f"{problem.advice}; or wait a little")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
-    if t.velocity_variance_m2ps2 is None:
-        return skipped("its variance is not logged")
+    if all(each.value is None for each in criteria.variances):
+        return skipped(UNREPORTED)
     found = f"variance {', '.join(each.text for each in criteria.variances)}"
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
@@ -200,11 +201,12 @@ def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
-    if not t.battery_v >= NO_BATTERY_READING_V:
-        return skipped("no reading", "restart the vehicle")
-    found = f"{t.battery_v:.2f} V at rest"
-    if problem := GroundCriteria(t, profile).battery_too_low:
+    criteria = GroundCriteria(t, profile)
+    if problem := criteria.battery_too_low or criteria.battery_unknown:
         return failed(problem.found, problem.advice)
+    if not is_battery_reading(t.battery_v):
+        return skipped(UNREPORTED)
+    found = f"{t.battery_v:.2f} V at rest"
     if t.battery_state == LOW_POWER:
         return failed(f"{found}, but it reports low power", "charge it")
     if t.battery_v < profile.safety.min_rest_v + 0.1:

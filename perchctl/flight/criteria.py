@@ -34,10 +34,12 @@ from perchctl.vehicle import (
     TUMBLED,
     ExternalPosition,
     Telemetry,
+    is_battery_reading,
 )
 from perchctl.vision import TargetEstimate
 
 KNOWN_SUPERVISOR_BITS = 0x0FFF
+READING_AGE_S = 1.0  # battery and variances come ten times a second
 REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
 WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
@@ -115,7 +117,7 @@ class GroundCriteria:
 
     @property
     def battery_too_low(self) -> Problem | None:
-        """Problem: the battery is too low to take off; a missing reading is no problem."""
+        """Problem: the battery is too low to take off; see `battery_unknown`, too."""
         rests_v, needed_v = self.telemetry.battery_v, self.profile.safety.min_rest_v
         if not NO_BATTERY_READING_V <= rests_v < needed_v:
             return None
@@ -123,6 +125,24 @@ class GroundCriteria:
         return Problem(
             f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
             "charge it",
+        )
+
+    @property
+    def battery_unknown(self) -> Problem | None:
+        """Problem: there is no reading of the battery, or an old one."""
+        telemetry = self.telemetry
+        if "battery" in self.profile.link.unreported:
+            return None
+        if not is_battery_reading(telemetry.battery_v):
+            return Problem(
+                "the vehicle gives no reading of its battery",
+                "restart it; a vehicle that never gives one needs link.unreported: [battery]",
+            )
+        if telemetry.battery_behind_s <= READING_AGE_S:
+            return None
+        return Problem(
+            f"the battery's reading is {telemetry.battery_behind_s:.1f} s old",
+            "bring the radio nearer, or restart the vehicle",
         )
 
     @property
@@ -151,17 +171,31 @@ class GroundCriteria:
 
     @property
     def estimate_unsettled(self) -> Problem | None:
-        """Problem: a variance of the state estimate is too large, or NaN."""
-        advice = "is there a positioning system?"
+        """Problem: a variance of the state estimate is too large, unknown or old."""
+        telemetry, advice = self.telemetry, "is there a positioning system?"
         if self.profile.positioning.by == "target":
             advice = "do the positions arrive, and does the target stay in view?"
+        unreported = "variance" in self.profile.link.unreported
         for each in self.variances:
-            if each.value is not None and not each.value <= each.most:
+            if each.value is None:
+                if unreported:
+                    continue
+                return Problem(
+                    f"the vehicle reports no variance of its {each.what}",
+                    "does its Kalman filter run (stabilizer.estimator: 2 under link.parameters)? a "
+                    "vehicle that has none needs link.unreported: [variance]",
+                )
+            if not each.value <= each.most:
                 found, allowed = distinct_texts(each.value, each.most, 2)
                 return Problem(
                     f"the {each.what}'s variance is {found} {each.unit}, at most {allowed} allowed",
                     advice,
                 )
+        if not (unreported or telemetry.variance_behind_s <= READING_AGE_S):
+            return Problem(
+                f"its variances are {telemetry.variance_behind_s:.1f} s old",
+                "bring the radio nearer, or restart the vehicle",
+            )
         return None
 
     @property
@@ -241,7 +275,7 @@ class GroundCriteria:
         x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
-        if max(abs(x), abs(y), abs(z)) >= ROOM_M:
+        if not max(abs(x), abs(y), abs(z)) < ROOM_M:
             return Problem(
                 f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these "
                 f"look like millimetres",
@@ -262,7 +296,7 @@ class GroundCriteria:
             return None
         away_m = math.dist((x, y), target.expected_xy_m)
         fence_m = self.profile.safety.fence_radius_m
-        if not away_m > fence_m + target.expected_within_m:
+        if away_m <= fence_m + target.expected_within_m:
             return None
         return Problem(
             f"the target is expected {away_m:.1f} m from where the vehicle stands (x {x:.2f}, y "
@@ -279,7 +313,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
     up = rotation_from_quaternion(place.quaternion) @ R_own.T[:, 2]
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
-    if not off_deg > UPRIGHT_DEG:
+    if off_deg <= UPRIGHT_DEG:
         return None
     axis = nearest_axis(up)
     found = f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its attitude"
@@ -315,7 +349,7 @@ class RestCheck:
         if place is None or self._from is None:
             return None
         way_m = math.dist(self._from.position_m, place.position_m)
-        if not way_m > WANDERED_M:
+        if way_m <= WANDERED_M:
             return None
         return Problem(
             f"by {feed_name(profile)} the vehicle has moved by {way_m:.2f} m, and it stands still",

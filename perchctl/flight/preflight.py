@@ -93,7 +93,7 @@ def still_waiting_for(
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
-    if telemetry_age_s > profile.safety.telemetry_hold_s:
+    if not telemetry_age_s <= profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {telemetry_age_s:.1f} s old)", waited_s, limit_s)
     criteria = GroundCriteria(telemetry, profile, decks)
     unsent = None if feed is None else unsent_problem(feed, profile)
@@ -111,6 +111,7 @@ def still_waiting_for(
         abort_on(criteria.off_ground)
         waiting = _first(
             {
+                "a reading of the battery": criteria.battery_unknown,
                 "the vehicle to stand level": criteria.not_level,
                 "the vehicle to stand still": criteria.not_still,
                 "the supervisor to allow flight": criteria.supervisor_not_ready,

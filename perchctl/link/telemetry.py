@@ -45,10 +45,16 @@ NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
 
 def telemetry_from_log(
-    values: Mapping[str, float], t_s: float, behind_s: float = 0.0, start: int = 0
+    values: Mapping[str, float],
+    t_s: float,
+    behind_s: float = 0.0,
+    start: int = 0,
+    *,
+    battery_behind_s: float = 0.0,
+    variance_behind_s: float = 0.0,
 ) -> Telemetry:
-    """Return telemetry from log variables by name; `behind_s` and `start` as in `Telemetry`.
-    Raises KeyError when a needed value is missing."""
+    """Return telemetry from log variables by name; the other arguments as in `Telemetry`. Raises
+    KeyError when a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
     return Telemetry(
         t_s=t_s,
@@ -68,6 +74,8 @@ def telemetry_from_log(
         acc_x_g=values["acc.x"],
         acc_y_g=values["acc.y"],
         start=start,
+        battery_behind_s=battery_behind_s,
+        variance_behind_s=variance_behind_s,
         velocity_variance_m2ps2=_largest(values, VELOCITY_VARIANCES),
         height_variance_m2=_largest(values, POSITION_VARIANCES[2:]),
     )
@@ -150,13 +158,13 @@ class SampleAssembler:
     """Makes telemetry samples of the newest values of all log blocks.
 
     Only the attitude's block completes a sample; the other values are the last that came. By how
-    much the position's block is older is written into the sample (`Telemetry.behind_s`), since
-    frozen numbers look like a vehicle at rest.
+    much each other block is older is written into the sample (`Telemetry.behind_s` and the like),
+    since frozen numbers look like a vehicle at rest.
     """
 
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
-        self._state_s: float | None = None
+        self._came_s: dict[str, float] = {}  # of each block since the newest start
         self._start = 0
 
     def accept(
@@ -169,14 +177,20 @@ class SampleAssembler:
         if start < self._start:
             return None
         if start > self._start:
-            self._start, self._state_s = start, None
+            self._start, self._came_s = start, {}
         self._values.update(values)
-        if block == "state":
-            self._state_s = t_s
-        if block != "attitude" or self._state_s is None:
+        self._came_s[block] = t_s
+        if block != "attitude" or "state" not in self._came_s:
             return None
-        behind_s = t_s - self._state_s
-        return telemetry_from_log(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
+        behind_s = {name: t_s - self._came_s.get(name, -math.inf) for name in BLOCKS}
+        return telemetry_from_log(
+            _carried(self._values, behind_s["state"]),
+            t_s,
+            max(0.0, behind_s["state"]),
+            start,
+            battery_behind_s=max(0.0, behind_s["battery"]),
+            variance_behind_s=max(0.0, behind_s["variance"]),
+        )
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:

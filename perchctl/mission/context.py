@@ -31,8 +31,8 @@ class Context:
         attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
             together; `imu_proves`: they are new enough to prove anything.
         velocity_variance_m2ps2: variance of the estimated velocity; `position_variance_m2`: of the
-            position, with decks of the height alone, since a Flow deck measures no other. Both 0 if
-            the vehicle reports none, infinite for a NaN. `is_unsure`: one of them is too large.
+            position, with decks of the height alone, since a Flow deck measures no other. Infinite
+            if unknown, 0 if `link.unreported` says so. `is_unsure`: one of them is too large.
         thrust_is_known: the measured thrust follows the ordered thrust.
         reads_one_g: the accelerometer reads 1 g, as on anything that is supported.
         telemetry_age_s: age of the oldest part of the telemetry; a frozen reading is as old as its
@@ -79,9 +79,11 @@ class Context:
         up = math.cos(tel.roll_rad) * math.cos(tel.pitch_rad)
         self.tilt_rad = math.acos(max(-1.0, min(1.0, up)))
         by_deck = profile.positioning.by == "deck"
-        self.velocity_variance_m2ps2 = _variance(tel.velocity_variance_m2ps2)
-        self.position_variance_m2 = _variance(
-            tel.height_variance_m2 if by_deck else tel.position_variance_m2
+        place_m2 = tel.height_variance_m2 if by_deck else tel.position_variance_m2
+        unknown = 0.0 if "variance" in profile.link.unreported else math.inf
+        self.velocity_variance_m2ps2, self.position_variance_m2 = (
+            unknown if reported is None else reported if reported >= 0.0 else math.inf
+            for reported in (tel.velocity_variance_m2ps2, place_m2)
         )
         self.is_unsure = (
             self.velocity_variance_m2ps2 > profile.safety.flight_velocity_variance_m2ps2
@@ -151,9 +153,3 @@ class Context:
         if self.climb_mps >= -mps:
             return False
         return self.placed or tel.acc_z_g < 1.0 - self.planner.perch.contact_acc_g
-
-
-def _variance(reported: float | None) -> float:
-    if reported is None:
-        return 0.0
-    return math.inf if math.isnan(reported) else reported

@@ -327,14 +327,14 @@ def hold_reason(c: Context) -> str:
 
 def unsure_text(c: Context) -> str:
     """Text: the variance by which the estimate is unsure, and the most that is allowed."""
-    most_m2ps2, most_m2 = c.safety.flight_velocity_variance_m2ps2, c.safety.flight_variance_m2
-    if c.velocity_variance_m2ps2 > most_m2ps2:
-        return (
-            f"the velocity's variance is {c.velocity_variance_m2ps2:.2g} (m/s)^2, at most "
-            f"{most_m2ps2:g} allowed"
-        )
-    what = "height" if c.profile.positioning.by == "deck" else "position"
-    return f"the {what}'s variance is {c.position_variance_m2:.2g} m^2, at most {most_m2:g} allowed"
+    what, variance, unit = "velocity", c.velocity_variance_m2ps2, "(m/s)^2"
+    most = c.safety.flight_velocity_variance_m2ps2
+    if variance <= most:
+        what = "height" if c.profile.positioning.by == "deck" else "position"
+        variance, most, unit = c.position_variance_m2, c.safety.flight_variance_m2, "m^2"
+    if math.isinf(variance):
+        return f"the {what}'s variance is not known"
+    return f"the {what}'s variance is {variance:.2g} {unit}, at most {most:g} allowed"
 
 
 def no_picture_reason(c: Context) -> str:

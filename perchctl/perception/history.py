@@ -166,7 +166,8 @@ def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
 
 
 def is_finite(s: Telemetry) -> bool:
-    """True if all values of a sample that steer a flight are finite."""
+    """True if all values of a sample that steer a flight are finite, its times among them."""
+    times = s.t_s, s.behind_s
     attitude = s.roll_rad, s.pitch_rad, s.yaw_rad
     forces = s.acc_x_g, s.acc_y_g, s.acc_z_g, s.thrust
-    return _is_placed(s) and all(map(math.isfinite, (*attitude, *forces)))
+    return _is_placed(s) and all(map(math.isfinite, (*times, *attitude, *forces)))

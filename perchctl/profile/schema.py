@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import difflib
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -44,6 +44,9 @@ class LinkConfig(Section):
         default_factory=dict, description="firmware parameters, set and read back before the flight"
     )
     telemetry_period_s: float = key(0.01, "period of position and attitude", ge=0.01, le=0.1)
+    unreported: tuple[Literal["battery", "variance"], ...] = key(
+        (), "what this vehicle never reports, and take-off does not ask for"
+    )
     loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
 
 

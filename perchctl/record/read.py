@@ -224,6 +224,11 @@ class FlightLog:
         except ValueError as error:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
+    @property
+    def has_position_variance(self) -> bool:
+        """True if the log tells the position's variance, where the vehicle reported it."""
+        return bool(self.header.get("version", 0) >= NAMED_VERSION)
+
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
         """The mask (height, width), True on the gear; None without a mask. Errors: InvalidValue."""
         text = self.header.get("mask")

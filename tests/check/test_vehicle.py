@@ -153,7 +153,9 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=0.5)}),
     ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=math.nan)}),
     ("estimator", "fail", {"telemetry": said(height_variance_m2=1.0)}),
-    ("estimator", "skipped", {"telemetry": said(velocity_variance_m2ps2=None)}),
+    ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=None)}),
+    ("estimator", "fail", {"telemetry": said(height_variance_m2=None)}),
+    ("estimator", "fail", {"telemetry": said(variance_behind_s=3.0)}),
     ("estimator", "warn", {"displacement_m": 0.2}),
     ("ground", "fail", {"telemetry": said(position_m=(0.0, 0.0, 2.1))}),
     ("ground", "fail", {"telemetry": said(position_m=(math.nan, 0.0, 0.0))}),
@@ -163,7 +165,9 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("battery", "fail", {"telemetry": said(battery_v=3.5)}),
     ("battery", "warn", {"telemetry": said(battery_v=3.85)}),
     ("battery", "fail", {"telemetry": said(battery_state=LOW_POWER)}),
-    ("battery", "skipped", {"telemetry": said(battery_v=math.nan)}),
+    ("battery", "fail", {"telemetry": said(battery_v=math.nan)}),
+    ("battery", "fail", {"telemetry": said(battery_v=0.0)}),
+    ("battery", "fail", {"telemetry": said(battery_behind_s=3.0)}),
 ]  # fmt: skip
 
 
@@ -204,3 +208,14 @@ def test_the_position_s_variance_counts_where_a_deck_measures_it(
     row = rows_of(status)["estimator"]
     assert row.verdict == verdict
     assert ("the position's variance is 100" in row.found) is (verdict == "fail")
+
+
+def test_what_the_profile_says_is_never_reported_is_skipped() -> None:
+    profile = Profile.model_validate({"link": {"unreported": ["battery", "variance"]}})
+    silent = said(
+        battery_v=math.nan, velocity_variance_m2ps2=None, height_variance_m2=None,
+        battery_behind_s=math.inf, variance_behind_s=math.inf,
+    )  # fmt: skip
+    rows = rows_of(replace(GOOD, telemetry=silent), profile)
+    for name in ("estimator", "battery"):
+        assert (rows[name].verdict, "link.unreported" in rows[name].found) == ("skipped", True)

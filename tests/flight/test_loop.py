@@ -163,6 +163,15 @@ IN_TIME: list[tuple[dict[str, Any], str]] = [
     ({"height_variance_m2": 1.0}, r"settle.*height's variance is 1\.00 m\^2, at most 0\.01"),
     ({"height_variance_m2": math.nan}, "settle"),
     ({"velocity_variance_m2ps2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
+    ({"velocity_variance_m2ps2": None}, r"settle .the vehicle reports no variance of its velocity"),
+    ({"height_variance_m2": None}, r"no variance of its height: .*link\.unreported: \[variance\]"),
+    ({"variance_behind_s": 3.0}, r"settle .its variances are 3\.0 s old"),
+    ({"variance_behind_s": math.nan}, "its variances are nan s old"),
+    ({"battery_v": math.nan}, r"no reading of its battery: .*link\.unreported: \[battery\]"),
+    ({"battery_v": 0.0}, "no reading of its battery"),
+    ({"battery_behind_s": 3.0}, r"the battery's reading is 3\.0 s old"),
+    ({"battery_behind_s": math.inf}, r"the battery's reading is inf s old"),
+    ({"behind_s": math.nan}, "waited 10 s for telemetry"),
     ({"supervisor": 0x06}, "0x0006"),
     ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
     ({"pitch_rad": -0.2}, "tilted by 11 deg"),
@@ -182,6 +191,28 @@ def test_a_vehicle_that_may_not_fly_or_is_not_ready_in_time_is_refused(
     rig.refused(TimedOut if waits else SafetyAbort, words)
     limit_s = PROFILE.safety.estimator_wait_s if waits else 0.0
     assert rig.link.now_s == pytest.approx(limit_s, abs=0.2 if waits else 0.1)
+
+
+@pytest.mark.parametrize(("unreported", "changes"), [
+    ("battery", {"battery_v": math.nan, "battery_behind_s": math.inf}),
+    ("variance", {"velocity_variance_m2ps2": None, "height_variance_m2": None,
+                  "position_variance_m2": None, "variance_behind_s": math.inf}),
+])  # fmt: skip
+def test_a_profile_may_say_what_its_vehicle_never_reports(
+    unreported: str, changes: dict[str, Any]
+) -> None:
+    rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
+    rig.profile = changed({"link.unreported": (unreported,)})
+    rig.operator = land_after(rig, 3.0)
+    assert rig.fly().outcome is Outcome.OPERATOR
+    assert not any(tick.state.hold for tick in rig.watcher.ticks)
+
+
+@pytest.mark.parametrize("changes", [{"battery_v": 3.4}, {"velocity_variance_m2ps2": 0.5}])
+def test_what_is_reported_all_the_same_still_counts(changes: dict[str, float]) -> None:
+    rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
+    rig.profile = changed({"link.unreported": ("battery", "variance")})
+    rig.refused(PerchError, "the battery rests at|velocity's variance is")
 
 
 @pytest.mark.parametrize(
@@ -223,7 +254,7 @@ def waits(z_m: float = 0.0, waited_s: float = 0.0, age_s: float = 0.0, target: A
 
 
 @pytest.mark.parametrize(
-    ("age_s", "is_old"), [(0.02, False), (0.2, False), (0.5, True), (5.0, True)]
+    ("age_s", "is_old"), [(0.02, False), (0.2, False), (0.5, True), (5.0, True), (math.nan, True)]
 )
 def test_old_telemetry_is_waited_for(age_s: float, is_old: bool) -> None:
     """It may have stopped while the camera was waited for: nothing is taken over on it."""

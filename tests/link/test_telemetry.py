@@ -126,6 +126,24 @@ def test_a_dead_block_shows_in_the_sample(silent_ms: int, speed_mps: float) -> N
     assert sample.position_m[2] == pytest.approx(carried_m)
 
 
+def test_a_dead_slow_block_shows_in_the_sample() -> None:
+    """What never came is not there, what came once grows old."""
+    assembler = SampleAssembler()
+
+    def ages(t_s: float, start: int = 0) -> tuple[float, float]:
+        assembler.accept("state", STILL["state"], t_s, start)
+        sample = assembler.accept("attitude", STILL["attitude"], t_s, start)
+        assert sample is not None
+        return sample.battery_behind_s, sample.variance_behind_s
+
+    assert ages(1.0) == (math.inf, math.inf)
+    assembler.accept("battery", STILL["battery"], 1.0)
+    assert ages(1.5) == (0.5, math.inf)
+    assembler.accept("variance", STILL["variance"], 1.7)
+    assert ages(3.0) == pytest.approx((2.0, 1.3))
+    assert ages(0.1, start=1) == (math.inf, math.inf)
+
+
 def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
     assembler = SampleAssembler()
     assembler.accept("state", STILL["state"], 1.0)

@@ -33,6 +33,7 @@ from tests.helpers.mission import (
     PROFILE,
     READY,
     Felt,
+    changed,
     observation,
     state_in,
     target_at,
@@ -45,6 +46,7 @@ HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
 PRESSED = HOVER_THRUST * 1.12
 HELD_PHASES = (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 LOST = (Phase.LANDING, "position-lost", Outcome.SAFETY)
+UNREPORTED = changed({"link.unreported": ("variance",)})
 
 
 def hidden(age_s: float) -> dict[str, Any]:
@@ -103,10 +105,15 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
     (PROFILE, {"position_variance_m2": 100.0}, ""),  # a Flow deck measures no place level with it
     (MOCAP, {"position_variance_m2": 100.0}, "position's variance is 1e+02 m^2"),
     (BY_TARGET, {"position_variance_m2": 100.0}, "position's variance is 1e+02 m^2"),
-    (BY_TARGET, {"velocity_variance_m2ps2": math.nan}, "velocity's variance is inf (m/s)^2"),
+    (BY_TARGET, {"velocity_variance_m2ps2": math.nan}, "velocity's variance is not known"),
+    (PROFILE, {"velocity_variance_m2ps2": None}, "velocity's variance is not known"),
+    (PROFILE, {"height_variance_m2": None}, "height's variance is not known"),
+    (MOCAP, {"position_variance_m2": None}, "position's variance is not known"),
+    (UNREPORTED, {"velocity_variance_m2ps2": None, "height_variance_m2": None}, ""),
+    (UNREPORTED, {"velocity_variance_m2ps2": 0.06}, "velocity's variance is 0.06 (m/s)^2"),
 ])  # fmt: skip
 def test_an_unsure_estimate_is_held_and_its_variance_named(
-    profile: Profile, claims: dict[str, float], words: str
+    profile: Profile, claims: dict[str, Any], words: str
 ) -> None:
     """After a reset in flight the velocity's variance is small and the position's is not."""
     state = state_in(Phase.ALIGN)
