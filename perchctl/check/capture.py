@@ -46,7 +46,8 @@ from perchctl.positioning import (
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
-CAPTURE_S = 2.0
+CAPTURE_S = 3.0
+"""In less a body that wanders off at 0.05 m/s does not show."""
 POLL_S = 0.005
 NOISE_FAIL = 4.0
 """Times `positioning.position_sigma_m`: so much more than the vehicle takes it for."""
@@ -164,7 +165,9 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
     criteria = GroundCriteria(newest, profile)
     if criteria.not_level or criteria.not_still:
         return skipped("the vehicle does not stand level and still")
-    problem = criteria.position_frame_problem(place)
+    problem = criteria.position_frame_problem(place) or criteria.moved_body(
+        float(np.linalg.norm(places[-1].position_m - places[0].position_m)), profile
+    )
     if problem is not None:
         return failed(problem.found, problem.advice)
     x, y, z = place.position_m

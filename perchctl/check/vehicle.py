@@ -40,7 +40,8 @@ class VehicleStatus:
     """State of a vehicle, as the check queried it.
 
     `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
-    infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest.
+    infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest;
+    `samples`: all that came, oldest first.
     """
 
     uri: str
@@ -54,6 +55,7 @@ class VehicleStatus:
     samples_hz: float = 0.0
     decks: tuple[str, ...] = ()
     displacement_m: float = 0.0
+    samples: Sequence[Telemetry] = ()
 
     @property
     def known_telemetry(self) -> Telemetry:
@@ -85,6 +87,7 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
         age_s=link.position_age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
         displacement_m=math.dist(samples[0].position_m, later[-1].position_m) if samples else 0.0,
+        samples=samples,
         decks=link.decks(),
     )
 
@@ -167,15 +170,17 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return failed(problem.found, f"{problem.advice}; or wait a little")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
-    if all(each.value is None for each in criteria.variances):
-        return skipped(UNREPORTED)
     found = f"variance {', '.join(each.text for each in criteria.variances)}"
+    if problem := criteria.moving_estimate(vehicle.samples, profile):
+        return failed(f"{found}, but {problem.found}", problem.advice)
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
         return warned(f"{ESTIMATOR} {kind:g} has no position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
         return warned(found, "what gives the position is not steady: light, floor")
+    if all(each.value is None for each in criteria.variances):
+        return skipped(UNREPORTED)
     return passed(found)
 
 

@@ -45,6 +45,15 @@ WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
 UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
 WANDERED_M = 0.1  # far beyond a capture's noise
+REST_S = 1.9
+"""For so long the state estimate must have stood still before a take-off: the loop keeps no more. A
+shorter time shows less of a slow drift."""
+DRIFT_M = 0.07
+"""So far it may move in that time (0.037 m/s). Healthy ones move by up to 0.006 m with a Flow or
+Lighthouse deck, 0.03 m by pictures, 0.035 m by ranging anchors."""
+STANDING_MPS = 0.1
+"""The mean of its velocity in that time, at most. By the target alone it is 0.076 m/s on a slope of
+9 deg, since the accelerometer leads it."""
 AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
 
 _FORBIDDEN = (
@@ -269,6 +278,51 @@ class GroundCriteria:
             "the vehicle hangs, or stands too close under it; take it down first",
         )
 
+    @staticmethod
+    def moving_estimate(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
+        """Problem: in the last `REST_S` of `samples`, oldest first, the state estimate has moved or
+        had a speed.
+
+        A vehicle that stands still keeps its place, so something leads its estimate away: flow over
+        a dark floor, a base station that was moved, positions of another body. Or the vehicle is
+        carried, too smoothly for its accelerometer to tell. Fewer samples are judged by what they
+        show.
+        """
+        if not samples:
+            return None
+        newest, advice = samples[-1], "let it stand still; if it does, what places it is not steady"
+        if profile.positioning.by == "deck":
+            advice += ": light, floor, base stations"
+        window = [s for s in samples if newest.t_s - s.t_s <= REST_S and s.start == newest.start]
+        lasts_s = newest.t_s - window[0].t_s
+        moved_m = math.dist(window[0].position_m, newest.position_m)
+        if not moved_m <= DRIFT_M:
+            moved, most = distinct_texts(moved_m, DRIFT_M, 2)
+            found = (
+                f"the estimated position moved {moved} m in {lasts_s:.1f} s, at most {most} allowed"
+            )
+            return Problem(found, advice)
+        mean_mps = math.hypot(*np.mean([s.velocity_mps for s in window], axis=0))
+        if not mean_mps <= STANDING_MPS:
+            mean, most = distinct_texts(mean_mps, STANDING_MPS, 2)
+            found = (
+                f"the estimated speed was {mean} m/s for {lasts_s:.1f} s, at most {most} allowed"
+            )
+            return Problem(found, advice)
+        return None
+
+    @staticmethod
+    def moved_body(moved_m: float, profile: Profile) -> Problem | None:
+        """Problem: by the positions from outside the vehicle has moved by `moved_m` while it stood
+        still: they are another body's, or the target hangs loose."""
+        if moved_m <= WANDERED_M:
+            return None
+        return Problem(
+            f"by {feed_name(profile)} the vehicle has moved by {moved_m:.2f} m, "
+            f"and it stands still",
+            "let the target hang still, put down what is carried, or correct positioning.body",
+        )
+
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
         """Problem: `place` is in another unit, has another axis up, or is too far from the
         expected target. If the target is the source, only the distance is checked."""
@@ -349,12 +403,7 @@ class RestCheck:
         if place is None or self._from is None:
             return None
         way_m = math.dist(self._from.position_m, place.position_m)
-        if way_m <= WANDERED_M:
-            return None
-        return Problem(
-            f"by {feed_name(profile)} the vehicle has moved by {way_m:.2f} m, and it stands still",
-            "let the target hang still, put down what is carried, or correct positioning.body",
-        )
+        return GroundCriteria.moved_body(way_m, profile)
 
 
 def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:

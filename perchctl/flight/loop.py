@@ -159,6 +159,7 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
             0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
             feed,
             decks,
+            inputs.history.samples,
         )
         if parts.source.finished:
             raise NotFound(

@@ -9,6 +9,7 @@ import numpy as np
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
+    REST_S,
     GroundCriteria,
     Problem,
     RestCheck,
@@ -87,9 +88,11 @@ def still_waiting_for(
     telemetry_age_s: float = 0.0,
     feed: FeedStatus | None = None,
     decks: Sequence[str] = (),
+    samples: Sequence[Telemetry] = (),
 ) -> str:
-    """Return in words what take-off still waits for; empty when ready. Errors: TimedOut after too
-    long a wait, SafetyAbort off the ground or too near to the target."""
+    """Return in words what take-off still waits for; empty when ready. `samples`: the telemetry of
+    the last moments, oldest first. Errors: TimedOut after too long a wait, SafetyAbort off the
+    ground or too near to the target."""
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
@@ -108,6 +111,9 @@ def still_waiting_for(
         }
     )
     if not waiting:
+        waiting = _first({"the state estimate to stand still": _unrest(samples, profile)})
+        limit_s += REST_S if waiting else 0.0
+    if not waiting:
         abort_on(criteria.off_ground)
         waiting = _first(
             {
@@ -125,6 +131,15 @@ def still_waiting_for(
         abort_on(criteria.target_too_near(target))
         return ""
     return _bounded(waiting, waited_s, limit_s)
+
+
+def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
+    """The problem of an estimate that moves, or was not yet seen to stand still for long enough."""
+    since_s = [sample.t_s for sample in samples if sample.start == samples[-1].start]
+    seen_s = since_s[-1] - since_s[0] if since_s else 0.0
+    if seen_s < REST_S:
+        return Problem(f"seen for {seen_s:.1f} of {REST_S:g} s", "let it stand")
+    return GroundCriteria.moving_estimate(samples, profile)
 
 
 def _first(problems: Mapping[str, Problem | None]) -> str:

@@ -111,6 +111,8 @@ FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("body place", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "look like millimetres"),
     ("body place", Scripted(y_up), "fail", "swapped axes: up is y"),
     ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.0, 0.0, 1.4))), "fail", "1.40"),
+    ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.05 * t_s, 0.0, 0.02))), "fail",
+     "has moved by 0.15 m, and it stands still"),
 ]  # fmt: skip
 
 

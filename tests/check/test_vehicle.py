@@ -19,7 +19,16 @@ from perchctl.check.vehicle import VEHICLE, VehicleStatus, query_vehicle
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
-from perchctl.vehicle import CAN_FLY, CRASHED, DECK_FAULT, FLYING, LOCKED, LOW_POWER, TUMBLED
+from perchctl.vehicle import (
+    CAN_FLY,
+    CRASHED,
+    DECK_FAULT,
+    FLYING,
+    LOCKED,
+    LOW_POWER,
+    TUMBLED,
+    Telemetry,
+)
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
 from tests.helpers.mission import READY
 
@@ -131,6 +140,12 @@ GOOD = VehicleStatus(
 )  # fmt: skip
 
 
+def running_away(mps: float) -> list[Telemetry]:
+    """Five seconds in which the estimate leaves while the accelerometer reads 1 g."""
+    times = (0.01 * k for k in range(501))
+    return [said(t_s=t_s, position_m=(mps * t_s, 0.0, 0.0)) for t_s in times]
+
+
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("packets", "warn", {"round_trips_s": [0.004] * 97 + [math.inf] * 3}),
     ("packets", "fail", {"round_trips_s": [0.004] * 80 + [math.inf] * 20}),
@@ -157,6 +172,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("estimator", "fail", {"telemetry": said(height_variance_m2=None)}),
     ("estimator", "fail", {"telemetry": said(variance_behind_s=3.0)}),
     ("estimator", "warn", {"displacement_m": 0.2}),
+    *(("estimator", "fail", {"samples": running_away(mps)}) for mps in (0.05, 0.3, 1.0)),
     ("ground", "fail", {"telemetry": said(position_m=(0.0, 0.0, 2.1))}),
     ("ground", "fail", {"telemetry": said(position_m=(math.nan, 0.0, 0.0))}),
     ("level", "warn", {"telemetry": said(roll_rad=math.radians(5.0))}),

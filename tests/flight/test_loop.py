@@ -249,8 +249,10 @@ def test_ctrl_c_on_the_ground_starts_nothing() -> None:
 def waits(z_m: float = 0.0, waited_s: float = 0.0, age_s: float = 0.0, target: Any = None,
           **safety: float) -> str:  # fmt: skip
     profile = PROFILE.model_copy(update={"safety": PROFILE.safety.model_copy(update=safety)})
-    sample = telemetry(1.0, z_m, thrust=0.0, supervisor=READY)
-    return still_waiting_for(sample, True, None, waited_s, profile, target, age_s)
+    at_rest = [telemetry(0.1 * k, z_m, thrust=0.0, supervisor=READY) for k in range(21)]
+    return still_waiting_for(
+        at_rest[-1], True, None, waited_s, profile, target, age_s, samples=at_rest
+    )
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,7 @@ def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
 def waits(waited_s: float = 0.0, **seen: Any) -> str:
     """What is waited for by a vehicle at rest that has pictures."""
     given = {"telemetry": REST, "has_frame": True, "feed": FeedStatus(problem=UNSEEN)} | seen
+    given["samples"] = [replace(REST, t_s=REST.t_s - 0.1 * k) for k in range(20, -1, -1)]
     return still_waiting_for(camera_problem=None, waited_s=waited_s, profile=TARGET, **given)
 
 

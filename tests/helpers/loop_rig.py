@@ -70,12 +70,14 @@ class Vehicle:
         self.closed = False
         self._changed = changed
         self._delay_s = delay_s
-        self._samples: list[Telemetry] = []
         self.z_m = 0.0
         self._goal_m: float | None = None
         self.by_itself = False
         self.motors = False
         self._off_s = -math.inf
+        # It has been heard for a while, as by a link that was opened before a question.
+        before = [changed(self._sample(-0.01 * k)) for k in range(200, 0, -1)]
+        self._samples = [sample for sample in before if sample is not None]
 
     def advance_to(self, t_s: float) -> None:
         while self.now_s < t_s - 1e-9:
@@ -124,16 +126,17 @@ class Vehicle:
             if self.by_itself and self.z_m <= 0.0 and self._goal_m <= 0.0:
                 self.z_m = 0.0
                 self._stop()
-        in_air = self.motors or self.now_s - self._off_s < 2.0
+        changed = self._changed(self._sample(self.now_s))
+        if changed is not None:
+            self._samples.append(changed)
+
+    def _sample(self, t_s: float) -> Telemetry:
+        in_air = self.motors or t_s - self._off_s < 2.0
         bits = AIRBORNE if in_air else READY
         if self.motors and self.by_itself:
             bits |= HL_ACTIVE
-        sample = telemetry(
-            self.now_s, self.z_m, supervisor=bits, thrust=HOVER_THRUST if self.motors else 0.0
-        )
-        changed = self._changed(sample)
-        if changed is not None:
-            self._samples.append(changed)
+        thrust = HOVER_THRUST if self.motors else 0.0
+        return telemetry(t_s, self.z_m, supervisor=bits, thrust=thrust)
 
     def _stop(self) -> None:
         if self.motors:
