@@ -25,7 +25,7 @@ MOST_LINES = {
     "commands": 3650,
     "display": 730,
     "faults": 2660,
-    "flight": 2400,
+    "flight": 2440,
     "link": 2340,
     "record": 2170,
     "mission": 4330,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -78,27 +79,42 @@ def refuse_wrong_positions(
         abort_on(rest_check.moved_body_problem(place, profile))
 
 
-def still_waiting_for(
-    telemetry: Telemetry | None,
-    has_frame: bool,
-    camera_problem: str | None,
-    waited_s: float,
-    profile: Profile,
-    target: TargetEstimate | None = None,
-    telemetry_age_s: float = 0.0,
-    feed: FeedStatus | None = None,
-    decks: Sequence[str] = (),
-    samples: Sequence[Telemetry] = (),
-) -> str:
-    """Return in words what take-off still waits for; empty when ready. `samples`: the telemetry of
-    the last moments, oldest first. Errors: TimedOut after too long a wait, SafetyAbort off the
-    ground or too near to the target."""
+@dataclass(frozen=True)
+class GroundTurn:
+    """What the loop knows in one turn before take-off.
+
+    `waited_s`: how long it has waited in all; `took_s`: how long this turn took so far;
+    `samples`: the telemetry of the last moments, oldest first, the newest `telemetry_age_s` old;
+    `picture_problem`: why there is no good and fresh picture, `unseen_s` after the last one;
+    `link_problem`: what is wrong with the link.
+    """
+
+    profile: Profile
+    waited_s: float
+    samples: Sequence[Telemetry] = ()
+    telemetry_age_s: float = 0.0
+    decks: Sequence[str] = ()
+    feed: FeedStatus | None = None
+    picture_problem: str | None = None
+    unseen_s: float = 0.0
+    target: TargetEstimate | None = None
+    link_problem: str | None = None
+    took_s: float = 0.0
+
+
+def still_waiting_for(turn: GroundTurn) -> str:
+    """Return in words what take-off still waits for; empty when ready, by this turn alone: what was
+    good before and is not now is waited for again. Errors: TimedOut after too long a wait,
+    SafetyAbort off the ground or too near to the target."""
+    profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
-    if telemetry is None:
+    if not turn.samples:
         return _bounded("telemetry", waited_s, limit_s)
-    if not telemetry_age_s <= profile.safety.telemetry_hold_s:
-        return _bounded(f"telemetry (the newest is {telemetry_age_s:.1f} s old)", waited_s, limit_s)
-    criteria = GroundCriteria(telemetry, profile, decks)
+    if not turn.telemetry_age_s <= profile.safety.telemetry_hold_s:
+        old = f"telemetry (the newest is {turn.telemetry_age_s:.1f} s old)"
+        return _bounded(old, waited_s, limit_s)
+    telemetry = turn.samples[-1]
+    criteria = GroundCriteria(telemetry, profile, turn.decks)
     unsent = None if feed is None else unsent_problem(feed, profile)
     seen = None if feed is None else feed.measured
     waiting = _first(
@@ -111,7 +127,7 @@ def still_waiting_for(
         }
     )
     if not waiting:
-        waiting = _first({"the state estimate to stand still": _unrest(samples, profile)})
+        waiting = _first({"the state estimate to stand still": _unrest(turn.samples, profile)})
         limit_s += REST_S if waiting else 0.0
     if not waiting:
         abort_on(criteria.off_ground)
@@ -123,12 +139,18 @@ def still_waiting_for(
                 "the supervisor to allow flight": criteria.supervisor_not_ready,
             }
         )
-    if not waiting and not has_frame:
-        waiting = f"a good picture ({camera_problem or 'none has come'})"
-        limit_s = profile.camera.start_timeout_s
+    if not waiting and turn.link_problem:
+        waiting = f"the link ({turn.link_problem})"
+    if not waiting and turn.picture_problem:
+        waiting = f"a good picture ({turn.picture_problem})"
+        others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
+        if waited_s <= others_s + limit_s:  # it may have failed while others were waited for
+            waited_s = min(waited_s, turn.unseen_s)
     waiting = waiting or _first({"a sight of the target, which measures the position": unsent})
+    if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
+        waiting = f"the flight loop to keep up (a turn took {turn.took_s:.1f} s)"
     if not waiting:
-        abort_on(criteria.target_too_near(target))
+        abort_on(criteria.target_too_near(turn.target))
         return ""
     return _bounded(waiting, waited_s, limit_s)
 
