@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -109,6 +110,11 @@ def test_a_vehicle_whose_estimate_runs_away_does_not_take_off(mps: float) -> Non
     assert rig.link.now_s == pytest.approx(PROFILE.safety.estimator_wait_s + REST_S, abs=0.2)
 
 
+def thinned(sample: Telemetry, every: int) -> Telemetry | None:
+    """The sample, up to the take-off only if its number is a multiple of `every`."""
+    return sample if sample.t_s > 1.0 or round(100 * sample.t_s) % every == 0 else None
+
+
 def first_setpoint_s(vehicle: Vehicle) -> float:
     rig = Rig(vehicle)
     rig.operator = lambda: Operator.LAND if vehicle.said(PositionSetpoint) else Operator.NONE
@@ -123,6 +129,9 @@ def test_a_take_off_waits_until_the_vehicle_was_seen_at_rest() -> None:
     assert first_setpoint_s(carried) == pytest.approx(1.0 + REST_S, abs=0.1)
     new = Vehicle(lambda s: s if s.t_s > 0.0 else None)
     assert first_setpoint_s(new) == pytest.approx(REST_S, abs=0.1)
+    for every in (17, 23):  # samples of which no two are 1.9 to 2.0 s apart
+        slow = Vehicle(partial(thinned, every=every))
+        assert first_setpoint_s(slow) < 0.3
     started_again = Vehicle(lambda s: replace(s, start=int(s.t_s > 1.0)))
     assert first_setpoint_s(started_again) < 0.1
     started_again = Vehicle(lambda s: replace(s, start=int(s.t_s > -1.0)))
