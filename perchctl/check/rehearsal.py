@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.flight import FlightInputs, WallClock
+from perchctl.flight import FlightInputs, GroundCriteria, WallClock
 from perchctl.geometry import Array
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck
@@ -43,7 +43,8 @@ class Rehearsal:
         newest_outputs: the last few; target_pictures: number of pictures with a target.
         silent_s: time without a picture at the end.
         target: the final estimate; None if the target was not in view.
-        target_places: time and place of the target, m, in each picture that measured it.
+        target_places: time and place of the target, m, in each picture that measured it since the
+            vehicle came to rest.
         print_verdict: `PrintCheck.error_and_text()`; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
     """
@@ -166,6 +167,10 @@ def _note(
     if senses.camera_problem is not None:
         done.problems[senses.camera_problem] += 1
     output = senses.output
+    newest = senses.history.newest
+    stands = newest is not None and GroundCriteria(newest, senses.profile).stands
+    if not stands:
+        done.target_places.clear()
     if output is None:
         return
     if done.pictures > WARM_FRAMES:
@@ -174,7 +179,7 @@ def _note(
     seen = output.detections
     done.target_pictures += seen.large is not None or seen.small is not None
     target = output.target
-    if target is not None and target.measured and target.world_m is not None:
+    if stands and target is not None and target.measured and target.world_m is not None:
         done.target_places.append((frame.t_s, target.world_m))
     prints.add(output)
     done.newest_outputs = [*done.newest_outputs[1 - KEPT_FRAMES :], (frame, output)]

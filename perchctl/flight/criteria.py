@@ -250,6 +250,11 @@ class GroundCriteria:
             return None
         return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
+    @property
+    def stands(self) -> bool:
+        """True if the accelerometer shows a vehicle that stands level and still."""
+        return self.not_level is None and self.not_still is None
+
     @staticmethod
     def no_position_source(decks: Sequence[str], profile: Profile) -> Problem | None:
         """Problem: none of the detected `decks` measures positions, as the profile expects."""

@@ -67,7 +67,7 @@ def refuse_wrong_positions(
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
         return  # unknown: not judged, and nothing is forgotten
     criteria = GroundCriteria(telemetry, profile)
-    stands = criteria.not_level is None and criteria.not_still is None
+    stands = criteria.stands
     # The last position before a problem may have been elsewhere.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
