@@ -162,16 +162,19 @@ def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
-    if profile.positioning.by != "deck" and not vehicle.position_decks(profile):
-        return skipped(BY_FLY)
-    criteria = GroundCriteria(t, profile, vehicle.decks)
+    judged = profile
+    if profile.positioning.by != "deck":
+        if not vehicle.position_decks(profile):
+            return skipped(BY_FLY)
+        judged = profile.with_({"positioning.by": "deck"})  # until fly sends positions
+    criteria = GroundCriteria(t, judged, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:
         return failed(problem.found, f"{problem.advice}; or wait a little")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
     found = f"variance {', '.join(each.text for each in criteria.variances)}"
-    if problem := criteria.moving_estimate(vehicle.samples, profile):
+    if problem := criteria.moving_estimate(vehicle.samples, judged):
         return failed(f"{found}, but {problem.found}", problem.advice)
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"

@@ -30,7 +30,7 @@ from perchctl.vehicle import (
     Telemetry,
 )
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
-from tests.helpers.mission import READY
+from tests.helpers.mission import BY_TARGET, MOCAP, READY
 
 pytestmark = pytest.mark.long
 
@@ -224,6 +224,14 @@ def test_the_position_s_variance_counts_where_a_deck_measures_it(
     row = rows_of(status)["estimator"]
     assert row.verdict == verdict
     assert ("the position's variance is 100" in row.found) is (verdict == "fail")
+
+
+@pytest.mark.parametrize("profile", [MOCAP, BY_TARGET], ids=["mocap", "target"])
+def test_until_fly_sends_positions_a_flow_deck_measures_the_height_alone(profile: Profile) -> None:
+    status = replace(GOOD, telemetry=said(position_variance_m2=100.0))
+    assert rows_of(status, profile)["estimator"].verdict is Verdict.PASS
+    away = replace(status, samples=running_away(0.05))
+    assert rows_of(away, profile)["estimator"].verdict is Verdict.FAIL
 
 
 def test_what_the_profile_says_is_never_reported_is_skipped() -> None:
