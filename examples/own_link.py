@@ -1,7 +1,7 @@
 """Your own link: here to a toy that follows setpoints, so that no radio is needed.
 
-Fly it by `fly(profile, "own_link:Toy", "own_camera:UdpCamera")`. A real link has a radio inside.
-"""
+Fly it by `fly(profile, "own_link:Toy", "own_camera:UdpCamera")`. A real link hands each command to
+its radio in `send`, and `telemetry` returns what has come down."""
 
 from collections.abc import Callable
 

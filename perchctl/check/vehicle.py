@@ -170,7 +170,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     criteria = GroundCriteria(t, judged, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:
-        return failed(problem.found, f"{problem.advice}; or wait a little")
+        return failed(problem.found, f"wait a little, then check again; {problem.advice}")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
     found = f"variance {', '.join(each.text for each in criteria.variances)}"
@@ -181,7 +181,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return warned(f"{ESTIMATOR} {kind:g} has no position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
-        return warned(found, "what gives the position is not steady: light, floor")
+        return warned(found, "let it stand still; if it did, check light and floor")
     if all(each.value is None for each in criteria.variances):
         return skipped(UNREPORTED)
     return passed(found)

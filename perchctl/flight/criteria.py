@@ -150,8 +150,9 @@ class GroundCriteria:
         if telemetry.battery_behind_s <= READING_AGE_S:
             return None
         return Problem(
-            f"the battery's reading is {telemetry.battery_behind_s:.1f} s old",
-            "bring the radio nearer, or restart the vehicle",
+            f"the battery's reading is {telemetry.battery_behind_s:.1f} s old, at most "
+            f"{READING_AGE_S:g} allowed",
+            "restart the vehicle if this lasts",
         )
 
     @property
@@ -202,8 +203,9 @@ class GroundCriteria:
                 )
         if not (unreported or telemetry.variance_behind_s <= READING_AGE_S):
             return Problem(
-                f"its variances are {telemetry.variance_behind_s:.1f} s old",
-                "bring the radio nearer, or restart the vehicle",
+                f"its variances are {telemetry.variance_behind_s:.1f} s old, at most "
+                f"{READING_AGE_S:g} allowed",
+                "restart the vehicle if this lasts",
             )
         return None
 
@@ -295,9 +297,9 @@ class GroundCriteria:
         """
         if not samples:
             return None
-        newest, advice = samples[-1], "let it stand still; if it does, what places it is not steady"
+        newest, advice = samples[-1], "let it stand still; if it did, check its positioning"
         if profile.positioning.by == "deck":
-            advice += ": light, floor, base stations"
+            advice += " (light, floor, base stations)"
         window = [s for s in samples if newest.t_s - s.t_s <= REST_S and s.start == newest.start]
         lasts_s = newest.t_s - window[0].t_s
         moved_m = math.dist(window[0].position_m, newest.position_m)

@@ -45,7 +45,9 @@ class LinkConfig(Section):
     )
     telemetry_period_s: float = key(0.01, "period of position and attitude", ge=0.01, le=0.1)
     unreported: tuple[Literal["battery", "variance"], ...] = key(
-        (), "what this vehicle never reports, and take-off does not ask for"
+        (),
+        "`battery`, `variance`: readings that this vehicle never reports, and that take-off then "
+        "does not need",
     )
     loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
 
