@@ -75,9 +75,8 @@ class Vehicle:
         self.by_itself = False
         self.motors = False
         self._off_s = -math.inf
-        # It has been heard for a while, as by a link that was opened before a question.
-        before = [changed(self._sample(-0.01 * k)) for k in range(200, 0, -1)]
-        self._samples = [sample for sample in before if sample is not None]
+        self._samples: list[Telemetry] = []
+        self._was_asked = False
 
     def advance_to(self, t_s: float) -> None:
         while self.now_s < t_s - 1e-9:
@@ -85,6 +84,12 @@ class Vehicle:
             self._live(0.01)
 
     def telemetry(self) -> list[Telemetry]:
+        """What has arrived: at first also what was heard in the two seconds before the flight, as
+        by a link that was opened before a question."""
+        if not self._was_asked:
+            self._was_asked = True
+            before = [self._changed(self._sample(-0.01 * k)) for k in range(200, 0, -1)]
+            self._samples = [sample for sample in before if sample is not None] + self._samples
         due_s = self.now_s - self._delay_s + 1e-9
         arrived = [s for s in self._samples if s.t_s <= due_s]
         self._samples = [s for s in self._samples if s.t_s > due_s]
