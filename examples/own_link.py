@@ -1,8 +1,7 @@
 """Your own link: here to a toy that follows setpoints, so that no radio is needed.
 
 Fly it by `fly(profile, "own_link:Toy", "own_camera:UdpCamera")`. A real link hands each command to
-its radio in `send`, and `telemetry` returns what has come down.
-"""
+its radio in `send`, and `telemetry` returns what has come down."""
 
 from collections.abc import Callable
 
@@ -56,5 +55,6 @@ class Toy:
         self._flies = self._flies and not (self._lands and z < 0.01)
         bits, thrust = READY | FLYING * self._flies, THRUST * self._flies
         return Telemetry(
-            self._sampled_s, (x, y, z), (vx, vy, vz), 0.0, 0.0, 0.0, 1.0, thrust, 4.0, bits
-        )
+            self._sampled_s, (x, y, z), (vx, vy, vz), 0.0, 0.0, 0.0, 1.0, thrust, 4.0, bits,
+            height_variance_m2=1e-6, velocity_variance_m2ps2=1e-6,
+        )  # fmt: skip

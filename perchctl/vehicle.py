@@ -30,7 +30,14 @@ class Telemetry:
     `t_s` is on the loop's clock; `thrust` is the commanded 0..65535; `acc_x_g`, `acc_y_g` and
     `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
     `behind_s`: by how much position and velocity, which come by a packet of their own, are older
-    than `t_s`. `start`: how often the vehicle has started anew since it was first heard.
+    than `t_s`; `battery_behind_s` and `variance_behind_s` say the same of battery and variances,
+    and are infinite before their first packet. `start`: how often the vehicle has started anew
+    since it was first heard.
+
+    The variances are those that the vehicle's estimator itself claims; None if it reports none.
+    With a deck that only measures the speed over ground, as a Flow deck does, nothing measures the
+    horizontal position, and `position_variance_m2` stays at 100 m^2 (docs/firmware.md,
+    "Variances"): of the position only `height_variance_m2` says anything there.
     """
 
     t_s: float
@@ -44,12 +51,16 @@ class Telemetry:
     battery_v: float
     supervisor: int
     battery_state: int = 0  # pm.state; 3 = low power
-    position_variance_m2: float | None = None  # largest of the estimator's three
-    climb_variance_m2ps2: float | None = None  # of the estimated vertical speed
+    position_variance_m2: float | None = None  # of the estimated position: largest of three axes
+    climb_variance_m2ps2: float | None = None  # of the estimated speed along the body's z axis
     behind_s: float = 0.0
     acc_x_g: float = 0.0
     acc_y_g: float = 0.0
     start: int = 0
+    battery_behind_s: float = 0.0
+    variance_behind_s: float = 0.0
+    velocity_variance_m2ps2: float | None = None  # of the estimated velocity: largest of three axes
+    height_variance_m2: float | None = None  # of the estimated height
 
     def has_bit(self, supervisor_bit: int) -> bool:
         return bool(self.supervisor & supervisor_bit)
@@ -115,8 +126,11 @@ class ExternalPosition:
 SendPosition = Callable[[ExternalPosition], object]
 """Sends one to the vehicle's estimator; returns False where it did not go out."""
 
-POSITION_DECKS = ("bcFlow2", "bcFlow", "bcLighthouse4", "bcLoco", "bcDWM1000")
-"""Those that measure a position, or a speed over ground, by the firmware's `deck` parameters."""
+FLOW_DECKS = ("bcFlow2", "bcFlow")
+"""Those that measure the speed over ground and the height, by the firmware's `deck` parameters."""
+ABSOLUTE_DECKS = ("bcLighthouse4", "bcLoco", "bcDWM1000")
+"""Those that measure the position."""
+POSITION_DECKS = (*FLOW_DECKS, *ABSOLUTE_DECKS)
 
 
 @dataclass(frozen=True)

@@ -225,6 +225,8 @@ def replay(
     comparison = Comparison(unknown, tolerances or {})
     used = profile or flown
     changed = changed_keys(flown, used)
+    if not log.has_position_variance:  # what is unknown was not asked for then
+        used = used.with_({"link.unreported": ["variance", *used.link.unreported]})
     seen = None
     if pictures is not None:
         pipeline = pipeline or replay_pipeline(log, used, changed)

@@ -192,6 +192,8 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
     if rehearsal.target is None:
         return warned("not at the end", "see lost frames and target; once more")
+    if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
+        return failed(problem.found, problem.advice)
     feet = (0.0, 0.0, profile.safety.ground_z_m)
     # The world of a level vehicle that stands at the origin, its front along x.
     gear_m = np.asarray(profile.vehicle.gear_body_m)

@@ -46,7 +46,8 @@ from perchctl.positioning import (
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
-CAPTURE_S = 2.0
+CAPTURE_S = 3.0
+"""In less a body that wanders off at 0.05 m/s does not show."""
 POLL_S = 0.005
 NOISE_FAIL = 4.0
 """Times `positioning.position_sigma_m`: so much more than the vehicle takes it for."""
@@ -162,9 +163,12 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
     if newest is None:
         return skipped("it cannot be compared: no telemetry")
     criteria = GroundCriteria(newest, profile)
-    if criteria.not_level or criteria.not_still:
+    if not criteria.stands:
         return skipped("the vehicle does not stand level and still")
     problem = criteria.position_frame_problem(place)
+    if problem is None and all(GroundCriteria(each, profile).stands for each in samples.telemetry):
+        moved_m = float(np.linalg.norm(places[-1].position_m - places[0].position_m))
+        problem = criteria.moved_body(moved_m, profile)
     if problem is not None:
         return failed(problem.found, problem.advice)
     x, y, z = place.position_m

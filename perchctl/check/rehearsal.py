@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.flight import FlightInputs, WallClock
+from perchctl.flight import FlightInputs, GroundCriteria, WallClock
+from perchctl.geometry import Array
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck
 from perchctl.vehicle import Telemetry
@@ -23,6 +24,7 @@ REHEARSED_S = 3.0
 WARM_FRAMES = 3
 """The first frames load libraries: how long they took says nothing."""
 KEPT_FRAMES = 12
+TRACK_SETTLES_S = 0.5
 
 TakeTelemetry = Callable[[], list[Telemetry]]
 """Gives what came since the last time."""
@@ -41,6 +43,8 @@ class Rehearsal:
         newest_outputs: the last few; target_pictures: number of pictures with a target.
         silent_s: time without a picture at the end.
         target: the final estimate; None if the target was not in view.
+        target_places: time and place of the target, m, in each picture that measured it since the
+            vehicle came to rest.
         print_verdict: `PrintCheck.error_and_text()`; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
     """
@@ -58,8 +62,16 @@ class Rehearsal:
     target_pictures: int = 0
     silent_s: float = 0.0
     target: TargetEstimate | None = None
+    target_places: list[tuple[float, Array]] = field(default_factory=list)
     print_verdict: tuple[bool, str] | None = None
     blur_px: float | None = None
+
+    @property
+    def target_moved_m(self) -> float:
+        """How far the target has moved by the sights, once its track had settled; 0 if unknown."""
+        places = self.target_places
+        settled_m = [m for t_s, m in places if t_s - places[0][0] >= TRACK_SETTLES_S]
+        return float(np.linalg.norm(settled_m[-1] - settled_m[0])) if settled_m else 0.0
 
     @property
     def frame_period_s(self) -> float | None:
@@ -155,6 +167,10 @@ def _note(
     if senses.camera_problem is not None:
         done.problems[senses.camera_problem] += 1
     output = senses.output
+    newest = senses.history.newest
+    stands = newest is not None and GroundCriteria(newest, senses.profile).stands
+    if not stands:
+        done.target_places.clear()
     if output is None:
         return
     if done.pictures > WARM_FRAMES:
@@ -162,6 +178,9 @@ def _note(
         done.ages_s.append(now_s - frame.t_s + work_s)
     seen = output.detections
     done.target_pictures += seen.large is not None or seen.small is not None
+    target = output.target
+    if stands and target is not None and target.measured and target.world_m is not None:
+        done.target_places.append((frame.t_s, target.world_m))
     prints.add(output)
     done.newest_outputs = [*done.newest_outputs[1 - KEPT_FRAMES :], (frame, output)]
 

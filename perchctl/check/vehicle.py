@@ -24,10 +24,10 @@ from perchctl.profile import Profile
 from perchctl.vehicle import (
     AIRFRAMES,
     LOW_POWER,
-    NO_BATTERY_READING_V,
     POSITION_DECKS,
     Telemetry,
     is_armed_by_request,
+    is_battery_reading,
 )
 
 LISTEN_S = 5.0
@@ -39,6 +39,7 @@ BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 """By a motion capture, or by the target."""
 ARMED_BY_FLY = "armed by fly after your yes"
 DISARM_IT = "keep away, end the program that armed it, or wait 30 s until it disarms itself"
+UNREPORTED = "by link.unreported this vehicle reports none"
 
 Wait = Callable[[float], None]
 
@@ -49,7 +50,8 @@ class VehicleStatus:
 
     `device_type`: the kind of vehicle, as its firmware names it; None without an answer.
     `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
-    infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest.
+    infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest;
+    `samples`: all that came, oldest first.
     """
 
     uri: str
@@ -64,6 +66,7 @@ class VehicleStatus:
     samples_hz: float = 0.0
     decks: tuple[str, ...] = ()
     displacement_m: float = 0.0
+    samples: Sequence[Telemetry] = ()
 
     @property
     def known_telemetry(self) -> Telemetry:
@@ -101,6 +104,7 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
         age_s=link.position_age_s(),
         samples_hz=(len(samples) - 1) / span_s if span_s > 0.0 else 0.0,
         displacement_m=math.dist(samples[0].position_m, later[-1].position_m) if samples else 0.0,
+        samples=samples,
         decks=link.decks(),
     )
 
@@ -186,22 +190,28 @@ def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
-    if profile.positioning.by != "deck" and not vehicle.position_decks(profile):
-        return skipped(BY_FLY)
-    problem = GroundCriteria(t, profile).estimate_unsettled
+    judged = profile
+    if profile.positioning.by != "deck":
+        if not vehicle.position_decks(profile):
+            return skipped(BY_FLY)
+        judged = profile.with_({"positioning.by": "deck"})  # until fly sends positions
+    criteria = GroundCriteria(t, judged, vehicle.decks)
+    problem = criteria.estimate_unsettled
     if problem is not None:
-        return failed(problem.found, "is there a positioning system? wait a little")
+        return failed(problem.found, f"wait a little, then check again; {problem.advice}")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
-    if t.position_variance_m2 is None:
-        return skipped("its variance is not logged")
-    found = f"variance {t.position_variance_m2:.2g} m^2"
+    found = f"variance {', '.join(each.text for each in criteria.variances)}"
+    if problem := criteria.moving_estimate(vehicle.samples, judged):
+        return failed(f"{found}, but {problem.found}", problem.advice)
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
         return warned(f"{ESTIMATOR} {kind:g} has no position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
-        return warned(found, "what gives the position is not steady: light, floor")
+        return warned(found, "let it stand still; if it did, check light and floor")
+    if all(each.value is None for each in criteria.variances):
+        return skipped(UNREPORTED)
     return passed(found)
 
 
@@ -227,12 +237,13 @@ def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
-    if not t.battery_v >= NO_BATTERY_READING_V:
-        return skipped("no reading", "restart the vehicle")
-    found = f"{t.battery_v:.2f} V at rest"
     criteria = GroundCriteria(t, profile)
-    if problem := criteria.battery_too_low or criteria.battery_too_high:
+    battery = criteria.battery_too_low or criteria.battery_too_high or criteria.battery_unknown
+    if problem := battery:
         return failed(problem.found, problem.advice)
+    if not is_battery_reading(t.battery_v):
+        return skipped(UNREPORTED)
+    found = f"{t.battery_v:.2f} V at rest"
     if t.battery_state == LOW_POWER:
         return failed(f"{found}, but it reports low power", "charge it")
     if t.battery_v < profile.safety.min_rest_v + 0.1:

@@ -23,6 +23,7 @@ from perchctl.geometry import (
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import (
+    ABSOLUTE_DECKS,
     CAN_FLY,
     CRASHED,
     DECK_FAULT,
@@ -36,15 +37,26 @@ from perchctl.vehicle import (
     Telemetry,
     is_armed_by_request,
     is_disarmed,
+    is_battery_reading,
 )
 from perchctl.vision import TargetEstimate
 
 KNOWN_SUPERVISOR_BITS = 0x0FFF
+READING_AGE_S = 1.0  # battery and variances come ten times a second
 REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
 WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
 UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
 WANDERED_M = 0.1  # far beyond a capture's noise
+REST_S = 1.9
+"""For so long the state estimate must have stood still before a take-off: the loop keeps no more. A
+shorter time shows less of a slow drift."""
+DRIFT_M = 0.07
+"""So far it may move in that time (0.037 m/s). Healthy ones move by up to 0.006 m with a Flow or
+Lighthouse deck, 0.03 m by pictures, 0.035 m by ranging anchors."""
+STANDING_MPS = 0.1
+"""The mean of its velocity in that time, at most. By the target alone it is 0.076 m/s on a slope of
+9 deg, since the accelerometer leads it."""
 AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
 
 _FORBIDDEN = (
@@ -69,11 +81,30 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Variance:
+    """A variance that the vehicle's estimator claims (None: it reports none) for `what`, in `unit`,
+    and the `most` with which it may take off."""
+
+    what: str
+    value: float | None
+    most: float
+    unit: str
+
+    @property
+    def text(self) -> str:
+        return (
+            f"of {self.what} {'unknown' if self.value is None else f'{self.value:.2g}'} {self.unit}"
+        )
+
+
+@dataclass(frozen=True)
 class GroundCriteria:
-    """Criteria for a vehicle at rest; each returns the problem that it finds, or None."""
+    """Criteria for a vehicle at rest; each returns the problem that it finds, or None. `decks`: the
+    vehicle's, by the firmware's names."""
 
     telemetry: Telemetry
     profile: Profile
+    decks: Sequence[str] = ()
 
     @property
     def supervisor_fault(self) -> Problem | None:
@@ -107,7 +138,7 @@ class GroundCriteria:
 
     @property
     def battery_too_low(self) -> Problem | None:
-        """Problem: the battery is too low to take off; a missing reading is no problem."""
+        """Problem: the battery is too low to take off; see `battery_unknown`, too."""
         rests_v, needed_v = self.telemetry.battery_v, self.profile.safety.min_rest_v
         if not NO_BATTERY_READING_V <= rests_v < needed_v:
             return None
@@ -130,17 +161,77 @@ class GroundCriteria:
         )
 
     @property
-    def estimate_unsettled(self) -> Problem | None:
-        """Problem: the variance of the state estimate is too large, or NaN."""
-        variance = self.telemetry.position_variance_m2
-        most = self.profile.safety.estimator_variance_m2
-        if variance is None or variance <= most:
+    def battery_unknown(self) -> Problem | None:
+        """Problem: there is no reading of the battery, or an old one."""
+        telemetry = self.telemetry
+        if "battery" in self.profile.link.unreported:
             return None
-        advice = "is there a positioning system?"
+        if not is_battery_reading(telemetry.battery_v):
+            return Problem(
+                "the vehicle gives no reading of its battery",
+                "restart it; a vehicle that never gives one needs link.unreported: [battery]",
+            )
+        if telemetry.battery_behind_s <= READING_AGE_S:
+            return None
+        return Problem(
+            f"the battery's reading is {telemetry.battery_behind_s:.1f} s old, at most "
+            f"{READING_AGE_S:g} allowed",
+            "restart the vehicle if this lasts",
+        )
+
+    @property
+    def variances(self) -> tuple[Variance, ...]:
+        """The variances by which the state estimate is judged (docs/firmware.md, "Variances").
+
+        The velocity's shows whether anything corrects the estimate, the position's whether anything
+        has placed it since the estimator last started. A Flow deck measures the height alone.
+        """
+        telemetry, safety = self.telemetry, self.profile.safety
+        is_placed = self.profile.positioning.by != "deck" or {*self.decks} & {*ABSOLUTE_DECKS}
+        return (
+            Variance(
+                what="velocity",
+                value=telemetry.velocity_variance_m2ps2,
+                most=safety.estimator_velocity_variance_m2ps2,
+                unit="(m/s)^2",
+            ),
+            Variance(
+                what="position" if is_placed else "height",
+                value=telemetry.position_variance_m2 if is_placed else telemetry.height_variance_m2,
+                most=safety.estimator_variance_m2,
+                unit="m^2",
+            ),
+        )
+
+    @property
+    def estimate_unsettled(self) -> Problem | None:
+        """Problem: a variance of the state estimate is too large, unknown or old."""
+        telemetry, advice = self.telemetry, "is there a positioning system?"
         if self.profile.positioning.by == "target":
             advice = "do the positions arrive, and does the target stay in view?"
-        found, allowed = distinct_texts(variance, most, 2)
-        return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
+        unreported = "variance" in self.profile.link.unreported
+        for each in self.variances:
+            if each.value is None:
+                if unreported:
+                    continue
+                return Problem(
+                    f"the vehicle reports no variance of its {each.what}",
+                    "does its Kalman filter run (stabilizer.estimator: 2 under link.parameters)? a "
+                    "vehicle that has none needs link.unreported: [variance]",
+                )
+            if not each.value <= each.most:
+                found, allowed = distinct_texts(each.value, each.most, 2)
+                return Problem(
+                    f"the {each.what}'s variance is {found} {each.unit}, at most {allowed} allowed",
+                    advice,
+                )
+        if not (unreported or telemetry.variance_behind_s <= READING_AGE_S):
+            return Problem(
+                f"its variances are {telemetry.variance_behind_s:.1f} s old, at most "
+                f"{READING_AGE_S:g} allowed",
+                "restart the vehicle if this lasts",
+            )
+        return None
 
     @property
     def off_ground(self) -> Problem | None:
@@ -185,6 +276,11 @@ class GroundCriteria:
             return None
         return Problem(f"its accelerometer reads {acc_z_g:.2f} g", "let it stand still")
 
+    @property
+    def stands(self) -> bool:
+        """True if the accelerometer shows a vehicle that stands level and still."""
+        return self.not_level is None and self.not_still is None
+
     @staticmethod
     def no_position_source(decks: Sequence[str], profile: Profile) -> Problem | None:
         """Problem: none of the detected `decks` measures positions, as the profile expects."""
@@ -213,13 +309,58 @@ class GroundCriteria:
             "the vehicle hangs, or stands too close under it; take it down first",
         )
 
+    @staticmethod
+    def moving_estimate(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
+        """Problem: in the last `REST_S` of `samples`, oldest first, the state estimate has moved or
+        had a speed.
+
+        A vehicle that stands still keeps its place, so something leads its estimate away: flow over
+        a dark floor, a base station that was moved, positions of another body. Or the vehicle is
+        carried, too smoothly for its accelerometer to tell. Fewer samples are judged by what they
+        show.
+        """
+        if not samples:
+            return None
+        newest, advice = samples[-1], "let it stand still; if it did, check its positioning"
+        if profile.positioning.by == "deck":
+            advice += " (light, floor, base stations)"
+        window = [s for s in samples if newest.t_s - s.t_s <= REST_S and s.start == newest.start]
+        lasts_s = newest.t_s - window[0].t_s
+        moved_m = math.dist(window[0].position_m, newest.position_m)
+        if not moved_m <= DRIFT_M:
+            moved, most = distinct_texts(moved_m, DRIFT_M, 2)
+            found = (
+                f"the estimated position moved {moved} m in {lasts_s:.1f} s, at most {most} allowed"
+            )
+            return Problem(found, advice)
+        mean_mps = math.hypot(*np.mean([s.velocity_mps for s in window], axis=0))
+        if not mean_mps <= STANDING_MPS:
+            mean, most = distinct_texts(mean_mps, STANDING_MPS, 2)
+            found = (
+                f"the estimated speed was {mean} m/s for {lasts_s:.1f} s, at most {most} allowed"
+            )
+            return Problem(found, advice)
+        return None
+
+    @staticmethod
+    def moved_body(moved_m: float, profile: Profile) -> Problem | None:
+        """Problem: by the positions from outside the vehicle has moved by `moved_m` while it stood
+        still: they are another body's, or the target hangs loose."""
+        if moved_m <= WANDERED_M:
+            return None
+        return Problem(
+            f"by {feed_name(profile)} the vehicle has moved by {moved_m:.2f} m, "
+            f"and it stands still",
+            "let the target hang still, put down what is carried, or correct positioning.body",
+        )
+
     def position_frame_problem(self, place: ExternalPosition) -> Problem | None:
         """Problem: `place` is in another unit, has another axis up, or is too far from the
         expected target. If the target is the source, only the distance is checked."""
         x, y, z = place.position_m
         if self.profile.positioning.by == "target":
             return self._unreachable(place)
-        if max(abs(x), abs(y), abs(z)) >= ROOM_M:
+        if not max(abs(x), abs(y), abs(z)) < ROOM_M:
             return Problem(
                 f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these "
                 f"look like millimetres",
@@ -240,7 +381,7 @@ class GroundCriteria:
             return None
         away_m = math.dist((x, y), target.expected_xy_m)
         fence_m = self.profile.safety.fence_radius_m
-        if not away_m > fence_m + target.expected_within_m:
+        if away_m <= fence_m + target.expected_within_m:
             return None
         return Problem(
             f"the target is expected {away_m:.1f} m from where the vehicle stands (x {x:.2f}, y "
@@ -257,7 +398,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
     up = rotation_from_quaternion(place.quaternion) @ R_own.T[:, 2]
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
-    if not off_deg > UPRIGHT_DEG:
+    if off_deg <= UPRIGHT_DEG:
         return None
     axis = nearest_axis(up)
     found = f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its attitude"
@@ -293,12 +434,7 @@ class RestCheck:
         if place is None or self._from is None:
             return None
         way_m = math.dist(self._from.position_m, place.position_m)
-        if not way_m > WANDERED_M:
-            return None
-        return Problem(
-            f"by {feed_name(profile)} the vehicle has moved by {way_m:.2f} m, and it stands still",
-            "let the target hang still, put down what is carried, or correct positioning.body",
-        )
+        return GroundCriteria.moved_body(way_m, profile)
 
 
 def unsent_problem(status: FeedStatus, profile: Profile) -> Problem | None:

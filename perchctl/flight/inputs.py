@@ -175,6 +175,25 @@ class FlightInputs:
         newest = self.history.newest
         return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
+    def picture_problem(self, now_s: float) -> str | None:
+        """Return why there is no good picture now: none has come, the newest was no measurement, or
+        the last good one is older than `safety.camera_hold_s`; None if there is one. A picture that
+        is only dark or empty is good."""
+        age_s = now_s - self.last_good_frame_s
+        if self.frames == 0:
+            return self.camera_problem or "none has come"
+        if not age_s <= self.profile.safety.camera_hold_s:
+            return self.camera_problem or f"none for {age_s:.1f} s"
+        return None if self.camera_problem == self._note else self.camera_problem
+
+    def telemetry_age_s(self, now_s: float) -> float:
+        """The age of the oldest part of the newest telemetry: a reading that has stood still while
+        others changed is as old as its first sample; infinite before there is any."""
+        newest, imu = self.history.newest, self.history.imu
+        if newest is None:
+            return math.inf
+        return now_s - newest.t_s + max(newest.behind_s, imu.attitude_age_s, imu.place_age_s)
+
     def catch_up(self, began_s: float, now_s: float) -> None:
         """Take in the telemetry that came while camera or vision hung in the tick of `began_s`."""
         late = self.link.telemetry()

@@ -11,13 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from perchctl.camera import FrameSource
-from perchctl.errors import Interrupted, NotFound
+from perchctl.camera import FrameSource, mirrored_note
+from perchctl.errors import Interrupted, NotFound, SafetyAbort
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import GroundCriteria, RestCheck
 from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
 from perchctl.flight.preflight import (
     Arming,
+    GroundTurn,
     abort_on,
     disarm_on_word,
     refuse_unfit_vehicle,
@@ -146,7 +147,8 @@ def _wait_until_ready(
     told: Callable[[SentCommand], None],
 ) -> None:
     refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
-    started_s, at_rest, arming = parts.clock.now(), RestCheck(), Arming()
+    decks, arming = parts.link.decks(), Arming()
+    started_s, at_rest = parts.clock.now(), RestCheck()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
@@ -158,16 +160,24 @@ def _wait_until_ready(
         feed = _outside(parts, inputs, now_s)
         refuse_wrong_positions(feed, newest, parts.profile, now_s, at_rest)
         turns.report_waiting_turn(inputs, now_s, feed)
-        waiting = still_waiting_for(
-            newest,
-            inputs.frames > 0,
-            inputs.camera_problem or inputs.perception.refused,
-            now_s - started_s,
-            parts.profile,
-            inputs.target(now_s),
-            0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
-            feed,
+        if inputs.perception.is_mirrored:
+            raise SafetyAbort(mirrored_note(parts.profile.camera))
+        if parts.profile.safety.land_on_log_error and (problem := _log_problem(parts)):
+            raise SafetyAbort(f"flight log: {problem}, and safety.land_on_log_error is set")
+        seen = GroundTurn(
+            profile=parts.profile,
+            waited_s=now_s - started_s,
+            samples=inputs.history.samples,
+            telemetry_age_s=inputs.telemetry_age_s(now_s),
+            decks=decks,
+            feed=feed,
+            picture_problem=inputs.picture_problem(now_s),
+            unseen_s=now_s - inputs.last_good_frame_s,
+            target=inputs.target(now_s),
+            link_problem=parts.link.problem(now_s),
+            took_s=parts.clock.now() - now_s,
         )
+        waiting = still_waiting_for(seen)
         if parts.source.finished:
             raise NotFound(
                 f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
@@ -273,6 +283,10 @@ def _mission(
         clock.wait_until(due_s)
 
 
+def _log_problem(parts: FlightParts) -> str | None:
+    return next((watcher.problem for watcher in parts.watchers if watcher.problem), None)
+
+
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
     """The status of the external positions, or of those by the target; None with decks."""
     if inputs.target_positioning is not None:
@@ -292,7 +306,7 @@ def _observe(
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
         operator=parts.operator(),
-        log_problem=next((w.problem for w in parts.watchers if w.problem), None),
+        log_problem=_log_problem(parts),
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,
     )

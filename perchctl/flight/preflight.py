@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
+    REST_S,
     GroundCriteria,
     Problem,
     RestCheck,
@@ -67,7 +69,7 @@ def refuse_wrong_positions(
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
         return  # unknown: not judged, and nothing is forgotten
     criteria = GroundCriteria(telemetry, profile)
-    stands = criteria.not_level is None and criteria.not_still is None
+    stands = criteria.stands
     # The last position before a problem may have been elsewhere.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
@@ -79,24 +81,42 @@ def refuse_wrong_positions(
         abort_on(rest_check.moved_body_problem(place, profile))
 
 
-def still_waiting_for(
-    telemetry: Telemetry | None,
-    has_frame: bool,
-    camera_problem: str | None,
-    waited_s: float,
-    profile: Profile,
-    target: TargetEstimate | None = None,
-    telemetry_age_s: float = 0.0,
-    feed: FeedStatus | None = None,
-) -> str:
-    """Return in words what take-off still waits for; empty when ready. Errors: TimedOut after too
-    long a wait, SafetyAbort off the ground or too near to the target."""
+@dataclass(frozen=True)
+class GroundTurn:
+    """What the loop knows in one turn before take-off.
+
+    `waited_s`: how long it has waited in all; `took_s`: how long this turn took so far;
+    `samples`: the telemetry of the last moments, oldest first, the newest `telemetry_age_s` old;
+    `picture_problem`: why there is no good and fresh picture, `unseen_s` after the last one;
+    `link_problem`: what is wrong with the link.
+    """
+
+    profile: Profile
+    waited_s: float
+    samples: Sequence[Telemetry] = ()
+    telemetry_age_s: float = 0.0
+    decks: Sequence[str] = ()
+    feed: FeedStatus | None = None
+    picture_problem: str | None = None
+    unseen_s: float = 0.0
+    target: TargetEstimate | None = None
+    link_problem: str | None = None
+    took_s: float = 0.0
+
+
+def still_waiting_for(turn: GroundTurn) -> str:
+    """Return in words what take-off still waits for; empty when ready, by this turn alone: what was
+    good before and is not now is waited for again. Errors: TimedOut after too long a wait,
+    SafetyAbort off the ground or too near to the target."""
+    profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
     limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
-    if telemetry is None:
+    if not turn.samples:
         return _bounded("telemetry", waited_s, limit_s)
-    if telemetry_age_s > profile.safety.telemetry_hold_s:
-        return _bounded(f"telemetry (the newest is {telemetry_age_s:.1f} s old)", waited_s, limit_s)
-    criteria = GroundCriteria(telemetry, profile)
+    if not turn.telemetry_age_s <= profile.safety.telemetry_hold_s:
+        old = f"telemetry (the newest is {turn.telemetry_age_s:.1f} s old)"
+        return _bounded(old, waited_s, limit_s)
+    telemetry = turn.samples[-1]
+    criteria = GroundCriteria(telemetry, profile, turn.decks)
     unsent = None if feed is None else unsent_problem(feed, profile)
     seen = None if feed is None else feed.measured
     waiting = _first(
@@ -109,22 +129,41 @@ def still_waiting_for(
         }
     )
     if not waiting:
+        waiting = _first({"the state estimate to stand still": _unrest(turn.samples, profile)})
+        limit_s += REST_S if waiting else 0.0
+    if not waiting:
         abort_on(criteria.off_ground)
         waiting = _first(
             {
+                "a reading of the battery": criteria.battery_unknown,
                 "the vehicle to stand level": criteria.not_level,
                 "the vehicle to stand still": criteria.not_still,
                 "the supervisor to allow flight": criteria.supervisor_not_ready,
             }
         )
-    if not waiting and not has_frame:
-        waiting = f"a good picture ({camera_problem or 'none has come'})"
-        limit_s = profile.camera.start_timeout_s
+    if not waiting and turn.link_problem:
+        waiting = f"the link ({turn.link_problem})"
+    if not waiting and turn.picture_problem:
+        waiting = f"a good picture ({turn.picture_problem})"
+        others_s, limit_s = limit_s + REST_S, profile.camera.start_timeout_s
+        if waited_s <= others_s + limit_s:  # it may have failed while others were waited for
+            waited_s = min(waited_s, turn.unseen_s)
     waiting = waiting or _first({"a sight of the target, which measures the position": unsent})
+    if not waiting and not turn.took_s <= profile.safety.loop_late_hold_s:
+        waiting = f"the flight loop to keep up (a turn took {turn.took_s:.1f} s)"
     if not waiting:
-        abort_on(criteria.target_too_near(target))
+        abort_on(criteria.target_too_near(turn.target))
         return ""
     return _bounded(waiting, waited_s, limit_s)
+
+
+def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
+    """The problem of an estimate that moves, or was not yet seen to stand still for long enough."""
+    since_s = [sample.t_s for sample in samples if sample.start == samples[-1].start]
+    seen_s = since_s[-1] - since_s[0] if since_s else 0.0
+    if seen_s < REST_S:
+        return Problem(f"seen for {seen_s:.1f} of {REST_S:g} s", "let it stand")
+    return GroundCriteria.moving_estimate(samples, profile)
 
 
 def _first(problems: Mapping[str, Problem | None]) -> str:

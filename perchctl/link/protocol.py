@@ -87,7 +87,11 @@ class VehicleLink(Protocol):
 
     def telemetry(self) -> list[Telemetry]:
         """The samples (`perchctl.vehicle.Telemetry`: SI, right-handed, `t_s` on the loop's clock)
-        that arrived since the last call, oldest first; at best 100 a second."""
+        that arrived since the last call, oldest first; at best 100 a second.
+
+        Take-off also asks for `battery_v`, `velocity_variance_m2ps2` and `height_variance_m2` (with
+        a Lighthouse or Loco deck `position_variance_m2`): a profile names what is never reported
+        in `link.unreported`."""
 
     def send(self, command: Command) -> None:
         """Hand one command of `perchctl.vehicle` to the vehicle, about 50 times a second.

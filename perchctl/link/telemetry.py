@@ -10,7 +10,7 @@ import math
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from perchctl.errors import NotFound, TimedOut
@@ -35,19 +35,27 @@ ATTITUDE_BLOCK: dict[str, str] = {
 BATTERY_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
 """Without it the battery is unknown, which the flight copes with (fault 7)."""
 
-VARIANCE_BLOCK = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
-"""Only where the Kalman estimator runs; a firmware without it is not refused."""
+POSITION_VARIANCES = tuple(f"kalman.var{axis}" for axis in "XYZ")
+VELOCITY_VARIANCES = tuple(f"kalman.varP{axis}" for axis in "XYZ")
+"""`P` is the filter's letter for the velocity, in body axes (docs/firmware.md, "Variances")."""
+VARIANCE_BLOCK = dict.fromkeys((*POSITION_VARIANCES, *VELOCITY_VARIANCES), "float")
+"""24 bytes; only where the firmware has the Kalman estimator."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
 
 def telemetry_from_log(
-    values: Mapping[str, float], t_s: float, behind_s: float = 0.0, start: int = 0
+    values: Mapping[str, float],
+    t_s: float,
+    behind_s: float = 0.0,
+    start: int = 0,
+    *,
+    battery_behind_s: float = 0.0,
+    variance_behind_s: float = 0.0,
 ) -> Telemetry:
-    """Return telemetry from log variables by name; `behind_s` and `start` as in `Telemetry`.
-    Raises KeyError when a needed value is missing."""
+    """Return telemetry from log variables by name; the other arguments as in `Telemetry`. Raises
+    KeyError when a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
-    variances = [values[name] for name in VARIANCE_BLOCK if name in values]
     return Telemetry(
         t_s=t_s,
         position_m=(x_m, y_m, z_m),
@@ -60,13 +68,26 @@ def telemetry_from_log(
         battery_v=values.get("pm.vbat", 0.0),
         supervisor=int(values["supervisor.info"]),
         battery_state=int(values.get("pm.state", 0)),
-        position_variance_m2=max(variances) if variances else None,
-        climb_variance_m2ps2=values.get("kalman.varPZ"),
+        position_variance_m2=_largest(values, POSITION_VARIANCES),
+        climb_variance_m2ps2=_largest(values, VELOCITY_VARIANCES[2:]),
         behind_s=behind_s,
         acc_x_g=values["acc.x"],
         acc_y_g=values["acc.y"],
         start=start,
+        battery_behind_s=battery_behind_s,
+        variance_behind_s=variance_behind_s,
+        velocity_variance_m2ps2=_largest(values, VELOCITY_VARIANCES),
+        height_variance_m2=_largest(values, POSITION_VARIANCES[2:]),
     )
+
+
+def _largest(values: Mapping[str, float], names: Sequence[str]) -> float | None:
+    """The largest of these variances, NaN if one is; None where one is missing, or zero: a filter
+    that runs keeps each at 1e-6 at least, one that never ran has zeros (source)."""
+    found = [values.get(name, 0.0) for name in names]
+    if any(variance == 0.0 for variance in found):
+        return None
+    return math.nan if any(map(math.isnan, found)) else max(found)
 
 
 # --- The vehicle's milliseconds on the loop's clock ---
@@ -137,13 +158,13 @@ class SampleAssembler:
     """Makes telemetry samples of the newest values of all log blocks.
 
     Only the attitude's block completes a sample; the other values are the last that came. By how
-    much the position's block is older is written into the sample (`Telemetry.behind_s`), since
-    frozen numbers look like a vehicle at rest.
+    much each other block is older is written into the sample (`Telemetry.behind_s` and the like),
+    since frozen numbers look like a vehicle at rest.
     """
 
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
-        self._state_s: float | None = None
+        self._came_s: dict[str, float] = {}  # of each block since the newest start
         self._start = 0
 
     def accept(
@@ -156,14 +177,20 @@ class SampleAssembler:
         if start < self._start:
             return None
         if start > self._start:
-            self._start, self._state_s = start, None
+            self._start, self._came_s = start, {}
         self._values.update(values)
-        if block == "state":
-            self._state_s = t_s
-        if block != "attitude" or self._state_s is None:
+        self._came_s[block] = t_s
+        if block != "attitude" or "state" not in self._came_s:
             return None
-        behind_s = t_s - self._state_s
-        return telemetry_from_log(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
+        behind_s = {name: t_s - self._came_s.get(name, -math.inf) for name in BLOCKS}
+        return telemetry_from_log(
+            _carried(self._values, behind_s["state"]),
+            t_s,
+            max(0.0, behind_s["state"]),
+            start,
+            battery_behind_s=max(0.0, behind_s["battery"]),
+            variance_behind_s=max(0.0, behind_s["variance"]),
+        )
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:

@@ -285,7 +285,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
         c.placed and math.hypot(*c.telemetry.velocity_mps[:2]) > KNOCKED_MPS
     ),
     Condition.SATURATED: _saturated,
-    Condition.UNSURE: lambda c: c.variance_m2 > c.safety.flight_variance_m2,
+    Condition.UNSURE: lambda c: c.is_unsure,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: _battery_is_low,
     Condition.OTHERWISE: _moves_otherwise,

@@ -36,7 +36,9 @@ class Context:
         height_m: above the ground that the flight started from.
         attitude_age_s: age of attitude, acceleration, thrust and supervisor bits, which come
             together; `imu_proves`: they are new enough to prove anything.
-        variance_m2: variance of the position; 0 if the firmware reports none, infinite for a NaN.
+        velocity_variance_m2ps2: variance of the estimated velocity; `position_variance_m2`: of the
+            position, with decks of the height alone, since a Flow deck measures no other. Infinite
+            if unknown, 0 if `link.unreported` says so. `is_unsure`: one of them is too large.
         thrust_is_known: the measured thrust follows the ordered thrust.
         reads_one_g: the accelerometer reads 1 g, as on anything that is supported.
         telemetry_age_s: age of the oldest part of the telemetry; a frozen reading is as old as its
@@ -83,15 +85,24 @@ class Context:
         self.speed_mps = math.sqrt(sum(v * v for v in tel.velocity_mps))
         up = math.cos(tel.roll_rad) * math.cos(tel.pitch_rad)
         self.tilt_rad = math.acos(max(-1.0, min(1.0, up)))
-        variance = tel.position_variance_m2 or 0.0
-        self.variance_m2 = math.inf if math.isnan(variance) else variance
+        by_deck = profile.positioning.by == "deck"
+        place_m2 = tel.height_variance_m2 if by_deck else tel.position_variance_m2
+        unknown = 0.0 if "variance" in profile.link.unreported else math.inf
+        self.velocity_variance_m2ps2, self.position_variance_m2 = (
+            unknown if reported is None else reported if reported >= 0.0 else math.inf
+            for reported in (tel.velocity_variance_m2ps2, place_m2)
+        )
+        self.is_unsure = (
+            self.velocity_variance_m2ps2 > profile.safety.flight_velocity_variance_m2ps2
+            or self.position_variance_m2 > profile.safety.flight_variance_m2
+        )
         unanswered_s = state.unanswered_s
         self.thrust_is_known = unanswered_s is None or obs.t_s - unanswered_s <= ANSWER_S
         oldest_s = max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
         self.telemetry_age_s = obs.t_s - tel.t_s + oldest_s
         self.proves = self.telemetry_age_s <= profile.safety.proof_age_s
         self.position_age_s = obs.position_age_s
-        if profile.positioning.by == "deck":
+        if by_deck:
             self.position_age_s = max(obs.position_age_s, imu.corrections.age_s(obs.t_s))
         self.position_is_stale = self.position_age_s > profile.positioning.hold_s
         doubted = state.astray or (self.by_sight and obs.mismatch is not None)

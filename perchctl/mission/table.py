@@ -93,7 +93,7 @@ OTHERWISE_S, BELOW_S, WEAK_S, UNSTOPPED_S = 0.1, 0.3, 2.0, 10.0
 SWINGS_MPS = 0.5  # only swings of position control sink so fast
 BLIND_PRESS_S = 1.25
 HELD_S = 2.0  # by then the magnet has been told from others
-BLIND_VARIANCE_M2 = 0.02  # about 3 s after the last sight
+BLIND_VARIANCE_M2PS2 = 0.02  # of the velocity: about 3 s after the last sight
 UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 
 
@@ -158,7 +158,7 @@ def is_position_lost(c: Context) -> bool:
     """True if no position came for `positioning.land_s`, or the estimate is useless earlier."""
     if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
-    return c.by_sight and c.position_is_stale and c.variance_m2 > BLIND_VARIANCE_M2
+    return c.by_sight and c.position_is_stale and c.velocity_variance_m2ps2 > BLIND_VARIANCE_M2PS2
 
 
 def position_loss_text(c: Context) -> str:
@@ -326,13 +326,25 @@ def hold_reason(c: Context) -> str:
         return f"telemetry is {c.telemetry_age_s:.1f} s old"
     if c.state.jump_s is not None:
         return "the state estimate jumped"
-    if c.variance_m2 > c.safety.flight_variance_m2:
-        return f"the state estimate is unsure (variance {c.variance_m2:.2g} m^2)"
+    if c.is_unsure:
+        return f"the state estimate is unsure ({unsure_text(c)})"
     if c.obs.loop_late_s > c.safety.loop_late_hold_s:
         return f"the control loop is {c.obs.loop_late_s:.1f} s late"
     if phase is not P.RECOVER and c.obs.camera_age_s > c.safety.camera_hold_s:
         return no_picture_reason(c)
     return ""
+
+
+def unsure_text(c: Context) -> str:
+    """Text: the variance by which the estimate is unsure, and the most that is allowed."""
+    what, variance, unit = "velocity", c.velocity_variance_m2ps2, "(m/s)^2"
+    most = c.safety.flight_velocity_variance_m2ps2
+    if variance <= most:
+        what = "height" if c.profile.positioning.by == "deck" else "position"
+        variance, most, unit = c.position_variance_m2, c.safety.flight_variance_m2, "m^2"
+    if math.isinf(variance):
+        return f"the {what}'s variance is not known"
+    return f"the {what}'s variance is {variance:.2g} {unit}, at most {most:g} allowed"
 
 
 def no_picture_reason(c: Context) -> str:
@@ -448,10 +460,7 @@ TABLE: tuple[Transition, ...] = (
         "estimate-unsure",
         IN_THE_OPEN,
         lambda c: c.held_s(C.UNSURE) >= c.safety.variance_land_s,
-        lambda c: (
-            f"the position's variance is {c.variance_m2:.2g} m^2, at most "
-            f"{c.safety.flight_variance_m2:g} allowed: is the positioning system gone?"
-        ),
+        lambda c: f"{unsure_text(c)}: is the positioning system gone?",
     ),
     land_row(
         "battery-low",

@@ -25,7 +25,8 @@ FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first.
+    """Telemetry of the last `KEEP_S`, oldest first, and the one sample before: together they show
+    the whole of that time, however far apart the samples are.
 
     In the newest samples, `jumped`: the estimate stepped; `turned_rad`: the heading's largest step.
     `battery_changed_s`: when the battery's reading last changed, or first came; `imu`: motion by
@@ -75,8 +76,8 @@ def add_samples(
         imu = imu.with_sample(samples[-1] if samples else None, sample)
         samples.append(sample)
     if samples:
-        oldest_s = samples[-1].t_s - KEEP_S
-        samples = samples[bisect.bisect_left(samples, oldest_s, key=_time_s) :]
+        within = bisect.bisect_left(samples, samples[-1].t_s - KEEP_S, key=_time_s)
+        samples = samples[max(0, within - 1) :]
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
 
 
@@ -166,7 +167,8 @@ def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
 
 
 def is_finite(s: Telemetry) -> bool:
-    """True if all values of a sample that steer a flight are finite."""
+    """True if all values of a sample that steer a flight are finite, its times among them."""
+    times = s.t_s, s.behind_s
     attitude = s.roll_rad, s.pitch_rad, s.yaw_rad
     forces = s.acc_x_g, s.acc_y_g, s.acc_z_g, s.thrust
-    return _is_placed(s) and all(map(math.isfinite, (*attitude, *forces)))
+    return _is_placed(s) and all(map(math.isfinite, (*times, *attitude, *forces)))

@@ -223,8 +223,12 @@ class SafetyConfig(Section):
     """Step of the heading from which it goes down at once, level, by raw thrust."""
     jump_mps: ClassVar[float] = 1.0
     """Such a step of its velocity."""
-    flight_variance_m2: ClassVar[float] = 0.05  # of the position in flight: above it, held
-    variance_land_s: ClassVar[float] = 1.0  # above it for so long: landed
+    flight_velocity_variance_m2ps2: ClassVar[float] = 0.05
+    """Above it in flight, held: 4.5 s after the last position. Larger, and it drifts longer."""
+    flight_variance_m2: ClassVar[float] = 0.05
+    """Above it, of the position, held as well: the estimator has started again, or has lost the
+    positions for 3 s. With decks it is the height's."""
+    variance_land_s: ClassVar[float] = 1.0  # above one of them for so long: landed
     jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
     max_height_m: float = key(
         3.0, "height above ground beyond which the vehicle lands", gt=0, le=20
@@ -239,8 +243,12 @@ class SafetyConfig(Section):
     loop_late_land_s: ClassVar[float] = 1.0
     """With a turn of the loop so late it lands."""
     estimator_wait_s: ClassVar[float] = 10.0  # on the ground
+    estimator_velocity_variance_m2ps2: ClassVar[float] = 0.01
+    """A larger variance of the velocity refuses take-off. Ranging anchors give up to 0.007, an
+    estimator that gets no position passes it within 1 s."""
     estimator_variance_m2: ClassVar[float] = 0.01
-    """A larger variance of the position refuses take-off."""
+    """A larger variance of the position refuses take-off. Ranging anchors give 0.0013; after a
+    reset it is 1 m^2 in height and 100 m^2 level, until the first position."""
     ground_z_m: float = key(0.0, "the estimate's height of the ground at take-off", ge=-10, le=10)
     ground_tolerance_m: float = key(
         0.15, "farther from `ground_z_m` the vehicle hangs or is held: no take-off", gt=0, le=10

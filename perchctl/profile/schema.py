@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import difflib
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -48,6 +48,11 @@ class LinkConfig(Section):
         description="firmware parameters, set and read back before the flight; none turns a motor",
     )
     telemetry_period_s: float = key(0.01, "period of position and attitude", ge=0.01, le=0.1)
+    unreported: tuple[Literal["battery", "variance"], ...] = key(
+        (),
+        "`battery`, `variance`: readings that this vehicle never reports, and that take-off then "
+        "does not need",
+    )
     loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
 
     @field_validator("parameters")

@@ -27,10 +27,11 @@ from perchctl.vehicle import (
 from perchctl.vision import MARKERS, PipelineOutput, TargetEstimate
 
 FORMAT = "perchctl-flight-log"
-SCHEMA_VERSION = 4
-READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
+SCHEMA_VERSION = 5
+READABLE_VERSIONS = (1, 2, 3, 4, SCHEMA_VERSION)
 """1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
-turns; 3 neither why a turn was decided so, nor what was sent in the loop's place."""
+turns; 3 neither why a turn was decided so, nor what was sent in the loop's place. Up to 4 the
+variance of the velocity had the position's name, and that of the position was not known."""
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
@@ -62,7 +63,9 @@ FIELDS: dict[str, str] = {
     "battery_left_s": "hover time left until row `battery-low` lands, by the energy model",
     "battery_attempts": "further attempts that the battery allows, with a landing",
     "supervisor": "supervisor bits",
-    "var_m2": "largest of the estimator's position variances",
+    "vel_var_m2ps2": "largest of the estimator's velocity variances",
+    "pos_var_m2": "largest of the estimator's position variances; with a Flow deck always 100",
+    "height_var_m2": "the estimator's variance of the height",
     "tel_age_s": "age of the telemetry sample",
     # positions from outside, as they are sent to the vehicle; None where its decks measure them
     "pos_age_s": "age of the last external position sent, since its exposure",
@@ -181,7 +184,9 @@ def _telemetry_values(tel: Telemetry) -> dict[str, Any]:
         **_xyz("", tel.position_m),
         **_xyz("v", tel.velocity_mps, "mps"),
         **{name: getattr(tel, name) for name in same.split()},
-        "var_m2": tel.position_variance_m2,
+        "vel_var_m2ps2": tel.velocity_variance_m2ps2,
+        "pos_var_m2": tel.position_variance_m2,
+        "height_var_m2": tel.height_variance_m2,
     }
 
 

@@ -265,6 +265,11 @@ class FlightLog:
         except ValueError as error:
             raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
+    @property
+    def has_position_variance(self) -> bool:
+        """True if the log tells the position's variance, where the vehicle reported it."""
+        return bool(self.header.get("version", 0) >= NAMED_VERSION)
+
     def flown_mask(self, camera: CameraModel) -> NDArray[np.bool_] | None:
         """The mask (height, width), True on the gear; None without a mask. Errors: InvalidValue."""
         text = self.header.get("mask")
@@ -314,6 +319,8 @@ def read_log(path: Path | str) -> FlightLog:
     for number, line in enumerate(lines[1:], start=2):
         try:
             record = _checked(decode_line(line))
+            if header["version"] < NAMED_VERSION:
+                record = _with_named_variance(record)
         except ValueError as error:
             bad = bad or (number, str(error))
             ignored += len(line)
@@ -401,6 +408,21 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
     if not is_time and kind not in ("summary", "recording"):
         raise ValueError(f"t_s must be a number of seconds, found {t_s!r}")
     return record
+
+
+NAMED_VERSION = 5
+"""From here on a log has the variances of velocity and position under their own names."""
+_NAMES = {"position_variance_m2": "velocity_variance_m2ps2", "var_m2": "vel_var_m2ps2"}
+
+
+def _with_named_variance(value: Any) -> Any:
+    """A value of an older log with the velocity's variance under its own name, not under that of
+    the position's."""
+    if isinstance(value, list):
+        return [_with_named_variance(part) for part in value]
+    if isinstance(value, dict):
+        return {_NAMES.get(key, key): _with_named_variance(part) for key, part in value.items()}
+    return value
 
 
 def _without_kind(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -30,6 +30,7 @@ from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import Scenario, SimulatedVehicle
+from perchctl.vehicle import Telemetry
 from perchctl.vision import make_pipeline
 from tests.helpers.mission import target_at
 
@@ -64,9 +65,10 @@ def rehearsed(
     fault: CameraFault | None = None,
     away_m: float = NEAR_M,
     duration_s: float = 0.4,
+    felt: Callable[[Telemetry], Telemetry] = lambda sample: sample,
     **scenario: Any,
 ) -> Rehearsal:
-    """On the pictures of a vehicle that is held under the target."""
+    """On the pictures of a vehicle that is held under the target; `felt` changes its telemetry."""
     changed = {"camera_noise_sigma": 4.0, "camera_jitter_s": 0.002} | scenario
     vehicle = SimulatedVehicle(Scenario(**changed), CAMERA, PROFILE.target)
     z_m = vehicle.scenario.ceiling_z_m - away_m - 0.03
@@ -77,7 +79,11 @@ def rehearsed(
     if fault is not None:
         source.begin_fault(fault, 0.4)
     clock = LockstepClock(link)
-    return rehearse(link.telemetry, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
+
+    def take() -> list[Telemetry]:
+        return [felt(sample) for sample in link.telemetry()]
+
+    return rehearse(take, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
 
 
 def rows_of(done: Rehearsal, profile: Profile = PROFILE) -> dict[str, Row]:
@@ -231,6 +237,22 @@ def test_a_missing_camera_skips_the_rest(text: str, advice: str) -> None:
 
 
 # --- The rehearsal itself, and the computer ---------------------------------------------
+
+
+def test_a_target_has_a_place_only_while_the_vehicle_stands() -> None:
+    """A vehicle in a hand moves, and the target does not: nothing is said against it."""
+    done, _ = good()
+    first_s, last_s = done.target_places[0][0], done.target_places[-1][0]
+    lifted_s = 0.5 * (first_s + last_s)
+
+    def carried(sample: Telemetry) -> Telemetry:
+        return replace(sample, acc_z_g=1.3) if lifted_s < sample.t_s < lifted_s + 0.1 else sample
+
+    later = rehearsed(**FAULTS["none"], felt=carried)
+    assert later.target_pictures == done.target_pictures
+    assert lifted_s < later.target_places[0][0] < later.target_places[-1][0]
+    in_hand = rehearsed(**FAULTS["none"], felt=lambda sample: replace(sample, acc_z_g=1.3))
+    assert not in_hand.target_places
 
 
 def test_a_rehearsal_needs_no_vehicle() -> None:

@@ -111,6 +111,8 @@ FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("body place", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "look like millimetres"),
     ("body place", Scripted(y_up), "fail", "swapped axes: up is y"),
     ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.0, 0.0, 1.4))), "fail", "1.40"),
+    ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.05 * t_s, 0.0, 0.02))), "fail",
+     "has moved by 0.15 m, and it stands still"),
 ]  # fmt: skip
 
 
@@ -120,6 +122,17 @@ def test_a_fault_makes_its_row(name: str, it: Scripted, verdict: str, words: str
     assert row.verdict == verdict, row
     assert words in row.found
     assert row.advice
+
+
+def test_a_body_that_was_carried_to_its_place_is_no_other_one() -> None:
+    it = Scripted(lambda t_s, pose: moved(pose, position_m=(min(0.1 * t_s, 0.2), 0.0, 0.02)))
+    rest = telemetry(0.0, 0.02, thrust=0.0, supervisor=READY)
+
+    def heard() -> list[Telemetry]:
+        return [replace(rest, t_s=it.now_s, acc_z_g=1.3 if it.now_s < 2.0 else 1.0)]
+
+    seen = capture.collect_samples(heard, it, it.clock, it.wait)
+    assert capture.mocap_rows_at_rest(seen, PROFILE)[-1].verdict is Verdict.PASS
 
 
 def test_a_tilted_vehicle_is_not_judged() -> None:

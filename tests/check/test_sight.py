@@ -33,6 +33,12 @@ def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) ->
     return replace(made, **changes)
 
 
+def wandering(mps: float) -> list[Any]:
+    """Three seconds of a target that moves; its first sight is off."""
+    times = [0.05 * k for k in range(60)]
+    return [(t_s, np.array((mps * t_s + 0.5 * (t_s == 0.0), 0.0, 2.0))) for t_s in times]
+
+
 def rows_of(done: Rehearsal, profile: Profile = TARGET) -> dict[str, Row]:
     found = picture_rows(done, profile, CAMERA)
     return {row.name: row for row in found if row.name == IN_VIEW}
@@ -49,6 +55,9 @@ def test_under_the_target_it_passes() -> None:
      rehearsed(target_pictures=0, target=None)),
     ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
     ("warn", "not at the end", "lost frames", rehearsed(target=None)),
+    ("fail", "has moved by 0.12 m, and it stands still", "hang still",
+     rehearsed(target_places=wandering(0.05))),
+    ("pass", "now, and at", "", rehearsed(target_places=wandering(0.01))),
     ("skipped", "no picture came", "", rehearsed(pictures=0)),
 ])  # fmt: skip
 def test_a_sight_makes_its_row(verdict: str, words: str, advice: str, done: Rehearsal) -> None:
@@ -66,7 +75,7 @@ def test_a_latency_that_is_written_down_is_doubted() -> None:
 
 def test_decks_and_an_estimate_are_not_asked_for() -> None:
     """Its estimate runs away while nothing is sent, and says nothing against it."""
-    away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
+    away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), velocity_variance_m2ps2=50.0)
     vehicle = VehicleStatus("radio://0/80/2M", telemetry=away)
     rows = {row.name: row for row in evaluate_rows(VEHICLE, vehicle, TARGET)}
     assert rows["positioning"].found == "by the target, see in view"

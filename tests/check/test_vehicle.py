@@ -31,9 +31,10 @@ from perchctl.vehicle import (
     LOCKED,
     LOW_POWER,
     TUMBLED,
+    Telemetry,
 )
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
-from tests.helpers.mission import READY
+from tests.helpers.mission import BY_TARGET, MOCAP, READY
 
 pytestmark = pytest.mark.long
 
@@ -144,6 +145,12 @@ GOOD = VehicleStatus(
 
 
 TWO_CELLS_V = (4.5, 6.05, 8.38)  # down to the protection of each cell; empty; full
+def running_away(mps: float) -> list[Telemetry]:
+    """Five seconds in which the estimate leaves while the accelerometer reads 1 g."""
+    times = (0.01 * k for k in range(501))
+    return [said(t_s=t_s, position_m=(mps * t_s, 0.0, 0.0)) for t_s in times]
+
+
 ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("packets", "warn", {"round_trips_s": [0.004] * 97 + [math.inf] * 3}),
     ("packets", "fail", {"round_trips_s": [0.004] * 80 + [math.inf] * 20}),
@@ -165,10 +172,14 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
         )
     ),
     ("positioning", "fail", {"decks": ("bcBuzzer",)}),
-    ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
-    ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
-    ("estimator", "skipped", {"telemetry": said(position_variance_m2=None)}),
+    ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=0.5)}),
+    ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=math.nan)}),
+    ("estimator", "fail", {"telemetry": said(height_variance_m2=1.0)}),
+    ("estimator", "fail", {"telemetry": said(velocity_variance_m2ps2=None)}),
+    ("estimator", "fail", {"telemetry": said(height_variance_m2=None)}),
+    ("estimator", "fail", {"telemetry": said(variance_behind_s=3.0)}),
     ("estimator", "warn", {"displacement_m": 0.2}),
+    *(("estimator", "fail", {"samples": running_away(mps)}) for mps in (0.05, 0.3, 1.0)),
     ("ground", "fail", {"telemetry": said(position_m=(0.0, 0.0, 2.1))}),
     ("ground", "fail", {"telemetry": said(position_m=(math.nan, 0.0, 0.0))}),
     ("level", "warn", {"telemetry": said(roll_rad=math.radians(5.0))}),
@@ -178,7 +189,9 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     *(("battery", "fail", {"telemetry": said(battery_v=volts)}) for volts in TWO_CELLS_V),
     ("battery", "warn", {"telemetry": said(battery_v=3.85)}),
     ("battery", "fail", {"telemetry": said(battery_state=LOW_POWER)}),
-    ("battery", "skipped", {"telemetry": said(battery_v=math.nan)}),
+    ("battery", "fail", {"telemetry": said(battery_v=math.nan)}),
+    ("battery", "fail", {"telemetry": said(battery_v=0.0)}),
+    ("battery", "fail", {"telemetry": said(battery_behind_s=3.0)}),
 ]  # fmt: skip
 
 
@@ -215,3 +228,37 @@ def test_an_old_profile_s_limit_is_the_flight_s() -> None:
     strict = Profile.model_validate({"safety": {"min_rest_v": 4.1}})
     vehicle = replace(GOOD, telemetry=said(battery_v=4.0))
     assert rows_of(vehicle, strict)["battery"].verdict is Verdict.FAIL
+
+
+@pytest.mark.parametrize(("decks", "verdict"), [
+    (("bcFlow2",), "pass"),
+    (("bcFlow2", "bcLighthouse4"), "fail"),
+    (("bcLoco",), "fail"),
+])  # fmt: skip
+def test_the_position_s_variance_counts_where_a_deck_measures_it(
+    decks: tuple[str, ...], verdict: str
+) -> None:
+    """A Flow deck measures the speed over ground: the place level with it is never measured."""
+    status = replace(GOOD, decks=decks, telemetry=said(position_variance_m2=100.0))
+    row = rows_of(status)["estimator"]
+    assert row.verdict == verdict
+    assert ("the position's variance is 100" in row.found) is (verdict == "fail")
+
+
+@pytest.mark.parametrize("profile", [MOCAP, BY_TARGET], ids=["mocap", "target"])
+def test_until_fly_sends_positions_a_flow_deck_measures_the_height_alone(profile: Profile) -> None:
+    status = replace(GOOD, telemetry=said(position_variance_m2=100.0))
+    assert rows_of(status, profile)["estimator"].verdict is Verdict.PASS
+    away = replace(status, samples=running_away(0.05))
+    assert rows_of(away, profile)["estimator"].verdict is Verdict.FAIL
+
+
+def test_what_the_profile_says_is_never_reported_is_skipped() -> None:
+    profile = Profile.model_validate({"link": {"unreported": ["battery", "variance"]}})
+    silent = said(
+        battery_v=math.nan, velocity_variance_m2ps2=None, height_variance_m2=None,
+        battery_behind_s=math.inf, variance_behind_s=math.inf,
+    )  # fmt: skip
+    rows = rows_of(replace(GOOD, telemetry=silent), profile)
+    for name in ("estimator", "battery"):
+        assert (rows[name].verdict, "link.unreported" in rows[name].found) == ("skipped", True)

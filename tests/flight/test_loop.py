@@ -13,12 +13,30 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, SafetyAbort, TimedOut
-from perchctl.flight.preflight import still_waiting_for
+from perchctl.flight.preflight import GroundTurn, still_waiting_for
 from perchctl.mission import EventKind, FlightReport, Operator, Outcome, Tick
 from perchctl.perception import perception
-from perchctl.vehicle import CRASHED, DECK_FAULT, FLYING, LOCKED, TUMBLED, Land, PositionSetpoint
+from perchctl.vehicle import (
+    CRASHED,
+    DECK_FAULT,
+    FLYING,
+    LOCKED,
+    TUMBLED,
+    Land,
+    PositionSetpoint,
+    Telemetry,
+)
 from perchctl.vision.types import Detections
-from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle, noise
+from tests.helpers.hangs import hang_in_the_camera
+from tests.helpers.loop_rig import (
+    PROFILE,
+    Camera,
+    Guarded,
+    Rig,
+    SleepyClock,
+    Vehicle,
+    noise,
+)
 from tests.helpers.mission import READY, changed, target_at, telemetry
 
 PERIOD_S = 1.0 / PROFILE.link.loop_hz
@@ -99,7 +117,11 @@ def test_a_log_that_fails_is_said_once_and_landed_for_where_the_profile_wants_it
 ) -> None:
     rig = Rig(profile=changed({"safety.land_on_log_error": strict}))
     rig.operator = land_after(rig, 3.0)
-    rig.watcher.problem = "the disk is full"
+
+    def fill_up(tick: Tick) -> None:
+        rig.watcher.problem = "the disk is full"
+
+    rig.watcher.on_tick = fill_up
     report = rig.fly()
     assert report.outcome is (Outcome.SAFETY if strict else Outcome.OPERATOR)
     assert ("the disk is full" in report.reason) is strict
@@ -159,9 +181,20 @@ AT_ONCE: list[tuple[dict[str, Any], str]] = [
     ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
 ]
 IN_TIME: list[tuple[dict[str, Any], str]] = [
-    ({"position_variance_m2": 0.5}, r"settle.*variance 0\.5.*positioning"),
-    ({"position_variance_m2": math.nan}, "settle"),
-    ({"position_variance_m2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
+    ({"velocity_variance_m2ps2": 0.5}, r"settle.*velocity's variance is 0\.50 \(m/s\)\^2, at most"),
+    ({"velocity_variance_m2ps2": math.nan}, r"settle.*is there a positioning system"),
+    ({"height_variance_m2": 1.0}, r"settle.*height's variance is 1\.00 m\^2, at most 0\.01"),
+    ({"height_variance_m2": math.nan}, "settle"),
+    ({"velocity_variance_m2ps2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
+    ({"velocity_variance_m2ps2": None}, r"settle .the vehicle reports no variance of its velocity"),
+    ({"height_variance_m2": None}, r"no variance of its height: .*link\.unreported: \[variance\]"),
+    ({"variance_behind_s": 3.0}, r"settle .its variances are 3\.0 s old"),
+    ({"variance_behind_s": math.nan}, "its variances are nan s old"),
+    ({"battery_v": math.nan}, r"no reading of its battery: .*link\.unreported: \[battery\]"),
+    ({"battery_v": 0.0}, "no reading of its battery"),
+    ({"battery_behind_s": 3.0}, r"the battery's reading is 3\.0 s old"),
+    ({"battery_behind_s": math.inf}, r"the battery's reading is inf s old"),
+    ({"behind_s": math.nan}, "waited 10 s for telemetry"),
     ({"supervisor": 0x06}, "0x0006"),
     ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, at most 10"),
     ({"pitch_rad": -0.2}, "tilted by 11 deg"),
@@ -181,6 +214,28 @@ def test_a_vehicle_that_may_not_fly_or_is_not_ready_in_time_is_refused(
     rig.refused(TimedOut if waits else SafetyAbort, words)
     limit_s = PROFILE.safety.estimator_wait_s if waits else 0.0
     assert rig.link.now_s == pytest.approx(limit_s, abs=0.2 if waits else 0.1)
+
+
+@pytest.mark.parametrize(("unreported", "changes"), [
+    ("battery", {"battery_v": math.nan, "battery_behind_s": math.inf}),
+    ("variance", {"velocity_variance_m2ps2": None, "height_variance_m2": None,
+                  "position_variance_m2": None, "variance_behind_s": math.inf}),
+])  # fmt: skip
+def test_a_profile_may_say_what_its_vehicle_never_reports(
+    unreported: str, changes: dict[str, Any]
+) -> None:
+    rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
+    rig.profile = changed({"link.unreported": (unreported,)})
+    rig.operator = land_after(rig, 3.0)
+    assert rig.fly().outcome is Outcome.OPERATOR
+    assert not any(tick.state.hold for tick in rig.watcher.ticks)
+
+
+@pytest.mark.parametrize("changes", [{"battery_v": 3.4}, {"velocity_variance_m2ps2": 0.5}])
+def test_what_is_reported_all_the_same_still_counts(changes: dict[str, float]) -> None:
+    rig = Rig(Vehicle(lambda sample: replace(sample, **changes)))
+    rig.profile = changed({"link.unreported": ("battery", "variance")})
+    rig.refused(PerchError, "the battery rests at|velocity's variance is")
 
 
 @pytest.mark.parametrize(
@@ -210,6 +265,121 @@ def test_what_does_not_come_is_refused(
     assert limit_s <= vehicle.now_s < limit_s + 0.2
 
 
+# --- What was good once: all of it has to be good at the moment of the take-off -------------------
+
+READY_S = 3.0
+"""Until then the supervisor does not allow flight."""
+
+
+def is_late(changes: Callable[[Telemetry], Telemetry] = lambda s: s) -> Vehicle:
+    return Vehicle(lambda s: changes(s) if s.t_s >= READY_S else replace(s, supervisor=0x06))
+
+
+def once(bad: Callable[[Any], Any]) -> Camera:
+    """Good for a second, and then as `bad` has it."""
+    return Camera(lambda frame: frame if frame.t_arrival_s < 1.0 else bad(frame))
+
+
+@pytest.mark.parametrize(("camera", "words"), [
+    (once(lambda f: None), r"a good picture .none for 8\.0 s"),
+    (once(lambda f: replace(f, image=STILL)), "a good picture .*stands still"),
+    (once(lambda f: replace(f, image=SMALL)), "a good picture .*32x24 px"),
+    (once(lambda f: replace(f, t_s=f.t_s - 5.0)), r"a good picture .*5\.\d s late"),
+], ids=["silent", "frozen", "of another size", "late"])  # fmt: skip
+def test_a_camera_that_was_good_once_is_not_flown_with(camera: Camera, words: str) -> None:
+    rig = Rig(is_late(), camera)
+    rig.refused(TimedOut, words)
+    assert rig.link.now_s == pytest.approx(1.0 + PROFILE.camera.start_timeout_s, abs=0.3)
+
+
+def test_a_camera_that_fell_silent_is_refused_by_its_own_words() -> None:
+    rig = Rig(is_late(), once(lambda f: None))
+    rig.camera.told = None
+
+    def poll(frame: Any) -> Any:
+        rig.camera.told = "the plug was pulled" if frame.t_arrival_s > 1.0 else None
+        return None if rig.camera.told else frame
+
+    rig.camera.alter = poll
+    rig.refused(TimedOut, "a good picture .the plug was pulled")
+
+
+def first_setpoint_s(rig: Rig) -> float:
+    rig.operator = lambda: Operator.LAND if rig.link.said(PositionSetpoint) else Operator.NONE
+    assert rig.fly().outcome is Outcome.OPERATOR
+    return rig.link.said(PositionSetpoint)[0]
+
+
+def test_a_camera_that_comes_back_is_flown_with() -> None:
+    gone = Camera(lambda f: None if 1.0 < f.t_arrival_s < 6.0 else f)
+    assert first_setpoint_s(Rig(is_late(), gone)) == pytest.approx(6.0, abs=0.1)
+    short = Camera(lambda f: None if READY_S - 0.3 < f.t_arrival_s < READY_S + 2.0 else f)
+    assert first_setpoint_s(Rig(is_late(), short)) == pytest.approx(READY_S, abs=0.1)
+
+
+def test_a_single_bad_picture_is_not_the_one_to_take_off_by() -> None:
+    bad = Camera(lambda f: replace(f, image=SMALL) if f.t_arrival_s < 0.05 else f)
+    assert first_setpoint_s(Rig(camera=bad)) == pytest.approx(0.06, abs=0.03)
+    at = Camera(lambda f: replace(f, image=SMALL) if 0 <= f.t_arrival_s - READY_S < 0.05 else f)
+    assert first_setpoint_s(Rig(is_late(), at)) == pytest.approx(READY_S + 0.06, abs=0.03)
+
+
+def test_what_the_rest_was_good_for_is_asked_again() -> None:
+    """Battery, variances, and a position that stands still while the accelerometer does not."""
+    for changes, words in (
+        ({"battery_behind_s": 2.0}, "battery's reading is 2.0 s old"),
+        ({"variance_behind_s": 2.0}, "variances are 2.0 s old"),
+    ):
+        rig = Rig(is_late(lambda s, c=changes: replace(s, **c)))  # type: ignore[misc]
+        rig.refused(TimedOut, words)
+    frozen: dict[str, Any] = {"position_m": (0.0, 0.0, 0.0), "velocity_mps": (0.0, 0.0, 0.0)}
+    rig = Rig(Vehicle(lambda s: replace(s, **frozen) if s.t_s > -1.0 else s))
+    rig.refused(TimedOut, r"telemetry .the newest is 1\d\.\d s old")
+
+
+def test_a_camera_that_is_good_at_wrong_times_is_waited_for_no_longer_than_all() -> None:
+    turn = GroundTurn(
+        PROFILE, 0.0, [telemetry(0.1 * k, 0.0, supervisor=READY) for k in range(21)],
+        picture_problem="snow", unseen_s=0.1,
+    )  # fmt: skip
+    assert still_waiting_for(replace(turn, waited_s=15.0)) == "a good picture (snow)"
+    with pytest.raises(TimedOut, match=r"a good picture \(snow\)"):
+        still_waiting_for(replace(turn, waited_s=20.0))
+
+
+def test_a_link_that_has_a_problem_is_not_flown_with() -> None:
+    rig = Rig(is_late())
+    rig.link.dies_at_s = 2.0
+    rig.refused(TimedOut, r"the link .the script ended the link")
+
+
+def test_a_turn_that_hung_is_not_taken_off_by() -> None:
+    rig = Rig(Guarded())
+    hang_in_the_camera(rig.link, rig.camera, -1.0, 1.0)
+    assert first_setpoint_s(rig) == pytest.approx(1.0, abs=0.1)
+    rig = Rig(Guarded())
+    poll = rig.camera.poll
+
+    def slow(now_s: float) -> Any:
+        frame = poll(now_s)
+        rig.link.advance_to(now_s + 0.4)
+        return frame
+
+    rig.camera.poll = slow  # type: ignore[method-assign]
+    rig.refused(TimedOut, r"the flight loop to keep up .a turn took 0\.4 s")
+
+
+def test_a_mirrored_picture_on_the_ground_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perception.Perception, "is_mirrored", True)
+    Rig().refused(SafetyAbort, "the picture is mirrored: .*camera.mirrored")
+
+
+def test_a_log_that_fails_on_the_ground_is_no_flight_where_it_would_be_landed_for() -> None:
+    rig = Rig(profile=changed({"safety.land_on_log_error": True}))
+    rig.watcher.problem = "the disk is full"
+    rig.refused(SafetyAbort, "flight log: the disk is full")
+
+
 def test_ctrl_c_on_the_ground_starts_nothing() -> None:
     Rig(operator=lambda: Operator.LAND).refused(Interrupted, "nothing was started")
 
@@ -217,12 +387,13 @@ def test_ctrl_c_on_the_ground_starts_nothing() -> None:
 def waits(z_m: float = 0.0, waited_s: float = 0.0, age_s: float = 0.0, target: Any = None,
           **safety: float) -> str:  # fmt: skip
     profile = PROFILE.model_copy(update={"safety": PROFILE.safety.model_copy(update=safety)})
-    sample = telemetry(1.0, z_m, thrust=0.0, supervisor=READY)
-    return still_waiting_for(sample, True, None, waited_s, profile, target, age_s)
+    at_rest = [telemetry(0.1 * k, z_m, thrust=0.0, supervisor=READY) for k in range(21)]
+    turn = GroundTurn(profile, waited_s, at_rest, telemetry_age_s=age_s, target=target)
+    return still_waiting_for(turn)
 
 
 @pytest.mark.parametrize(
-    ("age_s", "is_old"), [(0.02, False), (0.2, False), (0.5, True), (5.0, True)]
+    ("age_s", "is_old"), [(0.02, False), (0.2, False), (0.5, True), (5.0, True), (math.nan, True)]
 )
 def test_old_telemetry_is_waited_for(age_s: float, is_old: bool) -> None:
     """It may have stopped while the camera was waited for: nothing is taken over on it."""

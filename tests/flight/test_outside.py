@@ -56,6 +56,7 @@ REACH = changed({"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m":
     (at(0.2, -0.5, 0.012), REACH, None),
     (at(3.0, -0.5, 0.012), MOCAP, None),  # nobody has said where the target hangs
     (at(3.0, -0.5, 0.012), REACH, "target is expected 2.7 m from where.*another vehicle's"),
+    (at(math.nan, -0.5, 0.012), MOCAP, "x nan"),
 ])  # fmt: skip
 def test_a_place_that_is_none_is_named(
     place: ExternalPosition, profile: Profile, words: str | None
@@ -73,6 +74,7 @@ def test_a_body_that_goes_about_while_the_vehicle_stands_is_another_s() -> None:
     walks = [at(0.02 * k, 0.0, 0.012) for k in range(8)]
     assert told(walks) == [False] * 6 + [True] * 2
     assert not any(told([at(0.004 * (k % 2), 0.0, 0.012) for k in range(100)])), "noise"
+    assert told([at(0.0, 0.0, 0.0), at(math.nan, 0.0, 0.0)]) == [False, True], "no number"
     # What was carried there, or is not known for a while, begins anew.
     assert not any(told([*walks[:4], None, *walks[4:]]))
 

@@ -17,11 +17,16 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import fly_lockstep, view_problem
-from perchctl.flight.preflight import LEAN_DEG, still_waiting_for, target_view_from
+from perchctl.flight.preflight import (
+    LEAN_DEG,
+    GroundTurn,
+    still_waiting_for,
+    target_view_from,
+)
 from perchctl.geometry import Place, rot_z
 from perchctl.positioning import FeedStatus
 from perchctl.positioning.feed import UNSEEN
-from perchctl.vehicle import ExternalPosition
+from perchctl.vehicle import ExternalPosition, Telemetry
 from perchctl.vision import CameraModel
 from tests.helpers.flights import short_profile
 from tests.helpers.mission import READY, changed, telemetry
@@ -89,10 +94,11 @@ def test_an_approach_out_of_sight_is_refused_with_the_reason() -> None:
 # --- Waiting for it -------------------------------------------------------------------------
 
 
-def waits(waited_s: float = 0.0, **seen: Any) -> str:
+def waits(waited_s: float = 0.0, telemetry: Telemetry = REST, **seen: Any) -> str:
     """What is waited for by a vehicle at rest that has pictures."""
-    given = {"telemetry": REST, "has_frame": True, "feed": FeedStatus(problem=UNSEEN)} | seen
-    return still_waiting_for(camera_problem=None, waited_s=waited_s, profile=TARGET, **given)
+    samples = [replace(REST, t_s=REST.t_s - 0.1 * k) for k in range(20, 0, -1)]
+    given = {"samples": [*samples, telemetry], "feed": FeedStatus(problem=UNSEEN)} | seen
+    return still_waiting_for(GroundTurn(TARGET, waited_s, **given))
 
 
 BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m beside its estimate")
@@ -103,7 +109,7 @@ BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m beside its esti
     # Who carries it, or has no camera, has no use for where the target is.
     ({"telemetry": replace(REST, roll_rad=0.4)}, "stand level"),
     ({"telemetry": replace(REST, acc_z_g=1.3)}, "stand still"),
-    ({"has_frame": False}, "a good picture"),
+    ({"picture_problem": "none has come", "unseen_s": math.inf}, "a good picture"),
     ({"feed": BESIDE}, r"sight of the target.*0\.40 m beside its estimate"),
 ])  # fmt: skip
 def test_what_keeps_a_target_from_being_measured_is_named_first_things_first(

@@ -19,9 +19,7 @@ NOWHERE = "udp://127.0.0.1:9"
 NO_CAMERA = "camera:97"
 QUICK: dict[str, Any] = {"listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2}
 VEHICLE = ["address", *ANSWERING, LIFTED]
-AT_REST = telemetry(
-    1.0, 0.0, thrust=0.0, supervisor=READY, battery_v=4.1, position_variance_m2=1e-4
-)
+AT_REST = telemetry(1.0, 0.0, thrust=0.0, supervisor=READY, battery_v=4.1)
 
 
 def said(**changes: Any) -> Telemetry:

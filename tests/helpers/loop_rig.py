@@ -71,12 +71,13 @@ class Vehicle:
         self.closed = False
         self._changed = changed
         self._delay_s = delay_s
-        self._samples: list[Telemetry] = []
         self.z_m = 0.0
         self._goal_m: float | None = None
         self.by_itself = False
         self.motors = False
         self._off_s = -math.inf
+        self._samples: list[Telemetry] = []
+        self._was_asked = False
 
     def advance_to(self, t_s: float) -> None:
         while self.now_s < t_s - 1e-9:
@@ -84,6 +85,12 @@ class Vehicle:
             self._live(0.01)
 
     def telemetry(self) -> list[Telemetry]:
+        """What has arrived: at first also what was heard in the two seconds before the flight, as
+        by a link that was opened before a question."""
+        if not self._was_asked:
+            self._was_asked = True
+            before = [self._changed(self._sample(-0.01 * k)) for k in range(200, 0, -1)]
+            self._samples = [sample for sample in before if sample is not None] + self._samples
         due_s = self.now_s - self._delay_s + 1e-9
         arrived = [s for s in self._samples if s.t_s <= due_s]
         self._samples = [s for s in self._samples if s.t_s > due_s]
@@ -125,16 +132,17 @@ class Vehicle:
             if self.by_itself and self.z_m <= 0.0 and self._goal_m <= 0.0:
                 self.z_m = 0.0
                 self._stop()
-        in_air = self.motors or self.now_s - self._off_s < 2.0
+        changed = self._changed(self._sample(self.now_s))
+        if changed is not None:
+            self._samples.append(changed)
+
+    def _sample(self, t_s: float) -> Telemetry:
+        in_air = self.motors or t_s - self._off_s < 2.0
         bits = AIRBORNE if in_air else READY
         if self.motors and self.by_itself:
             bits |= HL_ACTIVE
-        sample = telemetry(
-            self.now_s, self.z_m, supervisor=bits, thrust=HOVER_THRUST if self.motors else 0.0
-        )
-        changed = self._changed(sample)
-        if changed is not None:
-            self._samples.append(changed)
+        thrust = HOVER_THRUST if self.motors else 0.0
+        return telemetry(t_s, self.z_m, supervisor=bits, thrust=thrust)
 
     def _stop(self) -> None:
         if self.motors:

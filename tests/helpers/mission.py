@@ -47,6 +47,10 @@ def telemetry(t_s: float, z_m: float = 1.0, **changes: object) -> Telemetry:
         thrust=HOVER_THRUST,
         battery_v=3.9 + 0.001 * (round(t_s * 100) % 7),
         supervisor=AIRBORNE,
+        position_variance_m2=2e-5,
+        height_variance_m2=1e-5,
+        velocity_variance_m2ps2=1e-4,
+        climb_variance_m2ps2=1e-4,
     )
     return replace(sample, **changes)  # type: ignore[arg-type]
 

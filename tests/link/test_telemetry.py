@@ -39,12 +39,42 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
     assert sample.yaw_rad == pytest.approx(math.radians(30))
     assert sample.supervisor == 0x021E
     assert sample.t_s == 1.5
-    assert sample.position_variance_m2 is None
-    assert sample.climb_variance_m2ps2 is None
     assert sample.battery_v == 0.0  # unknown, which to the planner is not empty
-    variances = {"kalman.varPX": 3e-4, "kalman.varPY": 2e-4, "kalman.varPZ": 1e-4}
-    sample = telemetry_from_log(values | variances, 1.5)
-    assert (sample.position_variance_m2, sample.climb_variance_m2ps2) == (3e-4, 1e-4)
+
+
+VARIANCES = {
+    "kalman.varX": 6e-4, "kalman.varY": 7e-4, "kalman.varZ": 5e-4,
+    "kalman.varPX": 3e-4, "kalman.varPY": 2e-4, "kalman.varPZ": 1e-4,
+}  # fmt: skip
+
+
+def variances_of(values: dict[str, float]) -> tuple[float | None, ...]:
+    """Of the position, of the height, of the velocity and of the climb."""
+    sample = telemetry_from_log(dict.fromkeys(NEEDED, 0.0) | values, 1.5)
+    return (
+        sample.position_variance_m2,
+        sample.height_variance_m2,
+        sample.velocity_variance_m2ps2,
+        sample.climb_variance_m2ps2,
+    )
+
+
+def test_each_variance_has_its_own_name() -> None:
+    """`varX` to `varZ` are of the position, `varPX` to `varPZ` of the velocity (docs/firmware.md,
+    "Variances"); what is not there, or was never written, is not small but unknown."""
+    assert variances_of({}) == (None, None, None, None)
+    assert variances_of(VARIANCES) == (7e-4, 5e-4, 3e-4, 1e-4)
+    assert variances_of(dict.fromkeys(VARIANCES, 0.0)) == (None, None, None, None)
+    place, height, speed, climb = variances_of(VARIANCES | {"kalman.varZ": math.nan})
+    assert (math.isnan(place or 0.0), math.isnan(height or 0.0)) == (True, True)
+    assert (speed, climb) == (3e-4, 1e-4)
+
+
+def test_each_log_block_fits_into_a_packet() -> None:
+    """26 bytes (docs/firmware.md, "Link")."""
+    size = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
+    sizes = {name: sum(size[kind] for kind in block.values()) for name, block in BLOCKS.items()}
+    assert max(sizes.values()) <= 26, sizes
 
 
 @given(
@@ -94,6 +124,24 @@ def test_a_dead_block_shows_in_the_sample(silent_ms: int, speed_mps: float) -> N
     assert sample.behind_s == pytest.approx(silent_ms / 1e3)
     carried_m = speed_mps * min(silent_ms / 1e3, MOST_CARRIED_S)
     assert sample.position_m[2] == pytest.approx(carried_m)
+
+
+def test_a_dead_slow_block_shows_in_the_sample() -> None:
+    """What never came is not there, what came once grows old."""
+    assembler = SampleAssembler()
+
+    def ages(t_s: float, start: int = 0) -> tuple[float, float]:
+        assembler.accept("state", STILL["state"], t_s, start)
+        sample = assembler.accept("attitude", STILL["attitude"], t_s, start)
+        assert sample is not None
+        return sample.battery_behind_s, sample.variance_behind_s
+
+    assert ages(1.0) == (math.inf, math.inf)
+    assembler.accept("battery", STILL["battery"], 1.0)
+    assert ages(1.5) == (0.5, math.inf)
+    assembler.accept("variance", STILL["variance"], 1.7)
+    assert ages(3.0) == pytest.approx((2.0, 1.3))
+    assert ages(0.1, start=1) == (math.inf, math.inf)
 
 
 def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:

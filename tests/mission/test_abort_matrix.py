@@ -78,7 +78,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
     ),
     "estimator-jump": (_obs(jumped=True), 0.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "estimate-unsure": (
-        _tel(position_variance_m2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
+        _tel(velocity_variance_m2ps2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
         Outcome.SAFETY,
     ),
     "battery-low": (_tel(battery_v=2.8), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
@@ -184,7 +184,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
         _obs(camera_age_s=1.0, new_frame=False, target=None),
         _obs(loop_late_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
-        _tel(position_variance_m2=0.08),
+        _tel(velocity_variance_m2ps2=0.08),
         _obs(position_age_s=0.3),
     ],
     ids=["camera-silent", "loop-late", "telemetry-late", "estimate-unsure", "position-stale"],

@@ -33,6 +33,7 @@ from tests.helpers.mission import (
     PROFILE,
     READY,
     Felt,
+    changed,
     observation,
     state_in,
     target_at,
@@ -45,6 +46,7 @@ HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
 PRESSED = HOVER_THRUST * 1.12
 HELD_PHASES = (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 LOST = (Phase.LANDING, "position-lost", Outcome.SAFETY)
+UNREPORTED = changed({"link.unreported": ("variance",)})
 
 
 def hidden(age_s: float) -> dict[str, Any]:
@@ -82,7 +84,7 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
         t_s = BEGIN_S + 0.01 * (i - 24)
         variance = 2e-4 + 1e-4 * max(0, math.ceil(10 * (t_s - BEGIN_S - lost_s) - 1e-6))
         tel = telemetry(
-            t_s, 1.0, climb_variance_m2ps2=variance, position_variance_m2=variance,
+            t_s, 1.0, climb_variance_m2ps2=variance, velocity_variance_m2ps2=variance,
             acc_x_g=1e-4 * (i % 2),
         )  # fmt: skip
         obs = felt(observation(t_s, telemetry=tel, new_frame=False))
@@ -95,6 +97,30 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
     assert "variance only grows" in state.reason
     assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
+
+
+@pytest.mark.parametrize(("profile", "claims", "words"), [
+    (PROFILE, {"velocity_variance_m2ps2": 0.06}, "velocity's variance is 0.06 (m/s)^2"),
+    (PROFILE, {"height_variance_m2": 1.0}, "height's variance is 1 m^2"),
+    (PROFILE, {"position_variance_m2": 100.0}, ""),  # a Flow deck measures no place level with it
+    (MOCAP, {"position_variance_m2": 100.0}, "position's variance is 1e+02 m^2"),
+    (BY_TARGET, {"position_variance_m2": 100.0}, "position's variance is 1e+02 m^2"),
+    (BY_TARGET, {"velocity_variance_m2ps2": math.nan}, "velocity's variance is not known"),
+    (PROFILE, {"velocity_variance_m2ps2": None}, "velocity's variance is not known"),
+    (PROFILE, {"height_variance_m2": None}, "height's variance is not known"),
+    (MOCAP, {"position_variance_m2": None}, "position's variance is not known"),
+    (UNREPORTED, {"velocity_variance_m2ps2": None, "height_variance_m2": None}, ""),
+    (UNREPORTED, {"velocity_variance_m2ps2": 0.06}, "velocity's variance is 0.06 (m/s)^2"),
+])  # fmt: skip
+def test_an_unsure_estimate_is_held_and_its_variance_named(
+    profile: Profile, claims: dict[str, Any], words: str
+) -> None:
+    """After a reset in flight the velocity's variance is small and the position's is not."""
+    state = state_in(Phase.ALIGN)
+    obs = observation(BEGIN_S + TICK_S)
+    obs = replace(obs, telemetry=replace(obs.telemetry, **claims))
+    held = step_mission(state, obs, profile)[0].hold
+    assert (words in held) if words else not held
 
 
 # --- At the ceiling ----------------------------------------------------------------------

@@ -169,7 +169,7 @@ CASES: dict[str, Case] = {
     ),
     "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
     "estimate-unsure": Case(
-        P.ALIGN, P.LANDING, at(position_variance_m2=0.08), 1.2, O.SAFETY
+        P.ALIGN, P.LANDING, at(velocity_variance_m2ps2=0.08), 1.2, O.SAFETY
     ),
     "battery-low": Case(P.ASCEND, P.LANDING, at(battery_v=2.8), 1.8, O.SAFETY),
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),

@@ -60,7 +60,7 @@ def blinded(
 
 def lost(state: PlannerState, lasts_s: float, z_m: float = 1.0, **tel: Any) -> Flight:
     """Turn by turn, without a sight from the first one on."""
-    return fly(state, unseen(z_m, **{"position_variance_m2": 1e-3, **tel}), lasts_s, PROFILE)
+    return fly(state, unseen(z_m, **{"velocity_variance_m2ps2": 1e-3, **tel}), lasts_s, PROFILE)
 
 
 @pytest.mark.parametrize("phase", IN_THE_AIR)

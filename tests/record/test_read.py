@@ -12,6 +12,8 @@ import pytest
 from perchctl import __version__
 from perchctl.errors import InvalidValue
 from perchctl.record import read_log
+from perchctl.record.exact import json_line
+from tests.helpers import log as synthetic
 from tests.helpers.commands import run_apart
 from tests.helpers.log import small_log
 
@@ -86,10 +88,10 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "packed other": (gzip.compress(b"\x00\x01" * 900, mtime=0), (NO_LOG,)),
     "cut header": (lambda good: good[:700], (NO_LOG, "cut off in its header")),
     "newer": (
-        lambda good: good.replace(b'"version":4', b'"version":9').replace(
+        lambda good: good.replace(b'"version":5', b'"version":9').replace(
             __version__.encode(), b"9.1", 1
         ),
-        ("schema version 9, this perchctl reads 1 to 4", "perchctl 9.1", "update it"),
+        ("schema version 9, this perchctl reads 1 to 5", "perchctl 9.1", "update it"),
     ),
     "garbage": (with_line(4, b"garbage"), ("line 4: not a record", "take the original")),
     "no time": (with_line(4, b'{"kind":"tick"}'), ("line 4", "t_s must be")),
@@ -97,6 +99,27 @@ DAMAGED: dict[str, tuple[Callable[[bytes], bytes] | bytes, tuple[str, ...]]] = {
     "nested": (with_line(4, b"[" * 100_000), ("line 4", "nested too deep")),
     "kind": (with_line(3, b'{"kind":"?","t_s":1}'), ("line 3", "allowed are")),
 }
+
+
+def test_an_older_log_s_variance_is_the_velocity_s(tmp_path: Path) -> None:
+    """Up to version 4 it stood under the position's name."""
+
+    def variances(version: int) -> tuple[float | None, ...]:
+        path = tmp_path / f"{version}.jsonl"
+        header = synthetic.header() | {"kind": "header", "version": version}
+        turn = {"kind": "turn", "t_s": 1.0, "taken": {"late": [{"position_variance_m2": 3e-4}]}}
+        tick = {"kind": "tick", "t_s": 1.0, "var_m2": 3e-4, "pos_var_m2": 0.1}
+        path.write_bytes(b"".join(map(json_line, (header, turn, tick))))
+        log = read_log(path)
+        (sample,), (record,) = log.turn_records[0]["taken"]["late"], log.records
+        return (
+            sample.get("velocity_variance_m2ps2"),
+            sample.get("position_variance_m2"),
+            record["vel_var_m2ps2"],
+        )
+
+    assert variances(4) == (3e-4, None, 3e-4)
+    assert variances(5) == (None, 3e-4, None)
 
 
 @pytest.mark.parametrize("kind", DAMAGED)

@@ -174,7 +174,7 @@ def test_a_lost_record_ends_the_replay_and_another_version_is_said(tmp_path: Pat
     assert any(f"0.0.9 flew it, and this is {perchctl.__version__}" in n for n in other.notes)
 
 
-@pytest.mark.parametrize("version", [2, 4])
+@pytest.mark.parametrize("version", [2, 5])
 def test_a_log_without_whole_turns_cannot_be_replayed(tmp_path: Path, version: int) -> None:
     """It is of before, or of a flight that never began."""
     header = altered(lines_of()[0], version=version, perchctl="0.1.0")

@@ -91,6 +91,40 @@ def test_with_a_deck_external_positions_count_for_nothing() -> None:
     assert abs(rig.firmware.log_value("stateEstimate.x")) < 0.02
 
 
+def variances(rig: Rig) -> tuple[float, ...]:
+    names = ("X", "Y", "Z", "PX", "PY", "PZ")
+    return tuple(rig.firmware.log_value(f"kalman.var{name}") for name in names)
+
+
+def test_a_flow_deck_s_filter_never_knows_where_it_is_level() -> None:
+    """It measures height and speed over ground: the more roughly the higher it flies
+    (docs/firmware.md, "Variances")."""
+    rig = make_rig()
+    rig.firmware.set_parameter("kalman.resetEstimation", 1)
+    rig.run(0.02)
+    assert variances(rig) == pytest.approx((100.0, 100.0, 1.0, 1e-4, 1e-4, 1e-4))
+    rig.run(0.5)
+    *level, height, vx, vy, climb = variances(rig)
+    assert level == [100.0, 100.0]
+    assert height < 1e-5
+    assert max(vx, vy, climb) < 3e-4
+    rig.world.set_pose((0.0, 0.0, 2.0), hold=True)
+    rig.run(0.1)
+    assert variances(rig)[3] == pytest.approx(6e-3, rel=0.1)
+
+
+def test_with_a_lighthouse_deck_the_filter_knows_the_whole_position() -> None:
+    rig = make_rig(parameters={"deck.bcFlow2": 0.0, "deck.bcLighthouse4": 1.0})
+    rig.run(0.5)
+    assert max(variances(rig)[:3]) < 1e-4
+
+
+def test_the_variances_of_a_filter_that_does_not_run_are_zero() -> None:
+    rig = make_rig(parameters={"stabilizer.estimator": 1.0})
+    rig.run(0.5)
+    assert variances(rig) == (0.0,) * 6
+
+
 # --- Without a deck: external positions, and none -------------------------------------------------
 
 

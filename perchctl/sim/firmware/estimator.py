@@ -16,8 +16,17 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, wrap_deg
-from perchctl.sim.firmware.outside import POSITION, ExternalFilter, Imu, Quaternion, Vector
+from perchctl.sim.firmware.outside import (
+    POSITION,
+    VELOCITY,
+    ExternalFilter,
+    Imu,
+    Quaternion,
+    Vector,
+    first_covariance,
+)
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.vehicle import FLOW_DECKS
 
 if TYPE_CHECKING:
     from perchctl.sim.world import World
@@ -37,7 +46,17 @@ _ACC_VIBRATION_G = 0.04  # added by turning motors
 _ACC_LAG = 1.0 - math.exp(-2 * math.pi * 30.0 * CONTROL_PERIOD_S)  # cut off at 30 Hz
 _NO_BIAS = (0.0, 0.0, 0.0)
 _ATTITUDE_GAIN = CONTROL_PERIOD_S / 2.0  # a memory of 2 s
-_VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
+
+# What the firmware's filter claims with a deck, in steady state, by its own noise parameters.
+_FIRST_DECK_S = 0.03
+"""From a reset to the deck's first measurement: a range comes every 25 ms."""
+_RANGED_M2, _CLIMB_M2PS2 = 2.4e-6, 1.8e-4
+"""Of height and vertical speed with the range of a Flow deck, sigma 2.5 mm."""
+_FLOW_M2PS2, _FLOW_LEAST_M = 2.15e-3, 0.1
+"""Of the horizontal velocity by optical flow, sigma 0.2 px, 1 m over the ground; it grows with the
+height's 1.5th power, and is as at 0.1 m below that."""
+_ABSOLUTE_M2, _ABSOLUTE_M2PS2 = 1e-6, 2.5e-4
+"""Of position and velocity with a Lighthouse deck."""
 
 
 class Estimator:
@@ -86,14 +105,23 @@ class Estimator:
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """The variance of a state, in the order of `Covariance`.
+        """The variance of a state of position or velocity, in the order of `ExternalFilter`'s.
 
-        With a deck all states have the same variance, which falls after a reset.
+        Zero, as in memory that nothing has written, while another estimator runs. A Flow deck
+        measures no horizontal position: its variance stays what it is after a reset.
         """
+        if self._parameters["stabilizer.estimator"] != KALMAN:
+            return 0.0
         if self.outside is not None:
             return float(self.outside.covariance[state, state])
-        age_s = t_s - self._reset_s
-        return _VARIANCE_FLOOR + _VARIANCE_START * math.exp(-age_s / _VARIANCE_FALL_S)
+        if t_s - self._reset_s < _FIRST_DECK_S:
+            return float(first_covariance()[state, state])
+        is_level = state % VELOCITY < 2  # of x and y
+        if not any(self._parameters[f"deck.{name}"] for name in FLOW_DECKS):
+            return _ABSOLUTE_M2PS2 if state >= VELOCITY else _ABSOLUTE_M2
+        if state < VELOCITY:
+            return float(first_covariance()[state, state]) if is_level else _RANGED_M2
+        return _FLOW_M2PS2 * max(self.now.z_m, _FLOW_LEAST_M) ** 1.5 if is_level else _CLIMB_M2PS2
 
     def update(
         self,

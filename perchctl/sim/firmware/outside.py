@@ -117,6 +117,12 @@ _REVERSION = 1e-3
 `attitudeReversion`)."""
 
 
+def first_covariance() -> Array:
+    """The covariance (9, 9) after a reset."""
+    m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
+    return np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
+
+
 class ExternalFilter:
     """`position_m`, `velocity_mps` in world axes, `quaternion` body to world: the estimate.
 
@@ -129,8 +135,7 @@ class ExternalFilter:
 
     def reset(self) -> None:
         """Start anew at the position and heading of `kalman.initial*`, level and at rest."""
-        m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
-        self.covariance = np.diag([m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3)
+        self.covariance = first_covariance()
         names = ("X", "Y", "Z", "Yaw")
         x, y, z, yaw = (self._parameters[f"kalman.initial{name}"] for name in names)
         self.position_m: Vector = (x, y, z)
