@@ -84,7 +84,7 @@ MOST_NAMES = {
     "commands": 2,
     "display": 6,
     "faults": 6,
-    "flight": 16,
+    "flight": 19,
     "link": 13,
     "record": 12,
     "mission": 31,

@@ -208,7 +208,7 @@ def page(flown: Flight, file: Path) -> None:
     picture, shown = flown.sketch(flown.frame(last)), [first]
     profile = flown.profile
     drawn = {"large_m": profile.target.large.side_m, "gear_m": profile.vehicle.gear_body_m[2]}
-    live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
+    live = LivePage(flown.camera, "perchctl fly sim://", lambda: None, lambda: None)
     closing = threading.Event()
 
     def feed() -> None:

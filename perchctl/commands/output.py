@@ -36,6 +36,14 @@ def discard_output(stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def stdin_number() -> int:
+    """The file descriptor of stdin; -1, which is none, where there is no stdin."""
+    try:
+        return sys.stdin.fileno()
+    except (OSError, ValueError, AttributeError):
+        return -1
+
+
 def ask(question: str) -> str:
     """Ask on stderr, and return the line typed. Raises EOFError at the end of the input."""
     print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
@@ -45,8 +53,8 @@ def ask(question: str) -> str:
 def ask_to_confirm(question: str) -> bool:
     """Ask on the terminal; return True if the answer is yes. Input typed before the question is
     discarded."""
-    with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
-        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    with contextlib.suppress(OSError, ValueError, termios.error):
+        termios.tcflush(stdin_number(), termios.TCIFLUSH)
     try:
         return ask(f"{question} [y/N]").strip().lower() in ("y", "yes")
     except EOFError:

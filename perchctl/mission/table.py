@@ -377,7 +377,7 @@ TABLE: tuple[Transition, ...] = (
     motor_cut_row(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
-        "second Ctrl-C: emergency stop",
+        "the operator cut the motors",
         O.EMERGENCY,
     ),
     Transition(

@@ -1,4 +1,4 @@
-"""The live page of a flight: what it shows, how old that is, what STOP does, and how it ends."""
+"""The live page of a flight: what it shows, how old that is, what its buttons do, and its end."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from perchctl.display import FlightPage, LivePage, Sketch
 from perchctl.display.live import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
-from perchctl.flight.operator import AGAIN_S, HELD_S
 from perchctl.mission import FlightReport, Operator, Outcome, Phase, Watcher
 from perchctl.profile import load_profile
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
-from tests.helpers.live_page import CORNERS, ask, stop, tick
+from tests.helpers.live_page import CORNERS, ask, press, tick
 from tests.helpers.mission import entered, note
 
 START_S = 100.0
@@ -115,35 +114,34 @@ def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
     page: LivePage, clock: list[float], phase: Phase
 ) -> None:
     flight = FlightPage(page, 0.15, 0.03)
-    assert stop(page.url, page.token) == 200
+    assert press(page.url, page.token) == 200
     flight.tick(tick(START_S))
-    assert state_of(page)["stop"] == "requested"
+    assert state_of(page)["orders"] == "land"
     flight.tick(tick(START_S + 1.0, phase.value))
     clock[0] += 9.0
     state = state_of(page)
-    assert (state["age_s"], state["stop"]) == (None, "over")
+    assert (state["age_s"], state["orders"]) == (None, "over")
 
 
-# --- STOP ------------------------------------------------------------------------------------
+# --- the buttons -----------------------------------------------------------------------------
 
 OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 
 
-def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
-    now_s = [100.0]
-    switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])
+def test_land_is_one_ctrl_c_and_never_two_and_cut_motors_stops_at_once(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    switch = OperatorSwitch(listening=True)
     with flight_page(OPTIONS, True, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
         for _ in range(2):
-            assert stop(flight.page.url, flight.page.token) == 200
+            assert press(flight.page.url, flight.page.token) == 200
             assert switch.read() is Operator.LAND
         switch.press()
-        assert switch.read() is Operator.LAND  # the first Ctrl-C repeats STOP
-        now_s[0] += AGAIN_S
-        switch.press()
-        now_s[0] += HELD_S
+        assert switch.read() is Operator.LAND  # the first Ctrl-C repeats Land
+        assert press(flight.page.url, flight.page.token, "cut") == 200
         assert switch.read() is Operator.STOP
 
 
