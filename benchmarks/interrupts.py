@@ -60,6 +60,7 @@ def interrupt_in(phase: str, seed: int, folder: Path) -> tuple[int, str, bool]:
     """Exit code, last phase and lock of a flight interrupted when it enters `phase`."""
     flight = subprocess.Popen(
         [sys.executable, "-m", "perchctl", "fly", "--seed", str(seed), "--log-dir", str(folder)],
+        stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
     )

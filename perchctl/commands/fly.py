@@ -210,6 +210,10 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
             raise
         finally:
             panel.close()
+            if panel.failure is not None:
+                say(panel.failure)
+        for sentence in report.detached:
+            say(sentence)
         summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
         print_lines(summary.text(log.path), stdout=not as_json)

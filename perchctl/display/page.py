@@ -80,8 +80,11 @@ class FlightPage:
 
     def _seen(self, frame: Frame) -> None:
         self._frame = frame
-        if not self._flying:  # no ticks yet that would show it
-            self.page.show(Sketch(frame.image))
+        try:
+            if not self._flying:  # no ticks yet that would show it
+                self.page.show(Sketch(frame.image))
+        except Exception as error:  # the frame goes on to the flight
+            self.page.store_error(error)
 
 
 def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:

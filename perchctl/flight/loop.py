@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from perchctl.camera import FrameSource
-from perchctl.errors import Interrupted, NotFound
+from perchctl.errors import Interrupted, NotFound, SafetyAbort
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import RestCheck
-from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
+from perchctl.flight.inputs import FlightInputs, TurnReporter
 from perchctl.flight.preflight import (
     abort_on,
     refuse_unfit_vehicle,
@@ -25,6 +25,7 @@ from perchctl.flight.preflight import (
     view_problem,
 )
 from perchctl.flight.watchdog import Watchdog, rescue
+from perchctl.flight.watching import Watchers
 from perchctl.link import Link
 from perchctl.mission import (
     Event,
@@ -34,7 +35,6 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
-    SentCommand,
     Tick,
     Transition,
     Watcher,
@@ -63,9 +63,10 @@ class PositionSource(Protocol):
 class FlightParts:
     """The parts that the flight loop works with.
 
-    `positions` sends the external positions, None where decks measure them; `remarks` returns new
-    notes on things that do not matter to safety, such as a recording; `table` is flown instead of
-    the profile's."""
+    `watchers` look on, and end no flight (`perchctl.flight.watching`); `judges` are those of a
+    simulation, whose errors do. `positions` sends the external positions, None where decks measure
+    them; `remarks` returns new notes on things that do not matter to safety, such as a recording;
+    `table` is flown instead of the profile's."""
 
     link: Link
     source: FrameSource
@@ -77,6 +78,7 @@ class FlightParts:
     positions: PositionSource | None = None
     remarks: Callable[[], Sequence[str]] = tuple
     table: tuple[Transition, ...] = table_of(None)
+    judges: tuple[Watcher, ...] = ()
 
     def position_age_s(self, now_s: float) -> float:
         """Age of the newest position by motion capture; 0 if positions come from elsewhere."""
@@ -89,20 +91,22 @@ def fly(parts: FlightParts) -> FlightReport:
     Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
     `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue.
     """
-    turns = TurnReporter(parts.watchers)
+    watchers = Watchers(parts.watchers, parts.clock.now, parts.remarks, parts.judges)
+    turns = TurnReporter(watchers.turn)
     inputs = FlightInputs(
         parts.link,
         parts.source,
         parts.pipeline,
         parts.profile,
         send=parts.link.send_external,
-        is_logged=turns.has_watchers,
+        is_logged=watchers.have_log,
     )
-    _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
-    watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
-    parts.link.set_guard(watchdog.poll, told)
+    _wait_until_ready(parts, inputs, turns, watchers)  # nothing is started before it returns
+    watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
+    parts.link.set_guard(watchdog.poll, watchers.sent)
     try:
-        return _mission(parts, inputs, watchdog, turns)
+        report = _mission(parts, inputs, watchdog, turns, watchers)
+        return replace(report, detached=tuple(watchers.detached))
     except BaseException as error:
         watchdog.note_rescue()
         rest = rescue(
@@ -113,35 +117,27 @@ def fly(parts: FlightParts) -> FlightReport:
             watchdog.state,
             inputs.history,
             parts.position_age_s,
-            told,
+            watchers.sent,
             inputs.perception.motion.motion,
         )
-        with contextlib.suppress(Exception):  # the log may be what failed
+        with contextlib.suppress(Exception):  # what failed may fail again
             turns.report_failure(inputs, error)
-        for watcher in parts.watchers:
-            with contextlib.suppress(Exception):  # it may be the one that failed
-                watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
+        with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
+            watchers.event(Event.of_rescue(parts.clock.now(), error, rest))
         raise
 
 
-def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    told = [watcher for watcher in parts.watchers if isinstance(watcher, TurnWatcher)]
-
-    def tell(sent: SentCommand) -> None:
-        for watcher in told:
-            with contextlib.suppress(Exception):
-                watcher.sent(sent)
-
-    return tell
-
-
-def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnReporter) -> None:
+def _wait_until_ready(
+    parts: FlightParts, inputs: FlightInputs, turns: TurnReporter, watchers: Watchers
+) -> None:
     refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
     started_s, at_rest = parts.clock.now(), RestCheck()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
             raise Interrupted("interrupted before take-off: nothing was started")
+        if parts.profile.safety.land_on_log_error and watchers.problem is not None:
+            raise SafetyAbort(f"flight log: {watchers.problem}; nothing was started")
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_unfit_vehicle(newest, parts.profile)
@@ -174,7 +170,11 @@ def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: TurnRepor
 
 
 def _mission(
-    parts: FlightParts, inputs: FlightInputs, watchdog: Watchdog, turns: TurnReporter
+    parts: FlightParts,
+    inputs: FlightInputs,
+    watchdog: Watchdog,
+    turns: TurnReporter,
+    watchers: Watchers,
 ) -> FlightReport:
     period_s = 1.0 / parts.profile.link.loop_hz
     clock = parts.clock
@@ -193,7 +193,7 @@ def _mission(
             inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
         feed = _outside(parts, inputs, now_s)
-        obs = _observe(parts, inputs, now_s, late_s, feed)
+        obs = _observe(parts, inputs, now_s, late_s, feed, watchers.problem)
         turns.note_observation(obs)
         before = state
         new, command = step_mission(before, obs, parts.profile, parts.table)
@@ -212,7 +212,7 @@ def _mission(
             parts.positions.stop()
             inputs.perception.drop_sightings()
         events = Event.of_tick(before, state, obs, parts.profile)
-        notes = [*parts.remarks()]
+        notes = watchers.take_notes()
         if obs.log_problem is not None and not log_noted:
             log_noted = True
             notes.insert(0, f"the log of this flight is incomplete: {obs.log_problem}")
@@ -220,8 +220,7 @@ def _mission(
         for event in events:
             if event.kind is EventKind.PHASE:
                 passed.append(event)
-            for watcher in parts.watchers:
-                watcher.event(event)
+            watchers.event(event)
         turn = turns.flown_turn(inputs, obs, state, command, feed)
         newest = inputs.perception.calibration.newest
         tick = Tick(
@@ -240,8 +239,7 @@ def _mission(
             turn,
         )
         logged = newest
-        for watcher in parts.watchers:
-            watcher.tick(tick)
+        watchers.tick(tick)
         if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
             return FlightReport.of(
@@ -266,13 +264,14 @@ def _observe(
     now_s: float,
     late_s: float,
     feed: FeedStatus | None,
+    log_problem: str | None,
 ) -> Observation:
     return replace(
         inputs.observation(now_s),
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
         operator=parts.operator(),
-        log_problem=next((w.problem for w in parts.watchers if w.problem), None),
+        log_problem=log_problem,
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,
     )

@@ -184,7 +184,8 @@ class Tick:
 
 
 class Watcher(Protocol):
-    """Receiver of ticks and events: flight log, panel, live page. Its methods must not raise."""
+    """Receiver of ticks and events: flight log, panel, live page. One that raises is detached, and
+    the flight goes on without it; an attribute `name` names it in the message."""
 
     def tick(self, tick: Tick) -> None:
         """Handle a turn that was flown."""

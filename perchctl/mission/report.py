@@ -114,6 +114,7 @@ class FlightReport:
     findings: Findings | None = None  # of latency and mounting, where it was long enough
     contact: ContactError | None = None  # of what hangs
     touchdown: Touchdown | None = None  # of what met the floor
+    detached: tuple[str, ...] = ()  # a sentence for each watcher that raised, and was left out
 
     @classmethod
     def of(

@@ -72,7 +72,7 @@ class LogWatcher:
         self._file = file
         self._writer = BackgroundWriter(MOST_WAITING, "perchctl-log", live)
         self._closed = False
-        self._unfinished = 0
+        self._unfinished = self._unmade = 0
         # Below: of the thread that writes.
         self._failed = 0
         self._synced_s = math.inf
@@ -80,7 +80,7 @@ class LogWatcher:
     @property
     def lost_records(self) -> int:
         """How many records could not be written."""
-        return self._writer.refused_jobs + self._failed + self._unfinished
+        return self._writer.refused_jobs + self._failed + self._unfinished + self._unmade
 
     @property
     def loss_reason(self) -> str | None:
@@ -172,11 +172,16 @@ class LogWatcher:
         if battery_v >= NO_BATTERY_READING_V:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
-        record = tick_record(tick, position_m, miss_m)
-        self.write(record)
+        record = None
+        try:
+            record = tick_record(tick, position_m, miss_m)
+            self.write(record)
+        except Exception as error:  # whatever it is: only this record is lost
+            self._unmade += 1
+            self._remember_unencodable(error)
         if tick.turn is not None:
             self.turn(tick.turn)
-        if self.recorder is not None:
+        if self.recorder is not None and record is not None:
             self.recorder.write_tick(record)
 
     def write(self, record: Mapping[str, Any]) -> None:
@@ -271,14 +276,13 @@ class LogWatcher:
             self._remember(_explain(error))
         except Exception as error:  # whatever it is: the thread outlives its record
             self._failed += 1
-            why = str(error) or type(error).__name__
-            self.unencodable = self.unencodable or f"a record has no form in the flight log: {why}"
+            self._remember_unencodable(error)
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
             # What was waited for in vain is in the file by now.
             problem = None if self.problem == NO_ANSWER else self.problem
-            lost_records = self._writer.refused_jobs + self._failed
+            lost_records = self._writer.refused_jobs + self._failed + self._unmade
             lost = {"lost_records": lost_records, "problem": problem or self.unencodable}
             self._store(partial(encode_line, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
@@ -293,6 +297,10 @@ class LogWatcher:
 
     def _remember(self, problem: str) -> None:
         self.problem = self.problem or problem
+
+    def _remember_unencodable(self, error: Exception) -> None:
+        why = str(error) or type(error).__name__
+        self.unencodable = self.unencodable or f"a record has no form in the flight log: {why}"
 
 
 def sent_line(sent: SentCommand) -> bytes:

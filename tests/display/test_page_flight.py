@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +15,7 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
-from perchctl.display import FlightPage, LivePage, Sketch
+from perchctl.display import FlightPage, FlightPanel, LivePage, Sketch
 from perchctl.display.live import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
@@ -87,6 +89,10 @@ def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     flight.watch_source(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
+    torn = Frame(0, 0.0, None)  # type: ignore[arg-type]
+    page._changed = None  # type: ignore[assignment]
+    assert FlightPage(page, 0.15, 0.03).watch_source(one_frame(torn)).poll(0.0) is torn
+    page._changed = threading.Condition()
     assert flight.problem is None
     flight.tick(tick(1.0, output="no output"))
     state_of(page)
@@ -188,8 +194,14 @@ def last_state(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_the_page_of_a_flight_ends_with_its_card(
-    options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
+    options: FlyOptions,
+    monkeypatch: pytest.MonkeyPatch,
+    last_state: dict[str, Any],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """And what fell silent on the way is named."""
+    monkeypatch.setattr(FlightPanel, "_draw_once", lambda self: 1 / 0)
+
     def session(_options: object, log: Watcher, display: Watcher, *more: Any) -> Any:
         _switch, page, asks = more
         assert not asks
@@ -199,10 +211,13 @@ def test_the_page_of_a_flight_ends_with_its_card(
         report = FlightReport(
             Phase.LANDED, Outcome.TARGET_NOT_FOUND, "target not found", 0, 9.0, False
         )
-        return report, None
+        return replace(report, detached=("a callback was detached",)), None
 
     monkeypatch.setattr(fly, "_session", session)
     assert fly.fly_and_report(options, as_json=False, view=True) == 50
+    said = capsys.readouterr().err
+    assert "perchctl: the display fell silent: ZeroDivisionError" in said
+    assert "perchctl: a callback was detached" in said
     card = last_state["card"]
     assert card["outcome"] == "LANDED"
     assert card["reason"].startswith("target not found")

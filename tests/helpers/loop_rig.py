@@ -235,7 +235,7 @@ class Camera:
 
 @dataclass
 class Watcher:
-    """Remembers what it saw; `on_tick` may raise, or steer."""
+    """Remembers what it saw; `on_tick` may steer, or raise, which ends the flight of a `Rig`."""
 
     on_tick: Callable[[Tick], None] = lambda tick: None
     ticks: list[Tick] = field(default_factory=list)
@@ -270,9 +270,9 @@ class Rig:
             self.clock or Clock(self.link),
             self.profile,
             self.setup,
-            (self.watcher,),
-            self.operator,
+            operator=self.operator,
             positions=self.positions,
+            judges=(self.watcher,),
         )
 
     def fly(self) -> FlightReport:

@@ -9,6 +9,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ import pytest
 from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions
-from perchctl.mission import FlightReport, Outcome, Phase, SentCommand
+from perchctl.mission import FlightReport, Outcome, Phase, PlannerState, SentCommand
 from perchctl.profile import apply_settings, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
-from perchctl.vehicle import EmergencyStop
+from perchctl.vehicle import EmergencyStop, Idle
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
 
@@ -90,6 +91,19 @@ def test_a_record_without_a_form_costs_itself_alone(
     end = read_log(log.path).summary
     assert end is not None
     assert (end["lost_records"], end["problem"]) == (1, summary.log_problem)
+
+
+def test_a_tick_without_a_form_costs_itself_alone(tmp_path: Path) -> None:
+    """A log that raised would be left out of its flight."""
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
+    good = synthetic.tick(1.0, synthetic.telemetry(), Idle(), PlannerState())
+    for tick in (good, replace(good, t_s=1.02, command="fly!"), replace(good, t_s=1.04)):  # type: ignore[arg-type]
+        log.tick(tick)
+    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
+    assert [r["t_s"] for r in read_log(log.path).records] == [1.0, 1.04]
+    assert summary is not None
+    assert summary.lost_records == 1
+    assert "no form" in (summary.log_problem or "")
 
 
 @pytest.mark.parametrize("live", [False, True])
