@@ -37,7 +37,7 @@ MOST_LINES = {
     "vision": 6370,
     "weights": 1190,
 }
-MOST_FILES = 220
+MOST_FILES = 230
 # Of the code before it was made shorter: what is shorter because its lines are fuller is not.
 CHARACTERS_A_LINE, DOCSTRING_SHARE, WITHIN = 35.06, 0.106, 0.05
 MOST_MEDIAN_LINES = 15  # of a function
