@@ -29,6 +29,8 @@ class PerchError(Exception):
 
     exit_code = 1
     meaning = "other failure"
+    advice = ""
+    """The end of the message that says what to do, where it is known apart."""
 
 
 class UsageError(PerchError):

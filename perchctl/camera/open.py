@@ -22,7 +22,7 @@ from perchctl.camera.source import (
     unmirror_frame,
     without_password,
 )
-from perchctl.errors import InvalidValue, NotFound, TimedOut
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.extensions import is_extension, make_extension
 from perchctl.profile import CameraConfig
 
@@ -185,8 +185,6 @@ def _started(source: LiveSource, timeout_s: float) -> FrameSource:
     source.begin()
     if source.wait_first_frame(timeout_s):
         return source
+    error = source.failure or source.no_first_frame(timeout_s)
     source.close()
-    raise source.failure or TimedOut(
-        f"{source.describe()}: no first frame within {timeout_s:g} s; is the camera powered, and "
-        f"its receiver on the right channel?"
-    )
+    raise error

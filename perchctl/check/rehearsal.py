@@ -43,6 +43,7 @@ class Rehearsal:
         target: the final estimate; None if the target was not in view.
         print_verdict: `PrintCheck.error_and_text()`; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
+        scheme: the kind of source, as ``camera``, which the advice depends on.
     """
 
     live: bool
@@ -60,6 +61,7 @@ class Rehearsal:
     target: TargetEstimate | None = None
     print_verdict: tuple[bool, str] | None = None
     blur_px: float | None = None
+    scheme: str = ""
 
     @property
     def frame_period_s(self) -> float | None:
