@@ -87,7 +87,7 @@ MOST_NAMES = {
     "flight": 19,
     "link": 13,
     "record": 12,
-    "mission": 31,
+    "mission": 32,
     "perception": 5,
     "positioning": 10,
     "profile": 33,

@@ -62,9 +62,7 @@ class DeviceSource(LiveSource):
     released, and opened again once it is back. `opener` returns a cv2.VideoCapture.
     """
 
-    silent_advice = (
-        "if it is a receiver: is the camera powered, and the receiver on its channel?"
-    )
+    silent_advice = "if it is a receiver: is the camera powered, and the receiver on its channel?"
     unreached_advice = ""
     reconnect_wait_s = REOPEN_EVERY_S
     max_failures = math.inf

@@ -226,7 +226,9 @@ class LiveSource:
             try:
                 reason = self._connection()
                 if self._found[0] == _SILENT:
-                    self._note("connected, but the stream ends without a picture", self.silent_advice)
+                    self._note(
+                        "connected, but the stream ends without a picture", self.silent_advice
+                    )
             except PerchError as error:
                 if self._arrived == 0:
                     self._fail(error)

@@ -47,8 +47,8 @@ _AGAIN = {
     "sim": "start it again",
 }
 _NEARER = {
-    "camera": "if it is a receiver, bring it nearer, turn its antenna, choose another channel; else "
-    "use another cable",
+    "camera": "if it is a receiver, bring it nearer, turn its antenna, choose another channel; "
+    "else use another cable",
     "aideck": "bring this computer nearer to the deck, choose another Wi-Fi channel",
     "sim": "close other programs: the simulated camera runs on this computer",
 }

@@ -111,6 +111,7 @@ class FaultyFlight:
             positions=lockstep_feed(self._link, profile),
             remarks=tuple if log is None else log.remarks,
             judges=(self,),
+            simulated=True,
         )
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
         self._oracle = Oracle(safety.max_height_m, safety.max_tilt_deg, radius_m)

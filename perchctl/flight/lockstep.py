@@ -213,6 +213,7 @@ def fly_lockstep(
         tuple if log is None else log.remarks,
         table,
         judges=(truth,),
+        simulated=True,
     )
     try:
         link.connect()

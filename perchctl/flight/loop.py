@@ -66,7 +66,8 @@ class FlightParts:
     `watchers` look on, and end no flight (`perchctl.flight.watching`); `judges` are those of a
     simulation, whose errors do. `positions` sends the external positions, None where decks measure
     them; `remarks` returns new notes on things that do not matter to safety, such as a recording;
-    `table` is flown instead of the profile's."""
+    `table` is flown instead of the profile's. What a `simulated` flight shows of latency and
+    mounting is no advice for a profile."""
 
     link: Link
     source: FrameSource
@@ -79,6 +80,7 @@ class FlightParts:
     remarks: Callable[[], Sequence[str]] = tuple
     table: tuple[Transition, ...] = table_of(None)
     judges: tuple[Watcher, ...] = ()
+    simulated: bool = False
 
     def position_age_s(self, now_s: float) -> float:
         """Age of the newest position by motion capture; 0 if positions come from elsewhere."""
@@ -243,7 +245,12 @@ def _mission(
         if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
             return FlightReport.of(
-                state, obs, parts.profile, tuple(passed), inputs.perception.camera_errors()
+                state,
+                obs,
+                parts.profile,
+                tuple(passed),
+                inputs.perception.camera_errors(),
+                simulated=parts.simulated,
             )
         due_s += period_s
         if due_s < now_s:

@@ -161,6 +161,7 @@ def fly_session(
                 positions,
                 remarks,
                 table,
+                simulated=options.simulated,
             )
             with contextlib.ExitStack() as waiting:
                 if isinstance(clock, SimulatedClock):

@@ -13,6 +13,7 @@ from .records import Turn as Turn
 from .records import TurnInputs as TurnInputs
 from .records import UnfilteredPose as UnfilteredPose
 from .records import Watcher as Watcher
+from .report import PROFILE_ROWS as PROFILE_ROWS
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport
 from .report import Touchdown as Touchdown

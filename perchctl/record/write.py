@@ -27,7 +27,7 @@ from perchctl.record.disk import BackgroundWriter, DiskFile, create_file
 from perchctl.record.exact import encode_line, json_line, to_exact_json
 from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
-from perchctl.record.summary import FlightSummary, RecordingEnd
+from perchctl.record.summary import FlightSummary, RecordingEnd, is_simulated
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ class LogWatcher:
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight goes on.
         truth: returns the true state at a tick; set by a simulation.
+        simulated: the header is that of a simulated vehicle.
         recorder: records the frames of the watched source; None without a recording.
     """
 
@@ -65,6 +66,7 @@ class LogWatcher:
         self.problem: str | None = None
         self.unencodable: str | None = None
         self.truth: Callable[[], Truth] | None = None
+        self.simulated = False
         self.recorder: Recorder | None = None
         self._battery_min_v: float | None = None
         self._ticks = 0
@@ -100,7 +102,9 @@ class LogWatcher:
             path.parent.mkdir(parents=True, exist_ok=True)
             for free in _free_names(path):
                 with suppress(FileExistsError):
-                    return create_file(free, live, partial(cls, free, line, live))
+                    log = create_file(free, live, partial(cls, free, line, live))
+                    log.simulated = is_simulated(header)
+                    return log
             raise AssertionError("unreachable")
         except OSError as error:
             raise InvalidValue(
@@ -222,6 +226,8 @@ class LogWatcher:
             findings=report.findings,
             contact=report.contact,
             touchdown=report.touchdown,
+            simulated=self.simulated,
+            blames_profile=report.blames_profile,
         )
         self.end(summary.as_record())
         return replace(

@@ -164,7 +164,7 @@ NEVER_WHOLE = [
     ([], f"connected, but the stream ends without a picture: {OFF_AND_ON}"),
     ([console(), NEVER], "it sends, but no picture: does wifi-img-streamer run in the deck?"),
     ([b"HTTP/1.1 200 OK\r\n", NEVER], "is not of Bitcraze's wifi-img-streamer: is that the"),
-    ([TRUNCATED, NEVER], "pictures come and are dropped (1 so far): the JPEG is not whole, its end"),
+    ([TRUNCATED, NEVER], "pictures come and are dropped (1 so far): the JPEG is not whole, its e"),
     ([TRUNCATED * 3, NEVER], "pictures come and are dropped (3 so far)"),
     ([DAMAGED, NEVER], "pictures come and are dropped (1 so far): the JPEG is damaged"),
     ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "has 162x122 px, and its header"),

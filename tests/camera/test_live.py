@@ -132,7 +132,9 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     gate.set()
     until(lambda: source.problem(100.0) is not None)
     assert source.connections == 2 + source.max_failures
-    assert "gave no picture in 5 attempts: connected, but the stream ends without a picture" in str(source.problem(100.0))
+    assert "gave no picture in 5 attempts: connected, but the stream ends without a picture" in str(
+        source.problem(100.0)
+    )
 
 
 HTML = b"<html>the camera's page</html>"
@@ -142,8 +144,8 @@ HTML = b"<html>the camera's page</html>"
     ([threading.Event()], "connected, but it sends nothing: does another program use it?"),
     ([HTML, threading.Event()], "it sends no type, and no whole JPEG: is it the stream's own addr"),
     ([part(jpeg(60)[:300]), threading.Event()], "it sends no type, and no whole JPEG"),
-    ([part(resized(jpeg(60), 5000, 4000)), threading.Event()], "pictures come and are dropped (1 so "
-     "far): they have 5000x4000 px"),
+    ([part(resized(jpeg(60), 5000, 4000)), threading.Event()], "pictures come and are dropped (1 "
+     "so far): they have 5000x4000 px"),
     ([part(NO_PIXELS), threading.Event()], "pictures come and are dropped (1 so far): the "
      "JPEG cannot be decoded"),
 ])  # fmt: skip

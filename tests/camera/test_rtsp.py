@@ -142,9 +142,7 @@ def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
     assert "secret" not in str(caught.value)
 
 
-def test_a_stream_without_a_picture_says_so(
-    server: RtspServer, opened: list[LiveSource]
-) -> None:
+def test_a_stream_without_a_picture_says_so(server: RtspServer, opened: list[LiveSource]) -> None:
     never = threading.Event()
     for _ in range(9):
         server.scripts.put([never])

@@ -181,7 +181,9 @@ def test_the_advice_fits_the_kind_of_link(uri: str, words: str) -> None:
     """No radio is brought nearer where there is none."""
     good = replace(GOOD, uri=uri, link_quality=None)
     for bad_s in ([0.004] * 80 + [math.inf] * 20, [math.inf] * 100, [0.2] * 100):
-        (row,) = (r for n, r in rows_of(replace(good, round_trips_s=bad_s)).items() if n == "packets")
+        (row,) = (
+            r for n, r in rows_of(replace(good, round_trips_s=bad_s)).items() if n == "packets"
+        )
         assert row.verdict is Verdict.FAIL
         assert words in row.advice
         assert ("radio" in row.advice) == uri.startswith("radio")
