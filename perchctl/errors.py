@@ -107,7 +107,7 @@ class EmergencyStopped(PerchError):
 
 class LogIncomplete(PerchError):
     exit_code = 60
-    meaning = "perched, but the flight log is incomplete"
+    meaning = "perched or simulated, but a flight log is incomplete"
 
 
 class ReplayDiffers(PerchError):

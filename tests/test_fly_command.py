@@ -54,6 +54,30 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []  # no log either
 
 
+@pytest.mark.parametrize(("words", "keys", "code", "named"), [
+    ("", "camera: {mount: {rpy_deg: [90, 0, 0]}}", 52, "camera turn"),
+    ("--log-dir afile", "{}", 30, "afile"),
+    ("-u usb://0 --source camera:0", "positioning: {by: mocap, host: lab, body: cf}", 52, "never"),
+])  # fmt: skip
+def test_a_plan_that_fly_refuses_exits_as_fly_does(
+    words: str, keys: str, code: int, named: str
+) -> None:
+    """Otherwise a script that flies what the plan allows finds out in the air's reach."""
+    pytest.importorskip("motioncapture" if "mocap" in keys else "mujoco")
+    Path("bad.yaml").write_text(f"extends: sim\n{keys if keys != '{}' else ''}\n")
+    Path("afile").touch()
+    planned = run("fly", "-p", "bad.yaml", *words.split(), "--dry-run")
+    assert (planned.code, run("fly", "-p", "bad.yaml", *words.split(), "--yes").code) == (
+        code,
+        code,
+    )
+    assert named in planned.stderr
+    assert "log " in planned.stdout  # the plan is shown all the same
+    record = json.loads(run("fly", "-p", "bad.yaml", *words.split(), "--dry-run", "--json").stdout)
+    assert record["exit_code"] == code
+    assert named in record["error"]
+
+
 def test_the_plan_loads_what_the_profile_names(tmp_path: Path) -> None:
     (tmp_path / "my_part.py").write_text("class Camera: pass\n")
     said = run("fly", "--source", "my_part:Camra", "--dry-run")

@@ -30,6 +30,7 @@ from perchctl.commands.command_line import (
 )
 from perchctl.commands.interrupt import ignore_signals, interruptible
 from perchctl.commands.output import (
+    add_problem,
     ask_to_confirm,
     print_lines,
     print_result,
@@ -49,6 +50,7 @@ from perchctl.errors import (
     Interrupted,
     InvalidValue,
     LogIncomplete,
+    PerchError,
     SafetyAbort,
     TargetNotFound,
     UsageError,
@@ -127,8 +129,12 @@ def fly(
     """
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:
-        print_result(plan_record(options) if as_json else plan_text(options))
-        return 0
+        refused = plan_problem(options)
+        print_result(add_problem(plan_record(options), refused) if as_json else plan_text(options))
+        if refused is None:
+            return 0
+        say(f"fly would refuse this: {refused}")
+        return refused.exit_code
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
     options.require_lift_check()
@@ -216,10 +222,10 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
             say(sentence)
         summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
-        print_lines(summary.text(log.path), stdout=not as_json)
+        written = print_lines(summary.text(log.path), stdout=not as_json)
         if page is not None:
             page.end(summary, log.path)
-    code = exit_code(report.outcome, summary)
+    code = exit_code(report.outcome, summary) or (0 if written else InvalidValue.exit_code)
     plot = draw_flight_plot(log.path, options.profile)
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
@@ -313,6 +319,16 @@ def flight_page(
 
 
 _COLUMN, _WIDTH = 13, 80
+
+
+def plan_problem(options: FlyOptions) -> PerchError | None:
+    """Return the error with which `fly` would refuse these options, before it opens anything."""
+    try:
+        warnings_before_flight(options)
+        options.require_lift_check()
+    except PerchError as error:
+        return error
+    return None
 
 
 def plan_record(options: FlyOptions) -> dict[str, Any]:

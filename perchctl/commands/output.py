@@ -13,21 +13,27 @@ from typing import Any, TextIO
 
 from perchctl.errors import PerchError
 
+NO = ("n", "no", "q", "quit")
+"""Answers that stop what only waits for Enter."""
+
 
 def say(sentence: str) -> None:
     """Print a sentence on stderr, as stdout is for results. Never raises."""
     print_lines(f"perchctl: {sentence}")
 
 
-def print_lines(text: str, stdout: bool = False) -> None:
-    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error."""
+def print_lines(text: str, stdout: bool = False) -> bool:
+    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error. Returns
+    False if a result on stdout is lost, as on a full disk."""
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
     except (OSError, ValueError) as error:
+        discard_output(stream)
         if stdout and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             say(f"the result cannot be written: {error.strerror}; free some space")
-        discard_output(stream)
+            return False
+    return True
 
 
 def discard_output(stream: TextIO) -> None:

@@ -247,7 +247,7 @@ class FaultyFlight:
         )
         if self._log is not None:
             self._log.close(report, result.miss_m, "fell" in result.flags)
-            result = replace(result, log=self._log.path, log_problem=self._log.problem)
+            result = replace(result, log=self._log.path, log_problem=self._log.loss_reason)
         return result
 
     def _for_log(self) -> tuple[tuple[float, float, float], float]:

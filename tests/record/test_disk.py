@@ -240,3 +240,23 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
     told = json.loads(said.out)
     assert (told["exit_code"], told["lost_records"]) == (code, int(full))
     assert ("No space left on device" in said.err) is full
+
+
+@pytest.mark.parametrize(("outcome", "code"), [(Outcome.PERCHED, 30), (Outcome.SAFETY, 52)])
+def test_a_result_that_stdout_does_not_take_is_in_the_exit_code(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    outcome: Outcome,
+    code: int,
+) -> None:
+    def session(*_: Any) -> Any:
+        return FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False), None
+
+    quiet = apply_settings(load_profile("sim"), ["log.plot=false"])
+    options = FlyOptions(quiet, Path("sim.yaml"), "sim://", "sim:", log_dir=tmp_path)
+    monkeypatch.setattr(fly, "_session", session)
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        assert fly.fly_and_report(options, as_json=False, view=False) == code
+    assert "the result cannot be written: No space left on device" in capsys.readouterr().err
