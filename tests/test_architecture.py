@@ -85,7 +85,7 @@ MOST_NAMES = {
     "display": 6,
     "faults": 6,
     "flight": 19,
-    "link": 13,
+    "link": 14,
     "record": 12,
     "mission": 32,
     "perception": 5,

@@ -58,6 +58,11 @@ class SourceName:
         """True for cameras and streams, which run in real time; False for recordings."""
         return self.scheme not in ("video", "images")
 
+    @property
+    def is_own(self) -> bool:
+        """True for a camera of your own, ``my_module:MyCamera``."""
+        return self.scheme not in SCHEMES
+
     def __str__(self) -> str:
         return without_password(self.spec)
 
@@ -149,7 +154,7 @@ def open_camera(
         name = parse_source(source)
         if name.scheme == "video" and name.place:
             opened = VideoSource(Path(name.place).expanduser(), latency_s)
-        elif name.scheme not in SCHEMES:
+        elif name.is_own:
             own = make_extension(name.spec, "camera.source", FrameSource, clock, config)
             opened = checked = GuardedSource(own, name.spec, clock)
             checked.wait_first_frame(timeout_s)

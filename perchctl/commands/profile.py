@@ -30,7 +30,7 @@ from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.extensions import is_extension
 from perchctl.files import check_output, write_files
 from perchctl.geometry import Array
-from perchctl.link import check_uri
+from perchctl.link import check_uri, is_own_uri
 from perchctl.profile import (
     Mounting,
     Profile,
@@ -323,9 +323,10 @@ def profile_and_keys(answers: Answers, name: str) -> tuple[Profile, set[str]]:
         path = Path(calibration).expanduser()
         texts["camera.calibration"] = str(path.resolve()) if path.is_file() else calibration
         load_calibration(find_calibration(texts["camera.calibration"]))
-    for key, check in (("link.uri", check_uri), ("camera.source", parse_source)):
-        if key in texts and not is_extension(texts[key]):
-            check(texts[key])
+    if (uri := texts.get("link.uri")) is not None and not (is_own_uri(uri) and is_extension(uri)):
+        check_uri(uri)
+    if "camera.source" in texts:
+        parse_source(texts["camera.source"])
     if texts.get("camera.source") == "camera:":
         raise InvalidValue("camera.source: found camera:; write camera:N or camera:NAME")
     source = texts.get("camera.source", "")
