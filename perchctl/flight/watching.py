@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeGuard, TypeVar
 
 from perchctl.extensions import error_at
 from perchctl.mission import Event, SentCommand, Tick, Turn, Watcher
@@ -21,7 +21,6 @@ SLOW_S = 0.25
 """A call that takes longer is reported: meanwhile the watchdog steers."""
 
 
-@runtime_checkable
 class TurnWatcher(Watcher, Protocol):
     """A watcher of all that a flight log holds: also of the turns without a tick, before take-off
     or decided again, and of the commands that the link sends in the loop's place."""
@@ -60,7 +59,7 @@ class Watchers:
     @property
     def have_log(self) -> bool:
         """True if one of them takes whole turns."""
-        return any(isinstance(watcher, TurnWatcher) for watcher in self._active)
+        return any(takes_turns(watcher) for watcher in self._active)
 
     @property
     def problem(self) -> str | None:
@@ -83,14 +82,14 @@ class Watchers:
 
     def turn(self, turn: Turn) -> None:
         for watcher in self._active:
-            if isinstance(watcher, TurnWatcher):
+            if takes_turns(watcher):
                 self._call(watcher, watcher.turn, turn)
 
     def sent(self, sent: SentCommand) -> None:
         """Hand on a command sent in the loop's place, in the link's thread. Never raises: the next
         command must go out all the same."""
         for watcher in self._active:
-            if isinstance(watcher, TurnWatcher):
+            if takes_turns(watcher):
                 try:
                     watcher.sent(sent)
                 except BaseException as error:  # an exit would end the link's thread
@@ -128,7 +127,7 @@ class Watchers:
                 return  # in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
             self.detached.append(f"{sentence}: it was detached, and the flight went on")
-            if isinstance(watcher, TurnWatcher):  # the loop reports it, as any problem of a log
+            if takes_turns(watcher):  # the loop reports it, as any problem of a log
                 self._log_problem = self._log_problem or sentence
                 return
         self._report(f"{sentence}: it is detached, and the flight goes on")
@@ -136,6 +135,11 @@ class Watchers:
     def _report(self, note: str) -> None:
         with self._lock:
             self._notes.append(note)
+
+
+def takes_turns(watcher: Watcher) -> TypeGuard[TurnWatcher]:
+    """True for a `TurnWatcher`. `isinstance` would read its `problem`, too, which may raise."""
+    return all(callable(getattr(watcher, name, None)) for name in ("turn", "sent"))
 
 
 def watcher_name(watcher: Watcher) -> str:

@@ -99,7 +99,11 @@ def test_a_log_that_fails_is_said_once_and_landed_for_where_the_profile_wants_it
 ) -> None:
     rig = Rig(profile=changed({"safety.land_on_log_error": strict}))
     rig.operator = land_after(rig, 3.0)
-    rig.watcher.problem = "the disk is full"
+
+    def fill(tick: Tick) -> None:
+        rig.watcher.problem = "the disk is full"
+
+    rig.watcher.on_tick = fill
     report = rig.fly()
     assert report.outcome is (Outcome.SAFETY if strict else Outcome.OPERATOR)
     assert ("the disk is full" in report.reason) is strict
