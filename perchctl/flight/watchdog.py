@@ -64,8 +64,8 @@ class LastTick:
 class Watchdog:
     """Decides what the link sends while the loop is silent: its `poll` is the link's guard.
 
-    `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's; each
-    thread writes fields of its own.
+    `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's. Each
+    thread writes fields of its own, and reads the other's: no value is lost without a lock.
 
     `position_age_s` returns the age of the newest external position at a time. `overruled_s` is how
     late the loop was when the watchdog began a landing in its place, else 0.
@@ -80,13 +80,16 @@ class Watchdog:
         self._profile = profile
         self._operator = operator
         self._position_age_s = position_age_s
+        # Written by the loop's thread:
         self._last: LastTick | None = None
+        self._streamed: Command | None = None
+        self._loop_has_cut = False
         self._closing = False
         self._motors_off = False
+        # Written by the link's thread:
         self.overruled_s = 0.0
         self._cut_ordered = False
         self._cut_s, self._cuts = -CUT_PERIOD_S, 0
-        self._streamed: Command | None = None
         self._history: History | None = None
         self._held: PositionSetpoint | None = None
         self._way_down: PlannerState | None = None
@@ -100,7 +103,7 @@ class Watchdog:
         if isinstance(command, (PositionSetpoint, RawThrust)):
             self._streamed = command
         if isinstance(command, EmergencyStop):
-            self._cut_ordered = True
+            self._loop_has_cut = True
         self._last = LastTick(next_due_s, state, self._streamed or command, obs)
 
     def note_rescue(self) -> None:
@@ -123,7 +126,7 @@ class Watchdog:
     ) -> Command | None:
         """The command to send in the loop's place, or None. `waiting`: unread samples."""
         last = self._last
-        if self._cut_ordered:
+        if self._loop_has_cut or self._cut_ordered:
             return self._cut(now_s, newest)
         if last is None or self._motors_off:
             return None
