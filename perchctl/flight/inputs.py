@@ -233,10 +233,10 @@ CARRIED_FOR_S = 0.1
 CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06  # turning motors scatter 1 g by 0.04, the mean by 0.013
 SINKING_MPS = -0.15  # more than a bias makes while the place is sent
 FROZEN_S = 0.06
-AHEAD_S = 0.1
-"""A picture may be so much ahead of the loop's clock; else its time is of another clock."""
 """An attitude frozen for longer is not the exposure's, and 0.1 rad displaces a vehicle 1.2 m under
 the target by 12 cm."""
+AHEAD_S = 0.1
+"""A picture may be so much ahead of the loop's clock; else its time is of another clock."""
 
 
 class TargetPositioning:
