@@ -87,7 +87,7 @@ MOST_NAMES = {
     "flight": 19,
     "link": 14,
     "record": 12,
-    "mission": 32,
+    "mission": 33,
     "perception": 5,
     "positioning": 10,
     "profile": 33,

@@ -1,4 +1,4 @@
-"""The live page of a flight: pictures, numbers, and a STOP button that lands."""
+"""The live page of a flight: pictures, numbers, and buttons to land and to cut the motors."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class FlightPage:
             self.page.store_error(error)
 
     def event(self, event: Event) -> None:
-        if event.is_rescue:
+        if event.rest is not None:
             self._rescue = event.reason
 
     def end(self, summary: FlightSummary, log: Path) -> None:

@@ -396,7 +396,4 @@ def report_claims(report: FlightReport) -> Claims:
 
 def rescue_claims(event: Event) -> Claims:
     """The claims of a rescue's event; an empty set for any other event."""
-    if not event.is_rescue:
-        return set()
-    found = next(found for found in RestState if found.value in event.reason)
-    return RESCUE_CLAIMS[found]
+    return set() if event.rest is None else RESCUE_CLAIMS[event.rest]

@@ -125,7 +125,7 @@ def fly(parts: FlightParts) -> FlightReport:
         with contextlib.suppress(Exception):  # what failed may fail again
             turns.report_failure(inputs, error)
         with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
-            watchers.event(Event.of_rescue(parts.clock.now(), error, rest))
+            watchers.event(Event.of_rescue(parts.clock.now(), error, rest.state, rest.text))
         raise
 
 

@@ -23,10 +23,11 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
+    Rest,
     RestState,
     SentCommand,
     VisualInertialMotion,
-    rest_text,
+    find_rest,
     step_landing,
 )
 from perchctl.perception import History, add_samples
@@ -235,9 +236,9 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
-) -> str:
+) -> Rest:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
-    Returns where the vehicle came to rest, in words without a full stop.
+    Returns where the vehicle came to rest.
 
     Args:
         state: the planner's last state; None before its first tick.
@@ -258,7 +259,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return RestState.UNSEEN.value
+            return Rest(RestState.UNSEEN)
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         problem: str | None = "the link fails"
@@ -279,8 +280,8 @@ def rescue(
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
-            rest = rest_text(state, obs, profile, LOOK_S)
+            rest = find_rest(state, obs, profile, LOOK_S)
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return RestState.UNSEEN.value
+    return Rest(RestState.UNSEEN)

@@ -161,17 +161,29 @@ class FlightReport:
         )
 
 
-def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
-    """Return where the vehicle is, in words without a full stop, with its touchdown if that was
-    hard; None until its motors have been seen off for `off_s`."""
+@dataclass(frozen=True)
+class Rest:
+    """Where a vehicle came to rest, and how hard it met the floor if it did."""
+
+    state: RestState
+    touchdown: Touchdown | None = None
+
+    @property
+    def text(self) -> str:
+        """The rest in words without a full stop, with its touchdown if that was hard."""
+        if self.touchdown is None or not self.touchdown.is_hard:
+            return self.state.value
+        return f"{self.state.value}; it {self.touchdown.text}"
+
+
+def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
+    """Return where the vehicle is; None until its motors have been seen off for `off_s`."""
     c = Context(state, obs, profile)
     if c.held_s(Condition.DOWN) < off_s:
         return None
-    finding, touchdown = find_rest_state(c), find_touchdown(c)
-    hangs = finding in (RestState.HANGS, RestState.HELD)
-    if hangs or touchdown is None or not touchdown.is_hard:
-        return finding.value
-    return f"{finding.value}; it {touchdown.text}"
+    found = find_rest_state(c)
+    hangs = found in (RestState.HANGS, RestState.HELD)
+    return Rest(found, None if hangs else find_touchdown(c))
 
 
 def find_touchdown(c: Context) -> Touchdown | None:

@@ -19,7 +19,16 @@ from perchctl.display import FlightPage, FlightPanel, LivePage, Sketch
 from perchctl.display.live import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
-from perchctl.mission import FlightReport, Operator, Outcome, Phase, Watcher
+from perchctl.mission import (
+    Event,
+    FlightReport,
+    Operator,
+    Outcome,
+    Phase,
+    Rest,
+    RestState,
+    Watcher,
+)
 from perchctl.profile import load_profile
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
@@ -163,11 +172,12 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     flight.fail(Interrupted("interrupted before take-off"), None)
     card = state_of(page)["card"]
     assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
-    flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
+    found = Rest(RestState.UNKNOWN)
+    flight.event(Event.of_rescue(START_S, RuntimeError(), found.state, found.text))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
     flight.fail(RuntimeError("boom"), tmp_path)
     rows = state_of(page)["card"]["rows"]
-    assert rows[0][1].endswith("the motors are off")
+    assert rows[0][1] == f"RuntimeError in flight: {RestState.UNKNOWN.value}"
     assert "report" in dict(rows)
     assert waited_s == [LAST_READ_S]  # for somebody who looks, as at the second end
 

@@ -21,6 +21,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
+    Rest,
     SentCommand,
     Tick,
 )
@@ -278,7 +279,7 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> str:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rest:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state

@@ -20,11 +20,12 @@ from perchctl.mission import (
     Outcome,
     Phase,
     PlannerState,
+    RestState,
 )
 from perchctl.mission.state import BatteryOutlook
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_rounded_json
-from perchctl.record.fields import FIELDS, tick_record
+from perchctl.record.fields import FIELDS, event_record, tick_record
 from perchctl.record.messages import TICK_SCHEMA
 from perchctl.record.write import log_path
 from perchctl.vehicle import (
@@ -151,3 +152,12 @@ def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -
     for summary in (ended, read):
         assert ("change no profile" in summary.text()) is (uri == "sim://")
     assert ("set camera.latency_s" in read.text()) is (uri != "sim://")
+
+
+@pytest.mark.parametrize("rest", RestState)
+def test_a_rescue_is_a_note_with_its_rest(rest: RestState) -> None:
+    """A reader needs no prose to tell where the vehicle is."""
+    record = event_record(Event.of_rescue(9.0, ValueError(), rest, rest.value))
+    assert (record["event"], record["rest"]) == ("note", rest.name.lower())
+    assert record["reason"] == f"ValueError in flight: {rest.value}"
+    assert event_record(Event(9.0, EventKind.NOTE, "a note in flight: "))["rest"] is None
