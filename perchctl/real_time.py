@@ -52,8 +52,9 @@ def fly(
     record: bool | None = None,
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
-    **It arms at once.** In the main thread press Ctrl-C to land, and again to cut the motors.
-    Warnings of the checks, and an incomplete log, are Python warnings (`perchctl.errors.Note`).
+    **It arms at once.** In the main thread: Press Ctrl-C to land. Press it again to cut the
+    motors. Warnings of the checks, and an incomplete log, are Python warnings
+    (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name or its file.

@@ -44,7 +44,7 @@ from perchctl.errors import (
 from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
-"""A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
+"""A second Ctrl-C counts from here on; presses closer together are one."""
 _NO_DIFFERENCE = ("name", "description", "date")
 
 
