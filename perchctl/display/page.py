@@ -26,6 +26,7 @@ class FlightPage:
     A failing page does not land the vehicle: `problem` stays None, `page.problem` has the error.
     """
 
+    name = "the live page"
     problem: str | None = None
 
     def __init__(self, page: LivePage, large_side_m: float, gear_up_m: float) -> None:

@@ -109,6 +109,7 @@ class FlightPanel:
     `problem` is always None, `failure` says why the output stopped.
     """
 
+    name = "the panel"
     problem: str | None = None
     help: tuple[str, str] = ("", "")
     """Sentences in the panel's frame, at most 60 columns each: below, and above."""

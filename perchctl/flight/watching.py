@@ -69,6 +69,8 @@ class Watchers:
                 if watcher.problem:
                     return watcher.problem
             except Exception as error:
+                if id(watcher) in self._judges:
+                    raise
                 self._detach(watcher, error)
         return self._log_problem
 

@@ -59,6 +59,8 @@ class LogWatcher:
         recorder: records the frames of the watched source; None without a recording.
     """
 
+    name = "the flight log"
+
     def __init__(self, path: Path, header_line: bytes, live: bool, file: DiskFile) -> None:
         """Write the header into a new file. Raises OSError."""
         file.write(header_line)

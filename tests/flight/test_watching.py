@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from perchctl.display import FlightPage, FlightPanel
 from perchctl.errors import SafetyAbort
 from perchctl.flight import fly
 from perchctl.flight.watching import SLOW_S
 from perchctl.mission import Event, EventKind, FlightReport, Operator, SentCommand, Tick, Turn
 from perchctl.perception import perception
+from perchctl.record import LogWatcher
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.loop_rig import Broken, Rig, Vehicle, Watcher, hung_rig
 
@@ -99,6 +101,15 @@ def test_a_watcher_without_a_name_is_named_by_its_class() -> None:
     assert report.detached[0].startswith("Breaks raised Broken")
 
 
+@pytest.mark.parametrize("kind", [FlightPanel, FlightPage, LogWatcher])
+def test_the_flight_s_own_watchers_have_names_for_people(kind: Any) -> None:
+    own = object.__new__(kind)  # raises whatever it is called for
+    own.problem = None
+    rig = ordered(Rig())
+    report = fly(replace(rig.parts(), watchers=(own,)))
+    assert report.detached[0].startswith("the ")
+
+
 @pytest.mark.parametrize("lands", [False, True])
 def test_a_log_that_raises_is_the_profile_s_to_judge(lands: bool) -> None:
     rig = Rig()
@@ -151,10 +162,11 @@ def test_an_exit_of_a_watcher_lands_first_and_is_raised(error: type[BaseExceptio
     assert not rig.link.motors
 
 
-def test_a_judge_that_raises_lands_and_is_raised() -> None:
+@pytest.mark.parametrize("part", ["tick", "event", "problem"])
+def test_a_judge_that_raises_lands_and_is_raised(part: str) -> None:
     """A simulated flight without its judge proves nothing."""
     rig = Rig()
-    breaks = Breaks("tick")
+    breaks = Breaks(part)
     breaks.now = lambda: rig.link.now_s
     with pytest.raises(Broken):
         fly(replace(rig.parts(), judges=(breaks,)))
