@@ -123,7 +123,7 @@ class FlightSummary:
         if self.cause and self.cause != self.outcome:
             lines[0] += f" [{self.cause}]"
         if self.simulated and self.blames_profile:
-            lines.append("simulated: so was the camera: change no profile of a real one by this")
+            lines.append("note:      camera and positions were simulated: change no real profile")
         if self.miss_m is not None:
             lines.append(f"miss:      {self.miss_m * 1e3:.1f} mm")
         if self.contact is not None:
