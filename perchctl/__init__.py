@@ -4,7 +4,9 @@ The names of `__init__.pyi` are the public ones, for notebooks and scripts; `doc
 them at work. They are loaded when they are first used, so that the command line starts at once.
 """
 
-from perchctl.startup import exit_at_ctrl_c, is_command_line
+import sys
+
+from perchctl.startup import NO_WINDOWS, exit_at_ctrl_c, is_command_line
 
 if is_command_line():
     exit_at_ctrl_c()  # before lazy_loader, which takes a while to load
@@ -13,3 +15,10 @@ import lazy_loader
 
 __version__ = "0.3.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+if sys.platform == "win32":
+
+    def __getattr__(name: str) -> object:
+        if name in __all__:
+            raise ImportError(NO_WINDOWS)
+        raise AttributeError(name)

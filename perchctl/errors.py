@@ -29,6 +29,8 @@ class PerchError(Exception):
 
     exit_code = 1
     meaning = "other failure"
+    advice = ""
+    """The end of the message that says what to do, where it is known apart."""
 
 
 class UsageError(PerchError):
@@ -113,7 +115,7 @@ class EmergencyStopped(PerchError):
 
 class LogIncomplete(PerchError):
     exit_code = 60
-    meaning = "perched, but the flight log is incomplete"
+    meaning = "perched or simulated, but a flight log is incomplete"
 
 
 class ReplayDiffers(PerchError):

@@ -6,8 +6,9 @@ import difflib
 import re
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib import import_module
+from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,20 @@ PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 _PACKAGE = Path(__file__).parent
 
 
+def has_extension_form(text: str, schemes: Collection[str]) -> bool:
+    """True for ``my_module:MyCamera``, unless the word before the colon is one of perchctl's own
+    `schemes`, in either case: ``camera:HDMI`` is a camera, whatever ``camera.py`` lies about."""
+    word = text.partition(":")[0].lower()
+    return word not in schemes and re.match(PATTERN, text) is not None
+
+
 def is_extension(text: str) -> bool:
     """True for ``my_module:MyCamera`` whose module is there; nothing is loaded."""
     if re.match(PATTERN, text) is None:
         return False
-    _search_here()
     package = re.split("[.:]", text)[0]
-    return package in sys.modules or find_spec(package) is not None
+    found = package in sys.modules or find_spec(package) is not None
+    return found or PathFinder.find_spec(package, [str(Path.cwd())]) is not None
 
 
 def load_extension(text: str, key: str) -> Any:

@@ -14,6 +14,7 @@ from pathlib import Path
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.check import warnings_before_flight
 from perchctl.errors import Note, require_type
+from perchctl.extensions import error_at
 from perchctl.flight import (
     FlyOptions,
     OperatorSwitch,
@@ -51,17 +52,19 @@ def fly(
     record: bool | None = None,
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
-    **It arms without a question.** In the main thread Ctrl-C lands, a second one stops the motors.
-    Warnings of the checks, and an incomplete log, are Python warnings (`perchctl.errors.Note`).
+    **It arms without a question.** In the main thread: Press Ctrl-C to land. Press it again to cut
+    the motors. Warnings of the checks, and an incomplete log, are Python warnings
+    (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name or its file.
         uri, source: vehicle and camera, instead of the profile's. A script that flies ``sim://``
             needs ``if __name__ == "__main__":``, for the simulator's process.
         on_tick: called 50 times a second with a `Tick`: telemetry, target, planner's state and
-            command; it must return within milliseconds.
-        on_event: called with each new phase and each note.
-        should_stop: called in each tick; once it returns True, the vehicle lands.
+            command; it must return within milliseconds. If it raises, it is not called any more,
+            the flight goes on, and a warning follows.
+        on_event: called with each new phase and each note. An error in it is treated alike.
+        should_stop: called in each tick; once it returns True or raises, the vehicle lands.
         rows: your own transitions, besides those of the profile; a replay does not know them.
         seed: of the simulated scenario.
         log_dir: folder of the log, instead of the profile's.
@@ -69,7 +72,8 @@ def fly(
 
     Raises:
         InvalidValue, NotFound, UsageError, ConnectionFailed, TimedOut, SafetyAbort, Interrupted:
-        it refused to take off. In flight: the error of your function, raised after the landing.
+        it refused to take off. KeyboardInterrupt and SystemExit of your functions, once the vehicle
+        has landed.
     """
     profile = load_profile(profile)
     uri = profile.link.uri if uri is None else uri
@@ -85,17 +89,19 @@ def fly(
     record = not options.simulated if record is None else record
     flown_seed = seed if options.simulated else None
     log = LogWatcher.open_real_time(log_dir, profile, uri, source, flown_seed, record)
-    switch, caller = OperatorSwitch(), _UserCallbacks(on_tick, on_event)
+    switch = OperatorSwitch()
+    stopper = _Stopper(should_stop, switch)
     with contextlib.ExitStack() as stack:
+        stack.callback(stopper.warn)
         if threading.current_thread() is threading.main_thread():
             stack.enter_context(operator_signals(switch, partial(print, file=sys.stderr)))
         try:
             report, miss_m = fly_session(
                 options,
-                (log, caller),
+                (log, _OnTick(on_tick), _OnEvent(on_event)),
                 switch,
-                lambda camera: log.watch_source(_Stoppable(camera, should_stop, switch)),
-                log.remarks,
+                lambda camera: log.watch_source(_Stoppable(camera, stopper)),
+                lambda: [*log.remarks(), *stopper.remarks()],
                 rows=rows,
             )
         except BaseException as error:
@@ -106,33 +112,63 @@ def fly(
     problem = None if summary is None else summary.log_problem
     if problem is not None:
         warnings.warn(f"the flight's log is incomplete: {problem}", Note, stacklevel=2)
+    for sentence in report.detached:
+        warnings.warn(sentence, Note, stacklevel=2)
     return Flight(report, log.path, miss_m)
 
 
-@dataclass
-class _UserCallbacks(Watcher):
-    """Calls a user's functions; what one raises lands the vehicle, as of any watcher."""
-
-    on_tick: Callable[[Tick], object]
-    on_event: Callable[[Event], object]
+@dataclass(frozen=True)
+class _OnTick(Watcher):
+    call: Callable[[Tick], object]
+    name: str = "on_tick"
 
     def tick(self, tick: Tick) -> None:
-        self.on_tick(tick)
+        self.call(tick)
+
+
+@dataclass(frozen=True)
+class _OnEvent(Watcher):
+    call: Callable[[Event], object]
+    name: str = "on_event"
 
     def event(self, event: Event) -> None:
-        self.on_event(event)
+        self.call(event)
+
+
+class _Stopper:
+    """Asks whether to stop, and orders the landing. What raises instead of answering is not asked
+    again: it may have meant yes."""
+
+    def __init__(self, should_stop: Callable[[], bool], switch: OperatorSwitch) -> None:
+        self._should_stop, self._switch = should_stop, switch
+        self._error: str | None = None
+        self._remarks: list[str] = []
+
+    def ask(self) -> None:
+        try:
+            if self._error is None and self._should_stop():
+                self._switch.land()
+        except Exception as error:
+            self._switch.land()
+            self._error = f"should_stop raised {error_at(error)}"
+            self._remarks.append(f"{self._error}: landing")
+
+    def remarks(self) -> list[str]:
+        remarks, self._remarks = self._remarks, []
+        return remarks
+
+    def warn(self) -> None:
+        if self._error is not None:
+            warnings.warn(f"{self._error}: the flight was ended", Note, stacklevel=3)
 
 
 class _Stoppable(WrappedSource):
     """Asks whether to stop in the loop's own thread: the watchdog's must not hang in it."""
 
-    def __init__(
-        self, source: FrameSource, should_stop: Callable[[], bool], switch: OperatorSwitch
-    ) -> None:
+    def __init__(self, source: FrameSource, stopper: _Stopper) -> None:
         super().__init__(source)
-        self._should_stop, self._switch = should_stop, switch
+        self._stopper = stopper
 
     def poll(self, now_s: float) -> Frame | None:
-        if self._should_stop():
-            self._switch.land()
+        self._stopper.ask()
         return super().poll(now_s)

@@ -14,6 +14,11 @@ import sys
 
 EXIT_CODE = 130
 SENTENCE = "Ctrl-C"
+NO_WINDOWS = (
+    "Windows is not supported: install perchctl in WSL2 (wsl --install), and attach the radio and "
+    "the camera to it with usbipd-win"
+)
+"""perchctl needs the terminals, signals and locks of POSIX, and cameras by Linux."""
 
 
 def is_command_line() -> bool:
@@ -35,6 +40,14 @@ def restore_ctrl_c() -> None:
     """Make Ctrl-C a KeyboardInterrupt again from now on."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def refuse_windows() -> int:
+    """Say that Windows is not supported; returns the exit code."""
+    sys.stderr.write(f"perchctl: {NO_WINDOWS}\n")
+    if "--json" in sys.argv[1:]:
+        sys.stdout.write(f"{failure_record(NO_WINDOWS, 1)}\n")
+    return 1
 
 
 def failure_record(sentence: str, code: int) -> str:

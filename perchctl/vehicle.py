@@ -175,7 +175,7 @@ class Land:
 
 @dataclass(frozen=True)
 class EmergencyStop:
-    """Cut the motors now and lock: the user's second Ctrl-C, or a useless attitude."""
+    """Cut the motors now and lock: the operator's order, or a useless attitude."""
 
 
 @dataclass(frozen=True)

@@ -273,6 +273,32 @@ def test_a_program_that_imports_perchctl_keeps_its_ctrl_c(
     assert is_command_line() is mine
 
 
+# --- Windows ---------------------------------------------------------------------------------
+
+AS_ON_WINDOWS = """
+import sys
+sys.platform = "win32"
+sys.modules.update(dict.fromkeys(["fcntl", "pwd", "termios", "tty"]))  # an ImportError each
+"""
+
+
+def test_windows_is_refused_in_one_sentence_with_a_way_to_go_on() -> None:
+    done = run_apart("fly", "--json", before=AS_ON_WINDOWS)
+    assert done.code == 1
+    assert done.complaint.startswith("Windows is not supported: install perchctl in WSL2")
+    assert json.loads(done.stdout) == {"error": done.complaint, "exit_code": 1}
+
+
+@pytest.mark.parametrize("use", ["from perchctl import fly", "import perchctl; perchctl.fly"])
+def test_a_program_on_windows_is_told_too(use: str) -> None:
+    shows = "except ImportError as error: sys.exit(f'perchctl: {error}')"
+    done = run_apart(before=f"{AS_ON_WINDOWS}\ntry: {use}\n{shows}")
+    assert done.complaint.startswith("Windows is not supported")
+
+
+# --- Misspelt commands -----------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("words", "meant"),
     [

@@ -17,10 +17,11 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl import fly
 from perchctl.calibration import MountingRecording, load_calibration
 from perchctl.commands import app
 from perchctl.commands.command_line import COMMANDS
-from perchctl.flight import fly_lockstep
+from perchctl.flight import KEY_HELP, STOP_HELP, fly_lockstep
 from perchctl.profile import Profile
 from perchctl.profile.keys import keys
 from tests.helpers import log as made_up_log
@@ -383,6 +384,25 @@ def test_named_keys_are_the_schema_s(path: Path) -> None:
     for name in re.findall(r"`([a-z]+(?:\.[a-z_0-9]+)+)(?:: [\w-]+)?`", TEXT[path]):
         if name.split(".")[0] in Profile.model_fields and name not in others:
             assert name in paths | sections, name
+
+
+@pytest.mark.parametrize(
+    "where", ["README.md", "docs/safety.md", "docs/first-perch.md", "perchctl/display/page.html"]
+)
+def test_the_operator_s_stop_is_described_in_the_same_words(where: str) -> None:
+    """Nobody is to work out, beside a vehicle that flies, whether two sentences mean the same."""
+    assert STOP_HELP in words_of((ROOT / where).read_text(encoding="utf-8"))
+
+
+def test_help_describes_the_operator_s_stop_in_the_same_words() -> None:
+    told = CliRunner().invoke(app, ["fly", "--help"], env={"COLUMNS": "80"}).stdout
+    assert f"{STOP_HELP} {KEY_HELP}" in words_of(told)
+    assert STOP_HELP in words_of(fly.__doc__ or "")
+
+
+def words_of(text: str) -> str:
+    """The text with one space between two words, wherever its lines end."""
+    return " ".join(text.split())
 
 
 def test_faults_have_their_numbers() -> None:

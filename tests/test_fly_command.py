@@ -54,11 +54,62 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []  # no log either
 
 
+@pytest.mark.parametrize(("words", "keys", "code", "named"), [
+    ("", "camera: {mount: {rpy_deg: [90, 0, 0]}}", 52, "camera turn"),
+    ("--log-dir afile", "{}", 30, "afile"),
+    ("-u usb://0 --source camera:0", "positioning: {by: mocap, host: lab, body: cf}", 52, "never"),
+])  # fmt: skip
+def test_a_plan_that_fly_refuses_exits_as_fly_does(
+    words: str, keys: str, code: int, named: str
+) -> None:
+    """Otherwise a script that flies what the plan allows finds out in the air's reach."""
+    pytest.importorskip("motioncapture" if "mocap" in keys else "mujoco")
+    Path("bad.yaml").write_text(f"extends: sim\n{keys if keys != '{}' else ''}\n")
+    Path("afile").touch()
+    planned = run("fly", "-p", "bad.yaml", *words.split(), "--dry-run")
+    assert (planned.code, run("fly", "-p", "bad.yaml", *words.split(), "--yes").code) == (
+        code,
+        code,
+    )
+    assert named in planned.stderr
+    assert "log " in planned.stdout  # the plan is shown all the same
+    record = json.loads(run("fly", "-p", "bad.yaml", *words.split(), "--dry-run", "--json").stdout)
+    assert record["exit_code"] == code
+    assert named in record["error"]
+
+
 def test_the_plan_loads_what_the_profile_names(tmp_path: Path) -> None:
     (tmp_path / "my_part.py").write_text("class Camera: pass\n")
     said = run("fly", "--source", "my_part:Camra", "--dry-run")
     assert (said.code, "did you mean Camera?" in said.stderr) == (20, True)
     assert run("fly", "--source", "my_part:Camera", "--dry-run").code == 0
+
+
+SCHEMES = ("camera", "video", "images", "sim", "http", "rtsp", "aideck", "radio", "usb", "udp")
+
+
+@pytest.mark.parametrize("words", [
+    "fly --dry-run --source camera:HDMI", "fly --dry-run --source CAMERA:HDMI",
+    "fly --dry-run --source video:flight", "fly --dry-run --source images:pictures",
+    "fly --dry-run --source sim:here", "fly --dry-run --source aideck:deck",
+    "fly --dry-run -u radio:mine --source camera:0", "fly --dry-run -u usb:mine",
+    "fly --dry-run -u sim:here", "fly --dry-run -u udp:host -p crazyflie",
+    "check --source camera:HDMI -u udp://127.0.0.1:9", "check -u radio:mine",
+    "track camera:HDMI", "track sim:here", "calibrate camera:HDMI -o x.yaml",
+    "profile new --defaults --set camera.source=camera:HDMI",
+    "profile new --defaults --set link.uri=radio:mine",
+    "profile new --defaults --set positioning.system=vicon:lab",
+    "fly --dry-run -p mocap.yaml",
+])  # fmt: skip
+def test_a_scheme_is_never_taken_for_a_module_that_lies_about(words: str) -> None:
+    """What is here would run: a scheme comes first, everywhere."""
+    for name in (*SCHEMES, "vicon", "CAMERA"):
+        Path(f"{name}.py").write_text("open('ran', 'w').close()\nHDMI = mine = here = lab = None\n")
+    Path("mocap.yaml").write_text("extends: sim\npositioning: {by: mocap, system: 'vicon:lab'}\n")
+    said = run(*words.split())
+    assert not Path("ran").exists(), said
+    if "vicon:lab" in words or "mocap" in words:
+        assert "'vicon:lab' is vicon and a host" in said.stderr
 
 
 def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> None:

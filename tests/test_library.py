@@ -355,6 +355,29 @@ def test_a_lockstep_flight_takes_rows_a_camera_and_a_perception() -> None:
     assert 50 < max(looked) < 128
 
 
+def test_a_watcher_that_raises_ends_no_simulated_flight() -> None:
+    class Breaks:
+        problem = None
+
+        def tick(self, tick: Any) -> None:
+            raise ZeroDivisionError("of a user's")
+
+        def event(self, event: Any) -> None:
+            return
+
+    row = Transition(
+        name="soon",
+        phases={Phase.APPROACH},
+        when=lambda tick: bool(tick.telemetry.position_m[2] > 0.1),
+        to=Phase.LANDING,
+        reason="high enough",
+        severity=Severity.LAND,
+    )
+    with pytest.warns(Note, match="Breaks raised ZeroDivisionError: of a user's"):
+        flight = fly_lockstep(load_profile(SHORT), rows=[row], watchers=(Breaks(),))
+    assert flight.report.reason == "high enough; motors off"
+
+
 def fly_toy(here: Path, on_tick: Any, should_stop: Any, **more: Any) -> Any:
     """Fly `own_link` and `own_camera` in real time."""
     profile, how = load_profile(SHORT), {"on_tick": on_tick, "should_stop": should_stop}
@@ -404,9 +427,6 @@ def test_a_link_and_a_camera_of_your_own_fly_in_real_time(here: Path) -> None:
 @pytest.mark.usefixtures("pictures")
 @pytest.mark.parametrize("by", ["row", "Ctrl-C"])
 def test_a_row_of_your_own_and_ctrl_c_land_in_real_time(by: str, here: Path) -> None:
-    def is_high(tick: Any) -> bool:
-        return bool(tick.telemetry.position_m[2] > 0.1)
-
     def press(tick: Any) -> None:
         if by == "Ctrl-C" and tick.state.phase is Phase.APPROACH and is_high(tick):
             signal.raise_signal(signal.SIGINT)
@@ -437,8 +457,51 @@ def test_a_log_that_is_incomplete_is_told(here: Path, monkeypatch: pytest.Monkey
         )
 
 
+def is_high(tick: Any) -> bool:
+    return bool(tick.telemetry.position_m[2] > 0.1)
+
+
 @pytest.mark.usefixtures("pictures")
-def test_what_a_callback_raises_lands_the_vehicle_first(
+@pytest.mark.parametrize("failing", ["on_tick", "on_event"])
+def test_a_callback_that_raises_is_left_out_and_the_flight_goes_on(
+    here: Path, failing: str
+) -> None:
+    calls, ticks, events = list[Any](), list[Any](), list[Any]()
+
+    def fails(what: Any) -> None:
+        calls.append(what)
+        raise ZeroDivisionError("of a user's")
+
+    how: dict[str, Any] = {"on_tick": ticks.append, "on_event": events.append} | {failing: fails}
+    asked = itertools.count()
+    with pytest.warns(Note, match=rf"{failing} raised ZeroDivisionError: of a user's \(test_lib"):
+        flight = fly_toy(here, should_stop=lambda: calls and next(asked) > 100, **how)
+    assert len(calls) == 1
+    assert flight.report.outcome.value == "operator"
+    (said,) = [each["reason"] for each in read_log(flight.log).events if each["event"] == "note"]
+    assert f"{failing} raised ZeroDivisionError" in said
+    assert "the flight goes on" in said
+    assert events[-1].phase is Phase.LANDED if failing == "on_tick" else ticks[-1].state.phase
+
+
+@pytest.mark.usefixtures("pictures")
+def test_should_stop_that_raises_lands(here: Path) -> None:
+    """It may have meant yes."""
+    ticks, events = list[Any](), list[Any]()
+
+    def fails() -> bool:
+        if ticks and is_high(ticks[-1]):
+            raise ZeroDivisionError("of a user's")
+        return False
+
+    with pytest.warns(Note, match="should_stop raised ZeroDivisionError: of a user's"):
+        flight = fly_toy(here, ticks.append, fails, on_event=events.append)
+    assert flight.report.outcome.value == "operator"
+    assert any("should_stop raised" in each.reason for each in events)
+
+
+@pytest.mark.usefixtures("pictures")
+def test_an_exit_of_a_callback_lands_the_vehicle_first(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import own_link
@@ -447,21 +510,21 @@ def test_what_a_callback_raises_lands_the_vehicle_first(
     made = own_link.Toy
     monkeypatch.setattr(own_link, "Toy", lambda *given: toys.append(made(*given)) or toys[-1])
 
-    def fails(tick: Any) -> None:
-        if tick.telemetry.position_m[2] > 0.1:
-            raise ZeroDivisionError("of a user's")
+    def leaves(tick: Any) -> None:
+        if is_high(tick):
+            sys.exit("the user's program ends")
 
     with pytest.raises(Interrupted, match="nothing was started"):
-        fly_toy(here, fails, lambda: True)
-    with pytest.raises(ZeroDivisionError, match="of a user's"):
-        fly_toy(here, fails, lambda: False)
+        fly_toy(here, leaves, lambda: True)
+    with pytest.raises(SystemExit, match="the user's program ends"):
+        fly_toy(here, leaves, lambda: False)
     (log,) = here.glob("*.jsonl")  # only of the flight that began
     assert read_log(log).summary.outcome == "failed"
     assert toys[1]._place[2] < 0.02
     assert not toys[1]._flies
     monkeypatch.setattr(sys.modules["own_camera"].UdpCamera, "live", False)
     with pytest.raises(UsageError, match="no live camera"):
-        fly_toy(here, fails, lambda: False)
+        fly_toy(here, leaves, lambda: False)
 
 
 def test_the_examples_are_what_the_protocols_say() -> None:

@@ -46,7 +46,7 @@ from perchctl.display import (  # noqa: E402
 )
 from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import status_panel  # noqa: E402
-from perchctl.flight import FlyOptions  # noqa: E402
+from perchctl.flight import KEY_HELP, STOP_HELP, FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
 from perchctl.mission import Phase, PlannerState, Tick  # noqa: E402
 from perchctl.mission.state import BatteryOutlook  # noqa: E402
@@ -126,7 +126,7 @@ class Flight:
     def tick(self, index: int) -> Tick:
         """What the displays showed at that tick."""
         r, first = self.log.records[index], self.log.records[0]
-        since_s = self.log.since(float(r["t_s"]))
+        since_s = self.log.to_flight_s(float(r["t_s"]))
         span = next(s for s in reversed(self.log.phases) if s.start_s <= since_s)
         t_s, still = r["t_s"], (0.0, 0.0, 0.0)
         place = (r["x_m"], r["y_m"], r["z_m"])
@@ -194,7 +194,7 @@ def terminal(flown: Flight, file: Path) -> None:
             break
         text = f"[{span.start_s - flown.log.start_s:7.2f} s] {span.phase}: {span.reason}"
         console.print(Text(text), soft_wrap=True)
-    console.print(status_panel(flown.tick(index)))
+    console.print(status_panel(flown.tick(index), STOP_HELP, KEY_HELP))
     svg = console.export_svg(title="perchctl", unique_id="perchctl")
     # Fonts from another server would be fetched by each reader.
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
@@ -208,7 +208,7 @@ def page(flown: Flight, file: Path) -> None:
     picture, shown = flown.sketch(flown.frame(last)), [first]
     profile = flown.profile
     drawn = {"large_m": profile.target.large.side_m, "gear_m": profile.vehicle.gear_body_m[2]}
-    live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
+    live = LivePage(flown.camera, "perchctl fly sim://", lambda: None, lambda: None)
     closing = threading.Event()
 
     def feed() -> None:

@@ -54,16 +54,27 @@ class _Picture:
     size: int
     data: bytearray
 
-    def pixels(self) -> NDArray[np.uint8] | None:
-        """The grey picture (h, w) of complete raw or JPEG data of its size, else None."""
+    def decode(self) -> tuple[NDArray[np.uint8], bytes | None] | str:
+        """The grey picture (h, w), and its JPEG if it came as one; or why it cannot be used. What
+        stands behind a JPEG's end is padding."""
         shape, data = (self.height, self.width), bytes(self.data)
-        if len(data) != self.size:
-            return None
         if not self.is_jpeg:
-            return np.frombuffer(data, np.uint8).reshape(shape)
-        is_whole = jpeg_end_and_size(data) == (len(data), (self.width, self.height))
-        image = decode_grey(data) if is_whole else None
-        return image if image is not None and image.shape == shape else None
+            if len(data) != self.size:
+                return f"{len(data)} bytes came, and its header announces {self.size}"
+            return np.frombuffer(data, np.uint8).reshape(shape), None
+        extent = jpeg_end_and_size(data)
+        if extent is None:
+            return "the JPEG is not whole, its end is missing"
+        end, (width, height) = extent
+        if not (width and height):
+            return "the JPEG is damaged"
+        if (width, height) != (self.width, self.height):
+            announced = f"{self.width}x{self.height}"
+            return f"the JPEG has {width}x{height} px, and its header announces {announced}"
+        image = decode_grey(data[:end])
+        if image is None or image.shape != shape:
+            return "the JPEG cannot be decoded"
+        return image, data[:end]
 
 
 class AiDeckSource(LiveSource):
@@ -74,6 +85,9 @@ class AiDeckSource(LiveSource):
     the last byte. Incomplete pictures are dropped; an invalid packet ends the connection, and the
     source reconnects.
     """
+
+    unreached_advice = "is this computer in the deck's Wi-Fi network, and is the address right?"
+    silent_advice = "switch the Crazyflie off and on"
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
@@ -87,6 +101,7 @@ class AiDeckSource(LiveSource):
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
             connection.settimeout(self.read_timeout_s)
             self._picture = None
+            self._connected()
             with connection.makefile("rb") as stream:
                 return self._read(stream)
 
@@ -96,14 +111,17 @@ class AiDeckSource(LiveSource):
             head = stream.read(_PACKET.size)
             came_s = self._clock()
             if len(head) < _PACKET.size:
-                return "the stream ended; if it does not begin, switch the Crazyflie off and on"
+                return "the stream ended"
             length, _, function = _PACKET.unpack(head)
             if not 2 <= length <= MAX_PACKET_BYTES or function not in _FUNCTIONS:
-                return (
-                    "what it sends is not of Bitcraze's wifi-img-streamer; is that the program in "
-                    "the deck?"
+                self._note(
+                    "what it sends is not of Bitcraze's wifi-img-streamer",
+                    "is that the program in the deck?",
                 )
+                return "no packet of the streamer"
             data = stream.read(length - 2)
+            if self._picture is None and self._arrived == 0:
+                self._note("it sends, but no picture", "does wifi-img-streamer run in the deck?")
             if function == _APP:
                 self._take(data, came_s)
         return "closed"
@@ -120,12 +138,18 @@ class AiDeckSource(LiveSource):
         if len(picture.data) < picture.size:
             return
         self._picture = None
-        image = picture.pixels() if self._clock() - picture.began_s <= STALLED_S else None
-        if image is None:
+        took_s = self._clock() - picture.began_s
+        if took_s > STALLED_S:
+            self._drop(f"it took {took_s:.1f} s from its first byte to its last")
             return
+        decoded = picture.decode()
+        if isinstance(decoded, str):
+            self._drop(decoded)
+            return
+        image, encoded = decoded
         grey = self._grey(image)
-        as_came = picture.is_jpeg and grey is image  # no mosaic was taken out of it
-        encoded = bytes(picture.data) if as_came else None
+        if grey is not image:  # a mosaic was taken out of it
+            encoded = None
         self._put(grey, began_s=picture.began_s, encoded=encoded)
 
 

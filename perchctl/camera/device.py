@@ -62,6 +62,8 @@ class DeviceSource(LiveSource):
     released, and opened again once it is back. `opener` returns a cv2.VideoCapture.
     """
 
+    silent_advice = "if it is a receiver: is the camera powered, and the receiver on its channel?"
+    unreached_advice = ""
     reconnect_wait_s = REOPEN_EVERY_S
     max_failures = math.inf
     retry_s = RETRY_S
@@ -74,6 +76,7 @@ class DeviceSource(LiveSource):
 
     def _connection(self) -> str:
         capture, failures = self._opener(), 0
+        self._connected()
         try:
             while not self._stop.is_set():
                 why = "stopped delivering frames"
@@ -85,6 +88,7 @@ class DeviceSource(LiveSource):
                         continue
                 except Exception as error:  # whatever a damaged picture does to OpenCV
                     why = f"gives pictures that cannot be decoded ({describe_error(error)})"
+                    self._drop(f"they cannot be decoded ({describe_error(error)})")
                 failures += 1
                 if failures >= LOST_AFTER_FAILURES:
                     raise NotFound(f"{self._name} {why}; plug it in again, or name another camera")

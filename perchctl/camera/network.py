@@ -47,6 +47,8 @@ class MjpegSource(LiveSource):
     settings are ignored.
     """
 
+    silent_advice = "does another program use it? many cameras serve one at a time"
+
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
         parts = urlsplit(url)
@@ -56,6 +58,7 @@ class MjpegSource(LiveSource):
     def _connection(self) -> str:
         try:
             with closing(self._opened()) as response:
+                self._connected()
                 self._read(response)
         except HTTPError as refused:
             refused.close()
@@ -64,6 +67,8 @@ class MjpegSource(LiveSource):
                 reason += ", so write its name and password as in http://NAME:PASSWORD@HOST/PATH"
             if refused.code in _NOT_MENDED:
                 raise NotFound(f"{self._name}: {reason}") from None
+            self._connected()
+            self._note(reason)
             return reason
         return "the stream ended"
 
@@ -104,12 +109,19 @@ class MjpegSource(LiveSource):
             data = response.read1(READ_BYTES)
             if not data:
                 return
+            if self._arrived == 0:
+                kind = response.headers.get("Content-Type", "no type")
+                self._note(f"it sends {kind}, and no whole JPEG", "is it the stream's own address?")
             # If the network delivered several at once only the newest is worth decoding.
             for picture, (width, height) in reversed(splitter.feed(data)):
-                image = decode_grey(picture) if width * height <= MOST_STREAM_PX else None
+                if width * height > MOST_STREAM_PX:
+                    self._drop(f"they have {width}x{height} px, the most are {MOST_STREAM_PX} px")
+                    continue
+                image = decode_grey(picture)
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
+                self._drop("the JPEG cannot be decoded")
 
 
 # --- RTSP, decoded by PyAV: its open and read end in time, and say why they failed; OpenCV's
@@ -170,6 +182,8 @@ class RtspSource(LiveSource):
     """
 
     connect_timeout_s = 5.0
+    silent_advice = "does another program use it? many cameras serve one at a time"
+    unreached_advice = "is the address right, is the camera on, and does no other program use it?"
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
@@ -196,7 +210,10 @@ class RtspSource(LiveSource):
         import av.error
 
         if not stream.streams.video:
+            self._is_connected = True
+            self._note("the stream has no picture in it", "is it the address of the video?")
             return "the stream has no picture in it"
+        self._connected()
         video = stream.streams.video[0]
         # A thread for each frame would hold back as many frames as there are threads.
         video.thread_type = "NONE"
@@ -209,6 +226,7 @@ class RtspSource(LiveSource):
                 frames = [(f.to_ndarray(format="gray"), f.time) for f in packet.decode()[-1:]]
             except (av.error.FFmpegError, ValueError):
                 damaged += 1
+                self._drop("they cannot be decoded")
                 if damaged >= MAX_DAMAGED:
                     return "its pictures cannot be decoded"
                 continue
@@ -230,7 +248,7 @@ _REASONS = {
     "HTTPUnauthorizedError": "it wants another name or password (401), as in "
     "rtsp://NAME:PASSWORD@HOST/PATH",
     "OSError": "the host cannot be reached, or its name is unknown",
-    "ExitError": "no answer in time",
+    "ExitError": "no answer in time, or no picture in it",
     "InvalidDataError": "no answer in time, or none of RTSP",
 }
 """In the place of FFmpeg's own, which say less."""

@@ -22,7 +22,7 @@ from perchctl.camera.source import (
     unmirror_frame,
     without_password,
 )
-from perchctl.errors import InvalidValue, NotFound, TimedOut
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.extensions import is_extension, make_extension
 from perchctl.profile import CameraConfig
 
@@ -57,6 +57,11 @@ class SourceName:
     def live(self) -> bool:
         """True for cameras and streams, which run in real time; False for recordings."""
         return self.scheme not in ("video", "images")
+
+    @property
+    def is_own(self) -> bool:
+        """True for a camera of your own, ``my_module:MyCamera``."""
+        return self.scheme not in SCHEMES
 
     def __str__(self) -> str:
         return without_password(self.spec)
@@ -149,7 +154,7 @@ def open_camera(
         name = parse_source(source)
         if name.scheme == "video" and name.place:
             opened = VideoSource(Path(name.place).expanduser(), latency_s)
-        elif name.scheme not in SCHEMES:
+        elif name.is_own:
             own = make_extension(name.spec, "camera.source", FrameSource, clock, config)
             opened = checked = GuardedSource(own, name.spec, clock)
             checked.wait_first_frame(timeout_s)
@@ -185,8 +190,6 @@ def _started(source: LiveSource, timeout_s: float) -> FrameSource:
     source.begin()
     if source.wait_first_frame(timeout_s):
         return source
+    error = source.failure or source.no_first_frame(timeout_s)
     source.close()
-    raise source.failure or TimedOut(
-        f"{source.describe()}: no first frame within {timeout_s:g} s; is the camera powered, and "
-        f"its receiver on the right channel?"
-    )
+    raise error

@@ -56,6 +56,7 @@ SILENT_AFTER_S = 1.0
 """A live source without a new frame for so long counts as gone."""
 CLOSE_WITHIN_S = 3.0
 _POLL_S = 0.002
+_SILENT = "connected, but it sends nothing"
 
 
 @runtime_checkable
@@ -127,6 +128,10 @@ class LiveSource:
 
     A subclass defines `_connection`, which opens and reads the camera. A connection that ended is
     made again after `reconnect_wait_s`, until `max_failures` in a row brought no picture.
+
+    A source that gives no picture says what it has seen, and no cause that it has not: whether
+    it connected (`_connected`), whether anything came (`_note`), and whether pictures came and were
+    dropped (`_drop`).
     """
 
     live = True
@@ -135,6 +140,10 @@ class LiveSource:
     read_timeout_s = 2.0
     reconnect_wait_s = 0.3
     max_failures = 5.0
+    unreached_advice = "is the address right, and is the camera on?"
+    """What to do if no connection is made."""
+    silent_advice = "switch the camera off and on"
+    """What to do if a connection is made, and nothing comes."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = without_password(name)
@@ -148,6 +157,10 @@ class LiveSource:
         self._last_arrival_s = clock()
         self._arrived = 0  # pictures, a receiver's repetitions too
         self._why_silent = ""
+        self._found = ("", "")  # by the newest connection, and what to do: until a picture comes
+        self._is_connected = False
+        self._dropped = 0  # pictures that came since the last good one
+        self._why_dropped = ""
         self.connections = 0
         self.failure: PerchError | None = None
         self.size_px: tuple[int, int] | None = None
@@ -161,10 +174,26 @@ class LiveSource:
             if self.failure is not None:
                 return str(self.failure)
             silent_s = now_s - self._last_arrival_s
-            why = f": {self._why_silent}" if self._why_silent else ""
         if silent_s > SILENT_AFTER_S:
-            return f"{self._name} has delivered no frame for {silent_s:.1f} s{why}"
+            why = ": ".join(filter(None, self._finding_and_advice()))
+            text = f"{self._name} has delivered no frame for {silent_s:.1f} s"
+            return f"{text}: {why}" if why else text
         return None
+
+    def no_first_frame(self, timeout_s: float) -> PerchError:
+        """The error of a source that has given no frame within `timeout_s`."""
+        finding, advice = self._finding_and_advice()
+        late = f"{self._name}: no first frame within {timeout_s:g} s"
+        error = TimedOut(": ".join(filter(None, (late, finding, advice))))
+        error.advice = advice
+        return error
+
+    def _finding_and_advice(self) -> tuple[str, str]:
+        """What has been seen since the last picture, and what to do about it."""
+        if self._dropped:
+            count = f"{self._dropped} so far"
+            return f"pictures come and are dropped ({count}): {self._why_dropped}", ""
+        return self._found if self._found[0] else (self._why_silent, "")
 
     def describe(self) -> str:
         size = "no frame yet" if self.size_px is None else "{}x{} px".format(*self.size_px)
@@ -193,8 +222,13 @@ class LiveSource:
         while not self._stop.is_set():
             before = self._arrived
             self.connections += 1
+            self._is_connected, is_unreached = False, True
             try:
                 reason = self._connection()
+                if self._found[0] == _SILENT:
+                    self._note(
+                        "connected, but the stream ends without a picture", self.silent_advice
+                    )
             except PerchError as error:
                 if self._arrived == 0:
                     self._fail(error)
@@ -203,12 +237,29 @@ class LiveSource:
             except Exception as error:
                 # Whatever damaged bytes do to a library: a new connection may bring whole ones.
                 reason = describe_error(error)
+                is_unreached = isinstance(error, OSError)
             self._why_silent = reason
+            if not self._is_connected:
+                self._found = (reason, self.unreached_advice if is_unreached else "")
             failed = 0 if self._arrived > before else failed + 1
             if failed >= self.max_failures:
-                self._fail(TimedOut(f"{self._name} gave no picture in {failed} attempts: {reason}"))
+                why = ": ".join(filter(None, self._finding_and_advice()))
+                self._fail(TimedOut(f"{self._name} gave no picture in {failed} attempts: {why}"))
                 return
             self._stop.wait(self.reconnect_wait_s)
+
+    def _connected(self) -> None:
+        """Note that the camera answers: while nothing comes, that is what is known."""
+        self._is_connected = True
+        self._note(_SILENT, self.silent_advice)
+
+    def _note(self, finding: str, advice: str = "") -> None:
+        """Note what this connection has shown instead of a picture, and what to do about it."""
+        self._found = (finding, advice)
+
+    def _drop(self, why: str) -> None:
+        """Note that a picture came and cannot be used."""
+        self._why_dropped, self._dropped = why, self._dropped + 1
 
     def _put(
         self,
@@ -230,7 +281,7 @@ class LiveSource:
             self._slot.put(grey, t_s, arrival_s, encoded)
             self._last_arrival_s = arrival_s
             self._arrived += 1
-            self._why_silent = ""
+            self._why_silent, self._found, self._dropped = "", ("", ""), 0
             self.size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 

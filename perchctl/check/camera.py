@@ -41,10 +41,22 @@ SEEN_WARN = 0.5
 """Of the pictures."""
 LEAST_RATED = 10
 """Pictures; of fewer no rate is known."""
-_AGAIN = "plug the receiver or camera in again"
+_AGAIN = {
+    "camera": "plug the receiver or camera in again",
+    "aideck": "switch the Crazyflie off and on",
+    "sim": "start it again",
+}
+_NEARER = {
+    "camera": "if it is a receiver, bring it nearer, turn its antenna, choose another channel; "
+    "else use another cable",
+    "aideck": "bring this computer nearer to the deck, choose another Wi-Fi channel",
+    "sim": "close other programs: the simulated camera runs on this computer",
+}
+_RESTART, _NETWORK = "switch the camera off and on", "look at the network to the camera"
+"""For sources of any other kind."""
 _LIGHT = "more light, a longer exposure, or the lens cap off"
 _ADVICE = {
-    VERDICT_TEXTS["frozen"]: _AGAIN,
+    VERDICT_TEXTS["frozen"]: _RESTART,
     VERDICT_TEXTS["snow"]: "set the receiver to the camera's channel, switch the camera on",
     VERDICT_TEXTS["uniform"]: "uncover the lens, switch the camera on",
     VERDICT_TEXTS["dark"]: _LIGHT,
@@ -54,8 +66,12 @@ _ADVICE = {
 def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
     """The rows of a camera that fails: the first failed, the others skipped."""
     found, semicolon, advice = str(error).rpartition("; ")
-    if not semicolon:
-        found, advice = str(error), "see docs/check.md; perchctl check --cameras lists the cameras"
+    if error.advice:
+        found, advice = str(error).removesuffix(f": {error.advice}"), error.advice
+    elif not semicolon:
+        found, advice = str(error), "see docs/check.md"
+        if found.startswith("camera:"):
+            advice = "see docs/check.md; perchctl check --cameras lists the cameras"
     names = ("size", *picture_row_names(profile))
     return [Row("camera", *failed(found, advice)), *skipped_rows(names, "no picture comes")]
 
@@ -74,7 +90,8 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
         first, *rest = picture_row_names(profile)
-        return [Row(first, *failed(why, _AGAIN)), *skipped_rows(rest, why)]
+        advice = _AGAIN.get(rehearsal.scheme, _RESTART)
+        return [Row(first, *failed(why, advice)), *skipped_rows(rest, why)]
     rows = evaluate_rows(PICTURES, rehearsal, profile)
     if profile.positioning.by == "target":
         rows.append(evaluate_row(IN_VIEW, _in_view, rehearsal, profile, camera))
@@ -98,14 +115,15 @@ def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if not rehearsal.live:
         return skipped("a recording")
     if rehearsal.silent_s > profile.safety.camera_hold_s:
-        return failed(f"none for the last {rehearsal.silent_s:.1f} s", _AGAIN)
+        advice = _AGAIN.get(rehearsal.scheme, _RESTART)
+        return failed(f"none for the last {rehearsal.silent_s:.1f} s", advice)
     pairs = pairwise(rehearsal.arrivals)
     gaps_s = [t - t0 for (i0, t0), (i, t) in pairs if i == i0 + 1]
     if len(gaps_s) < LEAST_RATED:
         return skipped("too few pictures")
     longest_s, limit_s = max(gaps_s), profile.safety.camera_hold_s
     found = f"the longest gap is {1e3 * longest_s:.0f} ms"
-    advice = "bring the receiver nearer, turn its antenna, choose another channel"
+    advice = _NEARER.get(rehearsal.scheme, _NETWORK)
     return limits_finding(longest_s, GAP_WARN * limit_s, limit_s, found, advice)
 
 

@@ -103,8 +103,10 @@ BODY_ROWS = ("body", "body place")
 
 def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
     """The rows of a motion capture that cannot be opened or sends nothing; `why` is shown."""
-    advice = "does it stream, is positioning.host right, does a firewall stop it?"
-    return [Row("capture", *failed(why, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
+    found, _, advice = why.rpartition("; ")
+    if not found:
+        found, advice = why, "does it stream, is positioning.host right, does a firewall stop it?"
+    return [Row("capture", *failed(found, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
 
 def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:

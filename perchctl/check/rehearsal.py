@@ -47,6 +47,7 @@ class Rehearsal:
             vehicle came to rest.
         print_verdict: `PrintCheck.error_and_text()`; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
+        scheme: the kind of source, as ``camera``, which the advice depends on.
     """
 
     live: bool
@@ -65,6 +66,7 @@ class Rehearsal:
     target_places: list[tuple[float, Array]] = field(default_factory=list)
     print_verdict: tuple[bool, str] | None = None
     blur_px: float | None = None
+    scheme: str = ""
 
     @property
     def target_moved_m(self) -> float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, open_camera, without_password
+from perchctl.camera import FrameSource, open_camera, parse_source, without_password
 from perchctl.check import camera, capture, vehicle
 from perchctl.check.profile import offline_rows
 from perchctl.check.rehearsal import REHEARSED_S, Rehearsal, TakeTelemetry, rehearse
@@ -79,12 +79,15 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
         try:
             size_px, asked = calibrated.size_px, options.profile.camera
             source = open_camera(spec, time.monotonic, asked, size_px=size_px)
+            scheme = parse_source(options.source).scheme
         except PerchError as error:
             yield from camera.failed_camera_rows(error, options.profile)
         else:
             stack.callback(source.close)
             yield Row("camera", *passed(f"{shown} gives pictures"))
-            rehearsal = yield from _camera_rows(take, source, pipeline, options.profile, scope)
+            rehearsal = yield from _camera_rows(
+                take, source, pipeline, options.profile, scope, scheme
+            )
     yield evaluate_row("loop", camera.loop_finding, rehearsal, options.profile)
     yield from offline_rows(options)
 
@@ -128,7 +131,8 @@ class VehicleChecks:
             self.probe.connect()
         except ConnectionFailed as error:
             found, _, advice = str(error).partition("\n")
-            advice = advice or "switch it on; perchctl check --scan shows what answers"
+            scheme = self.uri.partition("://")[0]
+            advice = advice or vehicle.ADDRESS_ADVICE[scheme]
             yield Row("address", *failed(found, advice))
             yield from skipped_rows(
                 [*vehicle.VEHICLE, vehicle.LIFTED], "the vehicle does not answer"
@@ -205,6 +209,7 @@ def _camera_rows(
     pipeline: Pipeline,
     profile: Profile,
     scope: CheckScope,
+    scheme: str,
 ) -> Generator[Row, None, Rehearsal | None]:
     """Yields the rows; returns the rehearsal, None where there could be none."""
     size = camera.size_finding(source.size_px, pipeline.camera.size_px)
@@ -215,5 +220,6 @@ def _camera_rows(
         return None
     scope.announce(f"rehearsing on live pictures for {scope.rehearse_s:g} s")
     done = rehearse(take, source, pipeline, profile, WallClock(), scope.rehearse_s)
+    done.scheme = scheme
     yield from camera.picture_rows(done, profile, pipeline.camera)
     return done

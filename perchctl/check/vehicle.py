@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from perchctl.check.row import (
@@ -43,6 +46,24 @@ UNREPORTED = "by link.unreported this vehicle reports none"
 
 Wait = Callable[[float], None]
 
+LINK_ADVICE = {
+    "radio": "bring the radio nearer, choose a channel above 80",
+    "usb": "use another cable or USB port",
+    "udp": "look at the network between this computer and the vehicle",
+    "sim": "close other programs: the simulated vehicle runs on this computer",
+}
+"""What helps against lost and slow packets, by the scheme of the vehicle's URI."""
+ADDRESS_ADVICE = {
+    "radio": "switch it on; perchctl check --scan shows what answers",
+    "usb": "plug it in and switch it on; perchctl check --scan shows what answers",
+    "udp": "switch it on, look at its address; perchctl check --scan shows what answers",
+    "sim": "start it again",
+}
+BUSY_ADVICE = "close other programs, or use a faster computer"
+WAKE_PERIOD_S = 0.005
+BUSY_SHARE = 0.5
+"""A computer that is late by this part of a packet's way back may be why the packet is late."""
+
 
 @dataclass(frozen=True)
 class VehicleStatus:
@@ -50,8 +71,9 @@ class VehicleStatus:
 
     `device_type`: the kind of vehicle, as its firmware names it; None without an answer.
     `missing_variables`: log variables that the firmware lacks; `round_trips_s` of test packets,
-    infinite if lost; `telemetry`: newest sample, `age_s` old; `displacement_m`: drift at rest;
-    `samples`: all that came, oldest first.
+    infinite if lost, and meanwhile `wake_delays_s` of a thread of this computer; `telemetry`:
+    newest sample, `age_s` old; `displacement_m`: drift at rest; `samples`: all that came, oldest
+    first.
     """
 
     uri: str
@@ -60,6 +82,7 @@ class VehicleStatus:
     missing_variables: tuple[str, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
     round_trips_s: Sequence[float] = ()
+    wake_delays_s: Sequence[float] = ()
     link_quality: float | None = None
     telemetry: Telemetry | None = None
     age_s: float = 0.0
@@ -67,6 +90,10 @@ class VehicleStatus:
     decks: tuple[str, ...] = ()
     displacement_m: float = 0.0
     samples: Sequence[Telemetry] = ()
+
+    @property
+    def link_scheme(self) -> str:
+        return self.uri.partition("://")[0]
 
     @property
     def known_telemetry(self) -> Telemetry:
@@ -88,7 +115,8 @@ class VehicleStatus:
 def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> VehicleStatus:
     """Query a connected vehicle, and collect its telemetry for `listen_s` seconds."""
     link.telemetry()
-    echoes = link.round_trips_s(listen_s)
+    with wake_delays() as delays_s:
+        echoes = link.round_trips_s(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
     later = link.telemetry() or samples
@@ -99,6 +127,7 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
         missing_variables=link.missing,
         parameters=link.parameters(),
         round_trips_s=echoes,
+        wake_delays_s=delays_s,
         link_quality=link.quality,
         telemetry=later[-1] if later else None,
         age_s=link.position_age_s(),
@@ -109,27 +138,58 @@ def query_vehicle(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehi
     )
 
 
+@contextlib.contextmanager
+def wake_delays() -> Iterator[list[float]]:
+    """The delays, s, with which this computer wakes a thread that sleeps, while the block runs."""
+    delays_s: list[float] = []
+    ended = threading.Event()
+
+    def sleep() -> None:
+        while not ended.is_set():
+            due_s = time.monotonic() + WAKE_PERIOD_S
+            time.sleep(WAKE_PERIOD_S)
+            delays_s.append(max(0.0, time.monotonic() - due_s))
+
+    sleeper = threading.Thread(target=sleep, daemon=True)
+    sleeper.start()
+    try:
+        yield delays_s
+    finally:
+        ended.set()
+        sleeper.join()
+
+
 # --- Its rows ---
 
 
 def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
-    """Judge the echoes, and a radio's quality, too."""
+    """Judge the echoes, and a radio's quality, too. Where this computer itself was late, a slow
+    packet is no reason to look for the link's fault."""
     sent, quality = len(vehicle.round_trips_s), vehicle.link_quality
     back_s = sorted(filter(math.isfinite, vehicle.round_trips_s))
+    advice = LINK_ADVICE.get(vehicle.link_scheme, BUSY_ADVICE)
     if not back_s:
-        return failed("no packet came back", "restart the vehicle, bring the radio nearer")
-    lost, p95_s = 1.0 - len(back_s) / sent, back_s[int(0.95 * (len(back_s) - 1))]
+        return failed("no packet came back", f"restart the vehicle; {advice}")
+    lost, p95_s = 1.0 - len(back_s) / sent, _quantile_95(back_s)
     found = f"{100.0 * lost:.1f} % of {sent} lost, 95 % back in {1e3 * p95_s:.1f} ms"
     if quality is not None:
         found += f", link quality {quality:.0f} %"
-    advice = "bring the radio nearer, choose a channel above 80, close other programs"
+    busy_s = _quantile_95(sorted(vehicle.wake_delays_s))
     limit_s = profile.safety.proof_age_s
+    slow_s, slow_advice = min(0.03, limit_s), advice
+    if p95_s > slow_s and busy_s > BUSY_SHARE * p95_s:
+        found += f", this computer late by {1e3 * busy_s:.0f} ms"
+        slow_advice = BUSY_ADVICE
     return worst_finding(
         limits_finding(lost, 0.01, 0.05, found, advice),
-        limits_finding(p95_s, min(0.03, limit_s), limit_s, found, advice),
+        limits_finding(p95_s, slow_s, limit_s, found, slow_advice),
         # A radio sends again by itself: its losses show in its quality only.
         limits_finding(-100.0 if quality is None else -quality, -90.0, -60.0, found, advice),
     )
+
+
+def _quantile_95(ordered_s: Sequence[float]) -> float:
+    return ordered_s[int(0.95 * (len(ordered_s) - 1))] if ordered_s else 0.0
 
 
 def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
@@ -140,7 +200,9 @@ def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
     found = f"{vehicle.samples_hz:.0f} Hz of {wanted_hz:.0f}, newest {age_ms:.0f} ms old"
     if vehicle.age_s > profile.safety.telemetry_hold_s:
         return failed(found, "see packets; restart the vehicle")
-    advice = "use a radio rate of 2M, or raise link.telemetry_period_s"
+    advice = "see packets, or raise link.telemetry_period_s"
+    if vehicle.link_scheme == "radio":
+        advice = "use a radio rate of 2M, or raise link.telemetry_period_s"
     return limits_finding(-vehicle.samples_hz / wanted_hz, -0.9, -0.5, found, advice)
 
 

@@ -33,10 +33,17 @@ from perchctl.commands.command_line import (
     ViewOption,
 )
 from perchctl.commands.interrupt import Stopper, ignore_signals
-from perchctl.commands.output import add_problem, ask, print_lines, print_result, say
+from perchctl.commands.output import NO, add_problem, ask, print_lines, print_result, say
 from perchctl.commands.progress import guidance_display
 from perchctl.display import live_page
-from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, UsageError
+from perchctl.errors import (
+    Interrupted,
+    InvalidValue,
+    NotFound,
+    PerchError,
+    SafetyAbort,
+    UsageError,
+)
 from perchctl.files import check_writable
 from perchctl.link import AttitudeLink, check_uri
 from perchctl.profile import (
@@ -106,7 +113,10 @@ def mount(
     measured = solve_mounting(vehicle, recordings)
     for line in measured.lines():
         print_lines(line)
-    written, before, problem = None, None, None
+    problem: PerchError | None = None
+    if not logs:
+        problem = InvalidValue("the recording is not kept")  # why has been said
+    written, before = None, None
     if into is not None:
         try:
             _check_unchanged(profile, vehicle)
@@ -225,7 +235,8 @@ def _record_live(
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
                 with contextlib.suppress(EOFError):  # Ctrl-D goes on as Enter does
-                    ask("press Enter when it is held so:")
+                    if ask("press Enter when it is held so:").strip().lower() in NO:
+                        raise UsageError("not confirmed: nothing was measured")
             recording = MountingRecording(part)
             recordings.append(recording)
             reader = PoseReader(profile, camera, frames.live)

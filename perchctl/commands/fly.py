@@ -9,7 +9,6 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -30,7 +29,14 @@ from perchctl.commands.command_line import (
     new_app,
 )
 from perchctl.commands.interrupt import ignore_signals, interruptible
-from perchctl.commands.output import ask_to_confirm, print_lines, print_result, say
+from perchctl.commands.output import (
+    add_problem,
+    ask_to_confirm,
+    print_lines,
+    print_result,
+    say,
+    stdin_number,
+)
 from perchctl.commands.profile import front_left_edges
 from perchctl.display import (
     FlightPage,
@@ -44,14 +50,18 @@ from perchctl.errors import (
     Interrupted,
     InvalidValue,
     LogIncomplete,
+    PerchError,
     SafetyAbort,
     TargetNotFound,
     UsageError,
 )
 from perchctl.flight import (
+    KEY_HELP,
+    STOP_HELP,
     FlyOptions,
     OperatorSwitch,
     check_options,
+    cut_key,
     fly_session,
     operator_signals,
 )
@@ -114,13 +124,17 @@ def fly(
 ) -> int:
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
 
-    Without options it flies the simulated vehicle. Ctrl-C once lands, again after half
-    a second, or held for two, cuts the motors.
+    Without options it flies the simulated vehicle. Press Ctrl-C to land. Press it again to cut the
+    motors. The space bar cuts the motors at once.
     """
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:
-        print_result(plan_record(options) if as_json else plan_text(options))
-        return 0
+        refused = plan_problem(options)
+        print_result(add_problem(plan_record(options), refused) if as_json else plan_text(options))
+        if refused is None:
+            return 0
+        say(f"fly would refuse this: {refused}")
+        return refused.exit_code
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
     options.require_lift_check()
@@ -195,19 +209,23 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
             page = stack.enter_context(flight_page(options, view, switch))
             report, miss_m = _session(options, log, panel, switch, page, confirm)
         except BaseException as error:
-            # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
+            # The page first: a disk that hangs holds up the log's end, and Land would seem ready.
             if page is not None:
                 page.fail(error, log.path if log.has_begun else None)
             log.abandon(str(error) or type(error).__name__)
             raise
         finally:
             panel.close()
+            if panel.failure is not None:
+                say(panel.failure)
+        for sentence in report.detached:
+            say(sentence)
         summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
-        print_lines(summary.text(log.path), stdout=not as_json)
+        written = print_lines(summary.text(log.path), stdout=not as_json)
         if page is not None:
             page.end(summary, log.path)
-    code = exit_code(report.outcome, summary)
+    code = exit_code(report.outcome, summary) or (0 if written else InvalidValue.exit_code)
     plot = draw_flight_plot(log.path, options.profile)
     if plot is not None:
         print_lines(f"plot:      {plot}", stdout=not as_json)
@@ -256,31 +274,40 @@ def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
 def _session(
     options: FlyOptions,
     log: LogWatcher,
-    display: Watcher,
+    panel: FlightPanel,
     switch: OperatorSwitch,
     page: FlightPage | None,
     asks: bool,
 ) -> tuple[FlightReport, float | None]:
-    watchers: tuple[Watcher, ...] = (log, display)
+    watchers: tuple[Watcher, ...] = (log, panel)
     watched = log.watch_source
     if page is not None:
         watchers = (*watchers, page)
         watched = lambda source: page.watch_source(log.watch_source(source))  # noqa: E731
-    with operator_signals(switch, say):
-        ask = partial(ask_before_arming, options.uri) if asks else None
-        return fly_session(options, watchers, switch, watched, log.remarks, ask)
+    with operator_signals(switch, say), contextlib.ExitStack() as stack:
+
+        def before_arming() -> None:
+            if asks:
+                ask_before_arming(options.uri)
+            has_key = stack.enter_context(cut_key(switch, stdin_number()))
+            panel.help = STOP_HELP, KEY_HELP if has_key else ""
+            print_lines("\n".join(filter(None, panel.help)))
+
+        return fly_session(options, watchers, switch, watched, log.remarks, before_arming)
 
 
 @contextlib.contextmanager
 def flight_page(
     options: FlyOptions, view: bool, switch: OperatorSwitch
 ) -> Iterator[FlightPage | None]:
-    """Yield the live page, whose STOP button presses the switch; None without `view`."""
+    """Yield the live page, with its buttons for landing and for cutting the motors; None without
+    `view`."""
     if not view:
         yield None
         return
     profile, title = options.profile, f"perchctl fly {options.uri}"
-    with live_page(profile_camera(profile.camera), title, view, say, switch.land) as page:
+    camera = profile_camera(profile.camera)
+    with live_page(camera, title, view, say, switch.land, switch.cut) as page:
         yield (
             None
             if page is None
@@ -292,6 +319,16 @@ def flight_page(
 
 
 _COLUMN, _WIDTH = 13, 80
+
+
+def plan_problem(options: FlyOptions) -> PerchError | None:
+    """Return the error with which `fly` would refuse these options, before it opens anything."""
+    try:
+        warnings_before_flight(options)
+        options.require_lift_check()
+    except PerchError as error:
+        return error
+    return None
 
 
 def plan_record(options: FlyOptions) -> dict[str, Any]:

@@ -13,27 +13,41 @@ from typing import Any, TextIO
 
 from perchctl.errors import PerchError
 
+NO = ("n", "no", "q", "quit")
+"""Answers that stop what only waits for Enter."""
+
 
 def say(sentence: str) -> None:
     """Print a sentence on stderr, as stdout is for results. Never raises."""
     print_lines(f"perchctl: {sentence}")
 
 
-def print_lines(text: str, stdout: bool = False) -> None:
-    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error."""
+def print_lines(text: str, stdout: bool = False) -> bool:
+    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error. Returns
+    False if a result on stdout is lost, as on a full disk."""
     stream = sys.stdout if stdout else sys.stderr
     try:
         print(text, file=stream, flush=True)
     except (OSError, ValueError) as error:
+        discard_output(stream)
         if stdout and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             say(f"the result cannot be written: {error.strerror}; free some space")
-        discard_output(stream)
+            return False
+    return True
 
 
 def discard_output(stream: TextIO) -> None:
     """Discard the stream's buffered output, so that flushing it at exit does not fail."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def stdin_number() -> int:
+    """The file descriptor of stdin; -1, which is none, where there is no stdin."""
+    try:
+        return sys.stdin.fileno()
+    except (OSError, ValueError, AttributeError):
+        return -1
 
 
 def ask(question: str) -> str:
@@ -45,8 +59,8 @@ def ask(question: str) -> str:
 def ask_to_confirm(question: str) -> bool:
     """Ask on the terminal; return True if the answer is yes. Input typed before the question is
     discarded."""
-    with contextlib.suppress(OSError, ValueError, AttributeError, termios.error):
-        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    with contextlib.suppress(OSError, ValueError, termios.error):
+        termios.tcflush(stdin_number(), termios.TCIFLUSH)
     try:
         return ask(f"{question} [y/N]").strip().lower() in ("y", "yes")
     except EOFError:

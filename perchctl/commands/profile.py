@@ -25,12 +25,12 @@ from perchctl.commands.command_line import (
     command,
     new_app,
 )
-from perchctl.commands.output import ask, print_lines, print_result, say
+from perchctl.commands.output import NO, ask, print_lines, print_result, say
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.extensions import is_extension
 from perchctl.files import check_output, write_files
 from perchctl.geometry import Array
-from perchctl.link import check_uri
+from perchctl.link import check_uri, is_own_uri
 from perchctl.profile import (
     Mounting,
     Profile,
@@ -194,7 +194,8 @@ def new(
         answers[name] = default_answer(name, answers)
     if not QUESTIONS.keys() <= answers.keys():
         print_lines(
-            f"A new profile: {output}. Enter takes what stands in brackets, {BACK} goes back."
+            f"A new profile: {output}. Press Enter to accept the value in brackets, or type {BACK} "
+            f"to return."
         )
         answers = ask_questions(given)
     profile, keys = profile_and_keys(answers, output.stem)
@@ -237,7 +238,7 @@ def ask_questions(given: Answers) -> Answers:
         answers, number = before[-1], len(before)
         if number > len(names):
             print_lines(answers_text(answers))
-            question, default = "Enter writes it", ""
+            question, default = f"Write it? Press Enter to write it, or type no or {BACK}:", ""
         else:
             name = names[number - 1]
             default = default_answer(name, answers)
@@ -247,7 +248,11 @@ def ask_questions(given: Answers) -> Answers:
             if typed.lower() == BACK:
                 before = before[: max(1, number - 1)]
             elif number > len(names):
-                return answers
+                if typed.lower() in ("", "y", "yes"):
+                    return answers
+                if typed.lower() in NO:
+                    raise UsageError("not confirmed: nothing was written")
+                print_lines(f"  found {typed!r}; press Enter, or type no or {BACK}")
             else:
                 answered = {**answers, name: _read(name, typed) if typed else default}
                 profile_and_keys(answered, "new")
@@ -318,9 +323,10 @@ def profile_and_keys(answers: Answers, name: str) -> tuple[Profile, set[str]]:
         path = Path(calibration).expanduser()
         texts["camera.calibration"] = str(path.resolve()) if path.is_file() else calibration
         load_calibration(find_calibration(texts["camera.calibration"]))
-    for key, check in (("link.uri", check_uri), ("camera.source", parse_source)):
-        if key in texts and not is_extension(texts[key]):
-            check(texts[key])
+    if (uri := texts.get("link.uri")) is not None and not (is_own_uri(uri) and is_extension(uri)):
+        check_uri(uri)
+    if "camera.source" in texts:
+        parse_source(texts["camera.source"])
     if texts.get("camera.source") == "camera:":
         raise InvalidValue("camera.source: found camera:; write camera:N or camera:NAME")
     source = texts.get("camera.source", "")

@@ -36,6 +36,7 @@ from perchctl.commands.output import add_problem, print_result, say
 from perchctl.commands.progress import progress_bar
 from perchctl.errors import (
     Interrupted,
+    LogIncomplete,
     PerchError,
     UsageError,
     no_cluster,
@@ -43,7 +44,7 @@ from perchctl.errors import (
 from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
-"""A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
+"""A second Ctrl-C counts from here on; presses closer together are one."""
 _NO_DIFFERENCE = ("name", "description", "date")
 
 
@@ -130,7 +131,7 @@ def run(
             partial(campaigns.fly_in_folder, flown, log_dir, record),
             campaigns.campaign_summary,
             campaigns.campaign_table,
-            campaigns.all_refused_error,
+            lambda results: campaigns.all_refused_error(results) or log_error(results),
         )
     else:
         names = tuple(fault.name for fault in fault_campaigns.select_faults(faults))
@@ -139,12 +140,16 @@ def run(
             partial(fault_campaigns.fly_fault_in_folder, flown, names, log_dir, record),
             fault_campaigns.fault_summary,
             fault_campaigns.fault_table,
+            log_error,
         )
 
     def report(results: list[Any], problem: PerchError | None) -> None:
         figures = add_problem(campaign.summary(results), problem) if as_json else None
         print_result(figures or campaign.table(results))
         print_log_folder(results, log_dir)
+        lost = log_error(results)
+        if lost is not None and not isinstance(problem, LogIncomplete):
+            say(str(lost))
 
     with (
         handle_signals(stop_handler()),
@@ -176,7 +181,7 @@ class _Campaign:
     fly: Callable[[int], Any]
     summary: Callable[[list[Any]], Mapping[str, Any]]
     table: Callable[[list[Any]], str]
-    objection: Callable[[list[Any]], PerchError | None] = lambda results: None
+    objection: Callable[[list[Any]], PerchError | None]
 
 
 @command(
@@ -367,13 +372,17 @@ def stop_handler(
 
 
 def print_log_folder(results: Sequence[campaigns.CampaignFlight], log_dir: Path | None) -> None:
-    """Print on stderr the folder of the logs, and whether some are incomplete."""
-    if log_dir is None or not results:
-        return
-    say(f"the flights' logs are in {log_dir}")
+    """Print on stderr the folder of the logs."""
+    if log_dir is not None and results:
+        say(f"the flights' logs are in {log_dir}")
+
+
+def log_error(results: Sequence[campaigns.CampaignFlight]) -> PerchError | None:
+    """Return the error that some of the flights' logs are incomplete; None if all are complete."""
     problems = [result.log_problem for result in results if result.log_problem is not None]
-    if problems:
-        say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
+    if not problems:
+        return None
+    return LogIncomplete(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
 def _list_faults(as_json: bool) -> int:

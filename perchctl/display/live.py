@@ -41,16 +41,18 @@ class LivePage:
     Args:
         camera: projects the axes to draw.
         title: heading of the page.
-        on_stop: called by the STOP button, from a thread of the page; None: no button.
+        on_land: called by the button Land, from a thread of the page; None: no buttons.
+        on_cut: called by the button Cut motors, likewise.
 
-    `url` holds the token that STOP needs.
+    `url` holds the token that the buttons need.
     """
 
     def __init__(
         self,
         camera: CameraModel,
         title: str,
-        on_stop: Callable[[], None] | None = None,
+        on_land: Callable[[], None] | None = None,
+        on_cut: Callable[[], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.camera = camera
@@ -58,8 +60,8 @@ class LivePage:
         self.token = secrets.token_urlsafe(16)
         self.problem: str | None = None
         self.closed = False
-        self._on_stop = on_stop
-        self._stop_requested = False
+        self._orders = {"land": on_land, "cut": on_cut}
+        self._ordered: set[str] = set()
         self._clock = clock
         self._changed = threading.Condition()
         self._drawing = threading.Lock()
@@ -112,25 +114,25 @@ class LivePage:
     def state(self) -> dict[str, Any]:
         """The values that the page polls: the keys of `describe` (rows of name, text and
         optional bar length 0..1; note, phase, battery, over), title, fresh (whether pictures come),
-        stop (``none``, ``ready``, ``requested``, ``over``), age_s of the values (None if no update
-        is due), and the card of `end`, or None."""
+        orders (``none``, ``ready``, ``land`` or ``cut`` once that was ordered, ``over``), age_s of
+        the values (None if no update is due), and the card of `end`, or None."""
         try:
             described = self._describe()
         except Exception as error:
             self.store_error(error)
             described = {}
-        if self._on_stop is None:
-            stop = "none"
+        if self._orders["land"] is None:
+            orders = "none"
         elif described.get("over") or self._card is not None:
-            stop = "over"
+            orders = "over"
         else:
-            stop = "requested" if self._stop_requested else "ready"
+            orders = next((name for name in ("cut", "land") if name in self._ordered), "ready")
         now_s, state_s = self._clock(), self._state_s
         self._read_s = now_s
         return described | {
             "title": self.title,
             "fresh": now_s - self._picture_s < _PICTURE_STALE_S,
-            "stop": stop,
+            "orders": orders,
             "age_s": None if state_s is None else round(max(0.0, now_s - state_s), 2),
             "card": self._card,
             "page_problem": self.problem,
@@ -154,16 +156,20 @@ class LivePage:
                 self._jpeg = (newest, jpeg.tobytes())
             return self._jpeg
 
-    def may_stop(self, token: str) -> bool:
+    def may_order(self, token: str) -> bool:
+        """True if the token is the one of `url`."""
         given, own = token.encode("utf-8", "replace"), self.token.encode()
-        return self._on_stop is not None and hmac.compare_digest(given, own)
+        return hmac.compare_digest(given, own)
 
-    def stop(self) -> None:
-        """Press the STOP button; pressing it again changes nothing."""
-        with self._changed:
-            first, self._stop_requested = not self._stop_requested, True
-        if first and self._on_stop is not None:
-            self._on_stop()
+    def order(self, name: str) -> bool:
+        """Press the button ``land`` or ``cut``; False if there is no such button. Pressing it again
+        changes nothing."""
+        act = self._orders.get(name)
+        if act is None:
+            return False
+        act()
+        self._ordered.add(name)
+        return True
 
     def store_error(self, error: BaseException) -> None:
         self.problem = f"{type(error).__name__}: {error}"
@@ -184,15 +190,18 @@ def live_page(
     title: str,
     enabled: bool,
     report: Callable[[str], None],
-    on_stop: Callable[[], None] | None = None,
+    on_land: Callable[[], None] | None = None,
+    on_cut: Callable[[], None] | None = None,
 ) -> Iterator[LivePage | None]:
     """Serve a page during the block; yield None unless `enabled`. `report` prints the address, and
-    at the end the page's problem if any. `on_stop`: as in `LivePage`."""
+    at the end the page's problem if any. `on_land`, `on_cut`: as in `LivePage`."""
     if not enabled:
         yield None
         return
-    page = LivePage(camera, title, on_stop)
-    report(f"live page{' with a STOP button' if on_stop else ''}: {page.url}")
+    page = LivePage(camera, title, on_land, on_cut)
+    report(
+        f"live page{' with buttons to land and to cut the motors' if on_cut else ''}: {page.url}"
+    )
     try:
         yield page
     finally:
@@ -203,7 +212,7 @@ def live_page(
 
 # --- HTTP of the live page: on loopback only, and only under loopback's names ---
 # A site in the same browser can send requests to 127.0.0.1 too. So the Host header must
-# name this machine (a rebound DNS name does not), STOP needs the token of the printed
+# name this machine (a rebound DNS name does not), a button needs the token of the printed
 # address, in a header that a foreign site may not send, and nothing allows its reading.
 
 
@@ -268,14 +277,15 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         if not self._from_here():
             return
-        page = self.server.page
-        if urlsplit(self.path).path != "/stop":
-            self._refuse(404, "only /stop takes a POST")
-        elif not page.may_stop(self.headers.get(TOKEN_HEADER, "")):
-            self._refuse(403, "STOP needs the token of the address that perchctl printed")
+        page, name = self.server.page, urlsplit(self.path).path.removeprefix("/")
+        if name not in ("land", "cut"):
+            self._refuse(404, "only /land and /cut take a POST")
+        elif not page.may_order(self.headers.get(TOKEN_HEADER, "")):
+            self._refuse(403, "this button needs the token of the address that perchctl printed")
+        elif not page.order(name):
+            self._refuse(403, "this page has no buttons: nothing flies")
         else:
-            page.stop()
-            self._send(200, "application/json", b'{"stop": "requested"}')
+            self._send(200, "application/json", json.dumps({"ordered": name}).encode())
 
     def log_message(self, format: str, *args: Any) -> None:
         """Print nothing: requests are not worth a line on the terminal."""

@@ -1,4 +1,4 @@
-"""The live page of a flight: pictures, numbers, and a STOP button that lands."""
+"""The live page of a flight: pictures, numbers, and buttons to land and to cut the motors."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ class FlightPage:
     A failing page does not land the vehicle: `problem` stays None, `page.problem` has the error.
     """
 
+    name = "the live page"
     problem: str | None = None
 
     def __init__(self, page: LivePage, large_side_m: float, gear_up_m: float) -> None:
@@ -55,7 +56,7 @@ class FlightPage:
             self.page.store_error(error)
 
     def event(self, event: Event) -> None:
-        if event.is_rescue:
+        if event.rest is not None:
             self._rescue = event.reason
 
     def end(self, summary: FlightSummary, log: Path) -> None:
@@ -80,8 +81,11 @@ class FlightPage:
 
     def _seen(self, frame: Frame) -> None:
         self._frame = frame
-        if not self._flying:  # no ticks yet that would show it
-            self.page.show(Sketch(frame.image))
+        try:
+            if not self._flying:  # no ticks yet that would show it
+                self.page.show(Sketch(frame.image))
+        except Exception as error:  # the frame goes on to the flight
+            self.page.store_error(error)
 
 
 def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:

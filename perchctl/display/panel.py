@@ -109,7 +109,10 @@ class FlightPanel:
     `problem` is always None, `failure` says why the output stopped.
     """
 
+    name = "the panel"
     problem: str | None = None
+    help: tuple[str, str] = ("", "")
+    """Sentences in the panel's frame, at most 60 columns each: below, and above."""
 
     def __init__(self, stream: TextIO) -> None:
         self.failure: str | None = None
@@ -172,7 +175,7 @@ class FlightPanel:
         tick = self._tick
         if self._live is not None and tick is not None and tick is not self._drawn:
             self._drawn = tick
-            self._live.update(status_panel(tick), refresh=True)
+            self._live.update(status_panel(tick, *self.help), refresh=True)
 
 
 def _new_live(stream: TextIO) -> Live:
@@ -187,9 +190,9 @@ def _new_live(stream: TextIO) -> Live:
     return Live(console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True)
 
 
-def status_panel(tick: Tick) -> Panel:
+def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
     """The status panel of a tick: at most `WIDTH` columns and eight lines, nine with
-    external positions."""
+    external positions. `below` and `above` are sentences in its frame."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
     table.add_column(no_wrap=True, overflow="ellipsis")
@@ -197,4 +200,11 @@ def status_panel(tick: Tick) -> Panel:
         style = _STYLES.get(tick.state.phase.value, "bold") if name == "phase" else ""
         style = "bold yellow" if name == "held" else style
         table.add_row(Text(name, style="dim"), Text(text, style=style))
-    return Panel(table, title="perchctl", title_align="left", width=WIDTH)
+    return Panel(
+        table,
+        title=Text(f"perchctl: {above}" if above else "perchctl"),
+        subtitle=Text(below) if below else None,
+        title_align="left",
+        subtitle_align="left",
+        width=WIDTH,
+    )

@@ -96,6 +96,18 @@ def key_press_times(period: float | Draw, duration: Draw) -> Draw:
     return draw
 
 
+def held_key_times(delay: Draw, period_s: float, held: Draw) -> Draw:
+    """Draw the times, s, at which a key presses that is held down: at once, and from `delay` until
+    `held` every `period_s`, three times at least."""
+
+    def draw(source: DrawInputs) -> tuple[float, ...]:
+        delay_s, for_s = delay(source), held(source)
+        repeats_s = np.arange(delay_s, max(for_s, delay_s + 2.5 * period_s), period_s)
+        return (0.0, *(round(float(t), 3) for t in repeats_s))
+
+    return draw
+
+
 def _value(value: Any, source: DrawInputs) -> Any:
     if isinstance(value, tuple):
         return tuple(_value(part, source) for part in value)
@@ -420,13 +432,13 @@ FAULTS: tuple[Fault, ...] = (
     Fault("operator-once", "Ctrl-C", ONCE),
     Fault(
         "operator-twice",
-        "Ctrl-C, and again 0.6 to 10 s later",
-        effect(e.operator, presses_s=(0.0, log_uniform(0.6, 10.0))),
+        "Ctrl-C, and again 0.3 to 10 s later",
+        effect(e.operator, presses_s=(0.0, log_uniform(0.3, 10.0))),
     ),
     Fault(
         "operator-held",
-        "Ctrl-C held for 0.1 to 1.8 s: it repeats every 30 ms",
-        effect(e.operator, presses_s=key_press_times(0.03, log_uniform(0.1, 1.8))),
+        "Ctrl-C held for up to 0.95 s: it repeats every 30 ms after 0.25 to 0.66 s",
+        effect(e.operator, presses_s=held_key_times(uniform(0.25, 0.66), 0.03, uniform(0.3, 0.95))),
     ),
     Fault("hang-up", "the terminal is closed", effect(e.operator, presses_s=(0.0,), hang_up=True)),
     # The program.
@@ -467,8 +479,8 @@ FAULTS: tuple[Fault, ...] = (
     Fault("exception", "an exception ends the loop", effect(e.raises)),
     Fault(
         "operator-hammers",
-        "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s",
-        effect(e.operator, presses_s=key_press_times(uniform(0.08, 0.25), uniform(2.5, 4.0))),
+        "Ctrl-C every 100 to 330 ms, for 1 to 4 s",
+        effect(e.operator, presses_s=key_press_times(uniform(0.1, 0.33), uniform(1.0, 4.0))),
     ),
     # Two at once.
     Fault("covered-and-kick", "a blow; the target is hidden", (COVERED, KICK), BY_CAMERA),

@@ -94,7 +94,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "the operator's word",
-        "a second Ctrl-C cuts the motors and locks",
+        "cutting the motors on the operator's order locks",
         lambda facts: facts.stop_s,
         CUT_DOWN,
     ),

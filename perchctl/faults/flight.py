@@ -94,10 +94,10 @@ class FaultyFlight:
         if case.landed_from is not None:
             lands = (partial(e.operator, presses_s=(0.0,), hang_up=True),)
             self._injectors.append(e.Injector(edges, lands, case.landed_from, case.landed_after_s))
-        watchers: tuple[Watcher, ...] = (self,)
+        watchers: tuple[Watcher, ...] = ()
         if log is not None:
             log.truth = self._for_log
-            watchers = (self, log)
+            watchers = (log,)
         pipeline = make_pipeline(profile, camera)
         seen = source if log is None else log.watch_source(source)
         self._parts = FlightParts(
@@ -110,6 +110,8 @@ class FaultyFlight:
             self._switch.read,
             positions=lockstep_feed(self._link, profile),
             remarks=tuple if log is None else log.remarks,
+            judges=(self,),
+            simulated=True,
         )
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
         self._oracle = Oracle(safety.max_height_m, safety.max_tilt_deg, radius_m)
@@ -245,7 +247,7 @@ class FaultyFlight:
         )
         if self._log is not None:
             self._log.close(report, result.miss_m, "fell" in result.flags)
-            result = replace(result, log=self._log.path, log_problem=self._log.problem)
+            result = replace(result, log=self._log.path, log_problem=self._log.loss_reason)
         return result
 
     def _for_log(self) -> tuple[tuple[float, float, float], float]:

@@ -23,7 +23,7 @@ FLAGS: dict[Flag, str] = {
     "slid": "touched down above 0.5 m/s sideways",
     "flies_on": "motors on in the air where it should have come down",
     "endless": "no end within 240 s",
-    "stop_not_obeyed": "motors on 0.5 s after the second Ctrl-C",
+    "stop_not_obeyed": "motors on 0.5 s after the order to cut them",
     "pressed": "pushed against ceiling or floor for more than 4 s",
     "strayed": "more than 1 m from where it should be, or too high",
     "lied": "perchctl said at the end what is not true",
@@ -55,10 +55,10 @@ SAY_OFF: frozenset[Claim] = frozenset(
 SEEN_S = 6.0
 """A vehicle at rest whose telemetry arrived for this long must have been seen."""
 STOP_S = 0.5
-"""The motors must be off this long after the second Ctrl-C."""
-SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0
-"""A press counts as the second Ctrl-C (docs/faults.md, 16) this long after the first and after
-this long without any, or when faster presses have gone on for the third time."""
+"""The motors must be off this long after the order to cut them."""
+AGAIN_S, KEY_HELD_S, REPEAT_WITHIN_S = 0.3, 1.0, 0.23
+"""A second press counts from the first time on, unless another follows within the third, as a key
+repeats; a key that repeats is one press until the second (docs/safety.md)."""
 
 
 class Sample(NamedTuple):
@@ -95,16 +95,24 @@ def drop_limit_m(hold_ratio: float) -> float:
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
-    """The time of the press of Ctrl-C that made an emergency stop; None if none did."""
-    run_s = presses_s[0] if presses_s else 0.0
-    for before_s, press_s in pairwise(presses_s):
-        if press_s - before_s >= SILENCE_S:
-            run_s = press_s
-            if press_s - presses_s[0] >= SECOND_AFTER_S:
-                return press_s
-        elif press_s - run_s >= HAMMERED_S:
+    """The time at which these presses of Ctrl-C order an emergency stop; None if they never do.
+
+    Presses are those of a hand, or of a key that repeats too fast for one."""
+    for number, press_s in enumerate(presses_s):
+        after_s, later_s = press_s - presses_s[0], presses_s[number + 1 : number + 2]
+        if after_s >= KEY_HELD_S:
+            return press_s
+        alone = not later_s or later_s[0] - press_s > REPEAT_WITHIN_S
+        if number == 1 and after_s >= AGAIN_S and alone:
+            return press_s + REPEAT_WITHIN_S
+        if number >= 2 and not _are_repeats(presses_s[: number + 1]):
             return press_s
     return None
+
+
+def _are_repeats(presses_s: Sequence[float]) -> bool:
+    delay_s, *periods_s = (later_s - earlier_s for earlier_s, later_s in pairwise(presses_s))
+    return delay_s > 2.0 * max(periods_s) and max(periods_s) - min(periods_s) < 0.01
 
 
 class _Lasting:
@@ -183,7 +191,7 @@ class Oracle:
 
     @property
     def stop_s(self) -> float | None:
-        """The time of the Ctrl-C that orders the emergency stop, or None."""
+        """The time at which Ctrl-C orders the emergency stop, or None."""
         return emergency_stop_s(self._presses_s)
 
     def update(self, sample: Sample) -> None:
@@ -388,7 +396,4 @@ def report_claims(report: FlightReport) -> Claims:
 
 def rescue_claims(event: Event) -> Claims:
     """The claims of a rescue's event; an empty set for any other event."""
-    if not event.is_rescue:
-        return set()
-    found = next(found for found in RestState if found.value in event.reason)
-    return RESCUE_CLAIMS[found]
+    return set() if event.rest is None else RESCUE_CLAIMS[event.rest]

@@ -113,7 +113,7 @@ class Facts:
         onboard_landing: the onboard landing was under way when that silence began.
         killed_s: when the program was killed.
         rebooted_s: when the vehicle rebooted in the air while its motors turned.
-        stop_s: when the operator pressed Ctrl-C for the second time.
+        stop_s: when the operator's presses ordered the motors off.
         magnet_failed_s: when the magnet let go for good; `hung_through_watch`: by then the whole
             weight had hung on the magnet, motors off, for the whole time of the program's watch.
         slipped_s: when the vehicle first came off the magnet with its motors still, `slip_height_m`

@@ -7,7 +7,10 @@ from .lockstep import lockstep_feed as lockstep_feed
 from .lockstep import lockstep_source as lockstep_source
 from .loop import FlightParts as FlightParts
 from .loop import fly as fly
+from .operator import KEY_HELP as KEY_HELP
+from .operator import STOP_HELP as STOP_HELP
 from .operator import OperatorSwitch as OperatorSwitch
+from .operator import cut_key as cut_key
 from .operator import operator_signals as operator_signals
 from .preflight import view_problem as view_problem
 from .session import FlyOptions as FlyOptions

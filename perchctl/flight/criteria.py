@@ -36,8 +36,8 @@ from perchctl.vehicle import (
     ExternalPosition,
     Telemetry,
     is_armed_by_request,
-    is_disarmed,
     is_battery_reading,
+    is_disarmed,
 )
 from perchctl.vision import TargetEstimate
 

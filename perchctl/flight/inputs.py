@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol
 
 from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
 from perchctl.mission import (
@@ -14,11 +14,9 @@ from perchctl.mission import (
     FrameRecord,
     Observation,
     PlannerState,
-    SentCommand,
     Turn,
     TurnInputs,
     UnfilteredPose,
-    Watcher,
 )
 from perchctl.perception import (
     History,
@@ -274,10 +272,10 @@ CARRIED_FOR_S = 0.1
 CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06  # turning motors scatter 1 g by 0.04, the mean by 0.013
 SINKING_MPS = -0.15  # more than a bias makes while the place is sent
 FROZEN_S = 0.06
-AHEAD_S = 0.1
-"""A picture may be so much ahead of the loop's clock; else its time is of another clock."""
 """An attitude frozen for longer is not the exposure's, and 0.1 rad displaces a vehicle 1.2 m under
 the target by 12 cm."""
+AHEAD_S = 0.1
+"""A picture may be so much ahead of the loop's clock; else its time is of another clock."""
 
 
 class TargetPositioning:
@@ -331,32 +329,17 @@ def is_supported(history: History, now_s: float) -> bool:
 # --- Each turn of the loop as a value, for the log ---
 
 
-@runtime_checkable
-class TurnWatcher(Watcher, Protocol):
-    """A watcher of all that a flight log holds: also of the turns without a tick, before take-off
-    or decided again, and of the commands that the link sends in the loop's place."""
-
-    def turn(self, turn: Turn) -> None: ...
-
-    def sent(self, sent: SentCommand) -> None:
-        """Take a command sent in the loop's place; in another thread, so never wait or raise."""
-
-
 Decision = tuple[PlannerState, Command, FeedStatus | None]
 
 
 class TurnReporter:
-    """Counts the loop's turns, and reports them to each `TurnWatcher`."""
+    """Counts the loop's turns, and calls `report` with each."""
 
-    def __init__(self, watchers: Iterable[Watcher]) -> None:
-        self._watchers = [w for w in watchers if isinstance(w, TurnWatcher)]
+    def __init__(self, report: Callable[[Turn], None]) -> None:
+        self._report = report
         self._count = 0
         self._began_s = 0.0
         self._open: tuple[Observation, Decision | None] | None = None  # observed, not yet reported
-
-    @property
-    def has_watchers(self) -> bool:
-        return bool(self._watchers)
 
     def begin_turn(self, now_s: float) -> None:
         self._began_s = now_s
@@ -443,10 +426,6 @@ class TurnReporter:
     def _counted(self) -> int:
         self._count += 1
         return self._count - 1
-
-    def _report(self, turn: Turn) -> None:
-        for watcher in self._watchers:
-            watcher.turn(turn)
 
 
 def external_positions(status: FeedStatus | None) -> ExternalPositions | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import FrameSource, NewestSlot, WrappedSource, unmirror_frame
-from perchctl.errors import ConnectionFailed
+from perchctl.errors import ConnectionFailed, Note
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, Radio
 from perchctl.mission import (
@@ -175,7 +176,8 @@ def fly_lockstep(
         log: a file to log to, or a watcher that is left open unless the flight raises.
         scenario, capture: used in place of the seed's own.
         operator: the operator's command.
-        watchers: further watchers of the flight.
+        watchers: further watchers of the flight. One that raises is detached, with a `Note` as
+            warning after the flight.
         rows: your own transitions, besides those of the profile.
         camera: gets the simulated camera, and returns the source that is flown with.
         perception: your own estimator: called instead of `perchctl.step`, with its arguments. The
@@ -195,7 +197,6 @@ def fly_lockstep(
     positions = lockstep_feed(link, profile)
     source = camera(lockstep_source(vehicle, profile))
     truth = TruthWatcher(vehicle)
-    watchers = (truth, *watchers)
     if log is not None:
         log.truth = truth.position_and_miss
         watchers = (*watchers, log)
@@ -211,6 +212,8 @@ def fly_lockstep(
         positions,
         tuple if log is None else log.remarks,
         table,
+        judges=(truth,),
+        simulated=True,
     )
     try:
         link.connect()
@@ -234,6 +237,8 @@ def fly_lockstep(
     )
     if opened is not None:
         flight.close_log(opened)
+    for sentence in report.detached:
+        warnings.warn(sentence, Note, stacklevel=2)
     return flight
 
 

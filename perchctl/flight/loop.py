@@ -15,7 +15,7 @@ from perchctl.camera import FrameSource, mirrored_note
 from perchctl.errors import Interrupted, NotFound, SafetyAbort
 from perchctl.flight.clock import Clock
 from perchctl.flight.criteria import GroundCriteria, RestCheck
-from perchctl.flight.inputs import FlightInputs, TurnReporter, TurnWatcher
+from perchctl.flight.inputs import FlightInputs, TurnReporter
 from perchctl.flight.preflight import (
     Arming,
     GroundTurn,
@@ -28,6 +28,7 @@ from perchctl.flight.preflight import (
     view_problem,
 )
 from perchctl.flight.watchdog import Watchdog, rescue
+from perchctl.flight.watching import Watchers
 from perchctl.link import Link
 from perchctl.mission import (
     Event,
@@ -37,7 +38,6 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
-    SentCommand,
     Tick,
     Transition,
     Watcher,
@@ -66,9 +66,11 @@ class PositionSource(Protocol):
 class FlightParts:
     """The parts that the flight loop works with.
 
-    `positions` sends the external positions, None where decks measure them; `remarks` returns new
-    notes on things that do not matter to safety, such as a recording; `table` is flown instead of
-    the profile's."""
+    `watchers` look on, and end no flight (`perchctl.flight.watching`); `judges` are those of a
+    simulation, whose errors do. `positions` sends the external positions, None where decks measure
+    them; `remarks` returns new notes on things that do not matter to safety, such as a recording;
+    `table` is flown instead of the profile's. What a `simulated` flight shows of latency and
+    mounting is no advice for a profile."""
 
     link: Link
     source: FrameSource
@@ -80,6 +82,8 @@ class FlightParts:
     positions: PositionSource | None = None
     remarks: Callable[[], Sequence[str]] = tuple
     table: tuple[Transition, ...] = table_of(None)
+    judges: tuple[Watcher, ...] = ()
+    simulated: bool = False
 
     def position_age_s(self, now_s: float) -> float:
         """Age of the newest position by motion capture; 0 if positions come from elsewhere."""
@@ -92,22 +96,23 @@ def fly(parts: FlightParts) -> FlightReport:
     Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
     `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue.
     """
-    turns = TurnReporter(parts.watchers)
+    watchers = Watchers(parts.watchers, parts.clock.now, parts.remarks, parts.judges)
+    turns = TurnReporter(watchers.turn)
     inputs = FlightInputs(
         parts.link,
         parts.source,
         parts.pipeline,
         parts.profile,
         send=parts.link.send_external,
-        is_logged=turns.has_watchers,
+        is_logged=watchers.have_log,
     )
-    told = _teller(parts)
-    parts.link.set_guard(disarm_on_word(parts.operator), told)
-    _wait_until_ready(parts, inputs, turns, told)  # nothing flies before it returns
+    parts.link.set_guard(disarm_on_word(parts.operator), watchers.sent)
+    _wait_until_ready(parts, inputs, turns, watchers)  # nothing flies before it returns
     watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
-    parts.link.set_guard(watchdog.poll, told)
+    parts.link.set_guard(watchdog.poll, watchers.sent)
     try:
-        return _mission(parts, inputs, watchdog, turns)
+        report = _mission(parts, inputs, watchdog, turns, watchers)
+        return replace(report, detached=tuple(watchers.detached))
     except BaseException as error:
         watchdog.note_rescue()
         rest = rescue(
@@ -118,33 +123,18 @@ def fly(parts: FlightParts) -> FlightReport:
             watchdog.state,
             inputs.history,
             parts.position_age_s,
-            told,
+            watchers.sent,
             inputs.perception.motion.motion,
         )
-        with contextlib.suppress(Exception):  # the log may be what failed
+        with contextlib.suppress(Exception):  # what failed may fail again
             turns.report_failure(inputs, error)
-        for watcher in parts.watchers:
-            with contextlib.suppress(Exception):  # it may be the one that failed
-                watcher.event(Event.of_rescue(parts.clock.now(), error, rest))
+        with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
+            watchers.event(Event.of_rescue(parts.clock.now(), error, rest.state, rest.text))
         raise
 
 
-def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
-    told = [watcher for watcher in parts.watchers if isinstance(watcher, TurnWatcher)]
-
-    def tell(sent: SentCommand) -> None:
-        for watcher in told:
-            with contextlib.suppress(Exception):
-                watcher.sent(sent)
-
-    return tell
-
-
 def _wait_until_ready(
-    parts: FlightParts,
-    inputs: FlightInputs,
-    turns: TurnReporter,
-    told: Callable[[SentCommand], None],
+    parts: FlightParts, inputs: FlightInputs, turns: TurnReporter, watchers: Watchers
 ) -> None:
     refuse_without_positions(parts.link, parts.profile, has_feed=parts.positions is not None)
     decks, arming = parts.link.decks(), Arming()
@@ -162,7 +152,7 @@ def _wait_until_ready(
         turns.report_waiting_turn(inputs, now_s, feed)
         if inputs.perception.is_mirrored:
             raise SafetyAbort(mirrored_note(parts.profile.camera))
-        if parts.profile.safety.land_on_log_error and (problem := _log_problem(parts)):
+        if parts.profile.safety.land_on_log_error and (problem := watchers.problem):
             raise SafetyAbort(f"flight log: {problem}, and safety.land_on_log_error is set")
         seen = GroundTurn(
             profile=parts.profile,
@@ -194,12 +184,16 @@ def _wait_until_ready(
             request = arming.next_request(newest, now_s)
             if request is not None:
                 parts.link.send(request)
-                told(SentCommand(now_s, "preflight", request))
+                watchers.sent(SentCommand(now_s, "preflight", request))
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
 
 def _mission(
-    parts: FlightParts, inputs: FlightInputs, watchdog: Watchdog, turns: TurnReporter
+    parts: FlightParts,
+    inputs: FlightInputs,
+    watchdog: Watchdog,
+    turns: TurnReporter,
+    watchers: Watchers,
 ) -> FlightReport:
     period_s = 1.0 / parts.profile.link.loop_hz
     clock = parts.clock
@@ -224,7 +218,7 @@ def _mission(
             inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
         feed = _outside(parts, inputs, now_s)
-        obs = _observe(parts, inputs, now_s, late_s, feed)
+        obs = _observe(parts, inputs, now_s, late_s, feed, watchers.problem)
         turns.note_observation(obs)
         before = state
         new, command = step_mission(before, obs, parts.profile, parts.table)
@@ -242,7 +236,7 @@ def _mission(
             parts.positions.stop()
             drops_sightings = True
         events = Event.of_tick(before, state, obs, parts.profile)
-        notes = [*parts.remarks()]
+        notes = watchers.take_notes()
         if obs.log_problem is not None and not log_noted:
             log_noted = True
             notes.insert(0, f"the log of this flight is incomplete: {obs.log_problem}")
@@ -250,8 +244,7 @@ def _mission(
         for event in events:
             if event.kind is EventKind.PHASE:
                 passed.append(event)
-            for watcher in parts.watchers:
-                watcher.event(event)
+            watchers.event(event)
         turn = turns.flown_turn(inputs, obs, state, command, feed)
         newest = inputs.perception.calibration.newest
         tick = Tick(
@@ -270,21 +263,21 @@ def _mission(
             turn,
         )
         logged = newest
-        for watcher in parts.watchers:
-            watcher.tick(tick)
+        watchers.tick(tick)
         if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
             return FlightReport.of(
-                state, obs, parts.profile, tuple(passed), inputs.perception.camera_errors()
+                state,
+                obs,
+                parts.profile,
+                tuple(passed),
+                inputs.perception.camera_errors(),
+                simulated=parts.simulated,
             )
         due_s += period_s
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
         clock.wait_until(due_s)
-
-
-def _log_problem(parts: FlightParts) -> str | None:
-    return next((watcher.problem for watcher in parts.watchers if watcher.problem), None)
 
 
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
@@ -300,13 +293,14 @@ def _observe(
     now_s: float,
     late_s: float,
     feed: FeedStatus | None,
+    log_problem: str | None,
 ) -> Observation:
     return replace(
         inputs.observation(now_s),
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
         operator=parts.operator(),
-        log_problem=_log_problem(parts),
+        log_problem=log_problem,
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,
     )

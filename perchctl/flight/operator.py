@@ -1,38 +1,85 @@
-"""The operator's commands: Ctrl-C, the other signals, and the live page's STOP button."""
+"""The operator's commands: Ctrl-C, the other signals, the panel's key and the live page's buttons.
+
+Ctrl-C reaches the program as one signal a press, whether a finger presses it again or the keyboard
+repeats a key that is held down. Which of the two it is has to be told from the times alone:
+
+======================================================  ==========================================
+presses                                                 order
+======================================================  ==========================================
+one                                                     land
+two, less than `AGAIN_S` apart                          land
+two, `AGAIN_S` to `LONGEST_DELAY_S` apart, no third     land, and stop `WAIT_S` after the second:
+                                                        it was no key's first repeat
+a second one later than that                            stop at once
+three within a second, not spaced as a key repeats      stop at once
+spaced as a key repeats                                 land for a second after the first; the
+                                                        first press after that stops
+spaced as a key repeats, and let go within that second  land if no hand presses like that
+                                                        (`_is_surely_key`), else stop
+======================================================  ==========================================
+
+A held key waits 0.25 to 1 s and then repeats 5 to 33 times a second, evenly (terminals on Linux:
+after 250 to 660 ms, every 30 to 92 ms). A hand hammers 3 to 10 times a second, unevenly, and its
+first gap is no longer than the next ones. Whatever both could have done is a stop, since a vehicle
+that falls does less harm than one that flies on against the operator's word.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import os
+import select
 import signal
 import socket
+import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
+from typing import Any
 
 from perchctl.errors import Interrupted
 from perchctl.mission import Operator
 
-AGAIN_S = 0.5  # a second press counts this long after the first
-HELD_S = 0.3  # faster presses are one: a key held down repeats at 5 to 33 Hz
-DELAY_S = 1.0  # a keyboard waits no longer before it repeats a key; 0.25 to 0.66 s are usual
-INSIST_S = 2.0  # who presses on for so long wants the motors stopped
-HUNG_S = 10.0  # a stopped flight that has not ended by then hangs
+STOP_HELP = "Press Ctrl-C to land. Press it again to cut the motors."
+KEY_HELP = "The space bar cuts the motors at once."
+"""Every help, panel, page and document describes the operator's stop in these words."""
+
+AGAIN_S = 0.3
+"""Two presses less than this apart are one: larger misses a hurried second press."""
+LONGEST_DELAY_S = 1.0
+"""No keyboard waits longer before it repeats a key. Until then the second press may be its first
+repeat; larger lets a held key land for longer, and delays the stop of whoever hammers as evenly."""
+SHORTEST_DELAY_S = 0.25
+"""A keyboard waits at least this long before it repeats; smaller takes more hands for keys."""
+SLOWEST_REPEAT_S = 0.2
+"""The longest time between two repeats of a key; larger delays the stop by a second press."""
+JITTER_S = 0.02
+"""A repeat may be read so much late on a busy computer; larger takes more hands for keys."""
+WAIT_S = SLOWEST_REPEAT_S + JITTER_S + 0.01
+"""A key that is still held has repeated again by then."""
+FASTER_THAN_A_HAND_S = 0.08
+"""Repeats faster than this, on average, are a key's; larger takes more hands for keys."""
+SHORTEST_FAST_DELAY_S = 0.15
+"""The delay of a key that repeats so fast may be shorter (``xset r rate 200 50``)."""
+LONGER_THAN_REPEATS = 1.2
+"""The least ratio of a key's delay to the mean of its repeats; a hand's gaps are alike."""
+SURE_REPEATS, SURELY_LONGER = 4, 2.0
+"""So many even repeats after a gap so much longer are a key's, also if a hand could be as fast."""
+HUNG_S = 10.0
+"""A stopped flight that has not ended by then hangs."""
 _EPS_S = 1e-9
 
 
 @dataclass
 class OperatorSwitch:
-    """Reads Ctrl-C for the planner: one press lands, two stop the motors.
+    """The operator's command, by the table above, for planner and watchdog.
 
-    `press` is Ctrl-C. A second press counts after at least `HELD_S` of silence and `AGAIN_S` after
-    the first. The first repetition of a key held down looks the same, so after a silence of up to
-    `DELAY_S` a press counts once no other has followed for `HELD_S`. Presses that still follow each
-    other `INSIST_S` after the first are a stop as well. `land` is for STOP on the live page and for
-    the signals that ask a program to end: it lands however often it comes, and never stops the
-    motors. All methods may be called from any thread.
+    `press` is Ctrl-C. `land` is for Land on the live page and for the signals that ask a program to
+    end: it lands however often it comes, and never stops the motors. `cut` is for the panel's key
+    and Cut motors on the page: it stops them at once. All methods may be called from any thread.
 
     Until the flight loop listens there is nothing to land, and `HUNG_S` after a stop nothing is
     left to do: then `interrupt` raises `Interrupted`.
@@ -43,36 +90,35 @@ class OperatorSwitch:
     landing_requested: bool = False
     clock: Callable[[], float] = time.monotonic
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _first_s: float | None = None
-    _last_s: float = 0.0
-    _second_s: float | None = None
+    _presses_s: list[float] = field(default_factory=list)  # until they are a stop
     _stopped_s: float = math.inf
 
     def read(self) -> Operator:
         with self._lock:
-            self._confirm(self.clock())
+            self._decide(self.clock())
             if self._stopped_s < math.inf:
                 return Operator.STOP
-            pressed = self._first_s is not None or self.landing_requested
+            pressed = bool(self._presses_s) or self.landing_requested
             return Operator.LAND if pressed else Operator.NONE
 
     def land(self) -> None:
         self.landing_requested = True
 
-    def press(self) -> None:
+    def cut(self) -> None:
+        with self._lock:
+            self._stopped_s = min(self._stopped_s, self.clock())
+
+    def press(self, count: int = 1) -> None:
+        """Note that Ctrl-C was pressed. With `count` it was pressed so often since the last call,
+        at times that are not known: they are taken as even, which is how a hand would press."""
         with self._lock:
             now_s = self.clock()
-            self._confirm(now_s)
-            silent_s = now_s - self._last_s
-            if self._first_s is None:
-                self._first_s = now_s
-            elif silent_s < HELD_S - _EPS_S:  # a key has begun to repeat, or it is hammered
-                self._second_s = None
-                self._confirm(now_s, now_s - self._first_s >= INSIST_S - _EPS_S)
-            elif now_s - self._first_s >= AGAIN_S - _EPS_S:
-                self._second_s = now_s
-                self._confirm(now_s, silent_s > DELAY_S + _EPS_S)
-            self._last_s = now_s
+            self._decide(now_s)
+            since_s = self._presses_s[-1] if self._presses_s else now_s
+            for number in range(count):
+                if self._stopped_s == math.inf:
+                    self._presses_s.append(since_s + (now_s - since_s) * (number + 1) / count)
+                    self._decide(now_s)
 
     def interrupt(self) -> None:
         """Raises `Interrupted` on a signal where the loop does not listen; called in the main
@@ -82,11 +128,64 @@ class OperatorSwitch:
         if not self.closing and self.clock() - self._stopped_s >= HUNG_S:
             raise Interrupted("the stopped flight hung")
 
-    def _confirm(self, now_s: float, insists: bool = False) -> None:
-        second_s = self._second_s
-        alone = second_s is not None and now_s - second_s >= HELD_S - _EPS_S
-        if alone or insists:
-            self._stopped_s = min(self._stopped_s, now_s)
+    def _decide(self, now_s: float) -> None:
+        if self._stopped_s == math.inf and _is_stop(self._presses_s, now_s):
+            self._stopped_s = now_s
+
+
+def _is_stop(presses_s: Sequence[float], now_s: float) -> bool:
+    """True if these presses, and none until `now_s`, stop the motors; once true it stays so."""
+    if len(presses_s) < 2:
+        return False
+    first_s, last_s = presses_s[0], presses_s[-1]
+    if last_s - first_s >= LONGEST_DELAY_S - _EPS_S:
+        return True
+    if len(presses_s) == 2 and last_s - first_s < AGAIN_S - _EPS_S:
+        return False
+    if not _may_be_key(presses_s):
+        return True
+    return now_s - last_s >= WAIT_S - _EPS_S and not _is_surely_key(presses_s)
+
+
+def _may_be_key(presses_s: Sequence[float]) -> bool:
+    """True if a single key, held down, may have made these presses (two or more)."""
+    delay_s, repeats_s = presses_s[1] - presses_s[0], presses_s[1:]
+    mean_s = _mean_gap_s(repeats_s)
+    if len(repeats_s) > 1 and mean_s <= FASTER_THAN_A_HAND_S:
+        return delay_s >= SHORTEST_FAST_DELAY_S - JITTER_S
+    return (
+        delay_s >= SHORTEST_DELAY_S - JITTER_S - _EPS_S
+        and mean_s <= SLOWEST_REPEAT_S + JITTER_S + _EPS_S
+        and delay_s >= LONGER_THAN_REPEATS * mean_s
+        and _are_even(repeats_s)
+    )
+
+
+def _is_surely_key(presses_s: Sequence[float]) -> bool:
+    """True if no hand makes these presses, which a key may have made."""
+    delay_s, repeats_s = presses_s[1] - presses_s[0], presses_s[1:]
+    mean_s = _mean_gap_s(repeats_s)
+    if len(repeats_s) < 2:
+        return False
+    even = len(repeats_s) >= SURE_REPEATS and delay_s >= SURELY_LONGER * mean_s
+    return even or mean_s <= FASTER_THAN_A_HAND_S
+
+
+def _mean_gap_s(times_s: Sequence[float]) -> float:
+    return (times_s[-1] - times_s[0]) / (len(times_s) - 1) if len(times_s) > 1 else 0.0
+
+
+def _are_even(times_s: Sequence[float]) -> bool:
+    """True if a period exists whose multiples these times follow, each up to `JITTER_S` late:
+    for each pair of them, ``k`` periods apart, it is their distance ``+- JITTER_S`` over ``k``."""
+    pairs = [
+        (later_s - earlier_s, k)
+        for i, earlier_s in enumerate(times_s)
+        for k, later_s in enumerate(times_s[i + 1 :], 1)
+    ]
+    least_s = max(((d - JITTER_S) / k for d, k in pairs), default=0.0)
+    most_s = min(((d + JITTER_S) / k for d, k in pairs), default=0.0)
+    return least_s <= most_s + _EPS_S
 
 
 # --- Signals that end a flight ---
@@ -136,11 +235,82 @@ def operator_signals(switch: OperatorSwitch, report: Callable[[str], None]) -> I
 
 def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str], None]) -> None:
     while numbers := reader.recv(64):
-        for number in numbers:
-            if number == signal.SIGINT:
-                switch.press()
-            elif number in LANDING_SIGNALS:
-                switch.land()
+        if presses := numbers.count(signal.SIGINT):
+            switch.press(presses)
+        if any(number in LANDING_SIGNALS for number in numbers):
+            switch.land()
         if switch.listening and signal.SIGTSTP in numbers:
             # Not from this thread: a terminal that stands still would hold up the signals.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
+
+
+# --- The key that cuts the motors ---
+
+
+_KEY = b" "
+_KEYS_AT_ONCE = 1024
+
+
+@contextlib.contextmanager
+def cut_key(switch: OperatorSwitch, terminal: int) -> Iterator[bool]:
+    """Let the space bar cut the motors while the block runs; yield True if it does.
+
+    It needs the file descriptor of a terminal in whose foreground this process runs; otherwise
+    nothing is changed. Keys come without Enter and are not echoed; Ctrl-C and Ctrl-Z go on making
+    signals. Keys pressed before or during the block are discarded, so that a stale one neither
+    cuts the motors nor reaches the shell. However the block ends, the terminal is as it was before.
+    """
+    before = _terminal_mode(terminal)
+    if before is None:
+        yield False
+        return
+    waker, wakes = os.pipe()
+    keys = threading.Thread(
+        target=_read_keys, args=(switch, terminal, waker), name="perchctl-keys", daemon=True
+    )
+    try:
+        _set_mode(terminal, _keys_mode(before))
+        keys.start()
+        yield True
+    finally:
+        os.close(wakes)
+        if keys.ident is not None:
+            keys.join(1.0)
+        os.close(waker)
+        _set_mode(terminal, before)
+
+
+def _terminal_mode(terminal: int) -> list[Any] | None:
+    """The mode of a terminal that this process may read keys from; None of any other file."""
+    with contextlib.suppress(OSError, ValueError, termios.error):
+        if os.tcgetpgrp(terminal) == os.getpgrp():
+            return termios.tcgetattr(terminal)
+    return None
+
+
+def _keys_mode(mode: list[Any]) -> list[Any]:
+    changed = [*mode[:6], list(mode[6])]
+    changed[3] &= ~(termios.ICANON | termios.ECHO)
+    changed[6][termios.VMIN], changed[6][termios.VTIME] = 1, 0
+    return changed
+
+
+def _set_mode(terminal: int, mode: list[Any]) -> None:
+    """Set a terminal's mode and discard the keys that wait. It does not wait for the output, which
+    stands still after Ctrl-S; a terminal that is gone has no mode."""
+    with contextlib.suppress(OSError, termios.error):
+        termios.tcsetattr(terminal, termios.TCSANOW, mode)
+        termios.tcflush(terminal, termios.TCIFLUSH)
+
+
+def _read_keys(switch: OperatorSwitch, terminal: int, waker: int) -> None:
+    with contextlib.suppress(OSError, ValueError):  # the terminal is closed
+        while True:
+            ready, _, _ = select.select([terminal, waker], [], [])
+            if waker in ready:
+                return
+            keys = os.read(terminal, _KEYS_AT_ONCE)
+            if _KEY in keys:
+                switch.cut()
+            if not keys:
+                return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,11 +21,18 @@ from perchctl.errors import (
     no_motion_capture,
     no_simulator,
 )
-from perchctl.extensions import PATTERN, is_extension, load_extension, make_extension
+from perchctl.extensions import load_extension, make_extension
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.link import CflibLink, GuardedLink, VehicleLink, check_uri, vehicle_uri
+from perchctl.link import (
+    CflibLink,
+    GuardedLink,
+    VehicleLink,
+    check_uri,
+    is_own_uri,
+    vehicle_uri,
+)
 from perchctl.mission import FlightReport, Transition, Watcher, add_rows, table_of
 from perchctl.positioning import PositionFeed, load_comparison, open_capture
 from perchctl.profile import PositioningConfig, Profile
@@ -56,7 +62,7 @@ class FlyOptions:
     @property
     def has_own_link(self) -> bool:
         """True if the URI names your own link, as ``my_module:MyLink``."""
-        return re.match(PATTERN, self.uri) is not None
+        return is_own_uri(self.uri)
 
     def require_lift_check(self) -> None:
         require_lift_check(self.profile.positioning, self.uri, simulated=self.simulated)
@@ -77,7 +83,7 @@ def check_options(options: FlyOptions) -> None:
     elif options.profile.positioning.by == "mocap" and find_spec("motioncapture") is None:
         raise no_motion_capture()  # the simulated room has a capture of its own
     source = parse_source(options.source)
-    if is_extension(options.source):
+    if source.is_own:
         load_extension(options.source, "camera.source")
     if source.scheme == "sim" and not options.simulated:
         raise UsageError(
@@ -161,6 +167,7 @@ def fly_session(
                 positions,
                 lambda: [*remarks(), *link.new_notes()],
                 table,
+                simulated=options.simulated,
             )
             with contextlib.ExitStack() as waiting:
                 if isinstance(clock, SimulatedClock):

@@ -23,10 +23,11 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
+    Rest,
     RestState,
     SentCommand,
     VisualInertialMotion,
-    rest_text,
+    find_rest,
     step_landing,
 )
 from perchctl.perception import History, add_samples
@@ -64,8 +65,8 @@ class LastTick:
 class Watchdog:
     """Decides what the link sends while the loop is silent: its `poll` is the link's guard.
 
-    `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's; each
-    thread writes fields of its own.
+    `tick`, `note_rescue` and `end` are called by the loop's thread, `poll` by the link's. Each
+    thread writes fields of its own, and reads the other's: no value is lost without a lock.
 
     `position_age_s` returns the age of the newest external position at a time. `overruled_s` is how
     late the loop was when the watchdog began a landing in its place, else 0.
@@ -80,13 +81,16 @@ class Watchdog:
         self._profile = profile
         self._operator = operator
         self._position_age_s = position_age_s
+        # Written by the loop's thread:
         self._last: LastTick | None = None
+        self._streamed: Command | None = None
+        self._loop_has_cut = False
         self._closing = False
         self._motors_off = False
+        # Written by the link's thread:
         self.overruled_s = 0.0
         self._cut_ordered = False
         self._cut_s, self._cuts = -CUT_PERIOD_S, 0
-        self._streamed: Command | None = None
         self._history: History | None = None
         self._held: PositionSetpoint | None = None
         self._way_down: PlannerState | None = None
@@ -100,7 +104,7 @@ class Watchdog:
         if isinstance(command, (PositionSetpoint, RawThrust)):
             self._streamed = command
         if isinstance(command, EmergencyStop):
-            self._cut_ordered = True
+            self._loop_has_cut = True
         self._last = LastTick(next_due_s, state, self._streamed or command, obs)
 
     def note_rescue(self) -> None:
@@ -123,7 +127,7 @@ class Watchdog:
     ) -> Command | None:
         """The command to send in the loop's place, or None. `waiting`: unread samples."""
         last = self._last
-        if self._cut_ordered:
+        if self._loop_has_cut or self._cut_ordered:
             return self._cut(now_s, newest)
         if last is None or self._motors_off:
             return None
@@ -232,9 +236,9 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
-) -> str:
+) -> Rest:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
-    Returns where the vehicle came to rest, in words without a full stop.
+    Returns where the vehicle came to rest.
 
     Args:
         state: the planner's last state; None before its first tick.
@@ -255,7 +259,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return RestState.UNSEEN.value
+            return Rest(RestState.UNSEEN)
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         problem: str | None = "the link fails"
@@ -276,8 +280,8 @@ def rescue(
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
-            rest = rest_text(state, obs, profile, LOOK_S)
+            rest = find_rest(state, obs, profile, LOOK_S)
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return RestState.UNSEEN.value
+    return Rest(RestState.UNSEEN)

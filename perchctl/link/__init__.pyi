@@ -10,4 +10,5 @@ from .own_link import GuardedLink as GuardedLink
 from .protocol import Link as Link
 from .protocol import VehicleLink as VehicleLink
 from .protocol import check_uri as check_uri
+from .protocol import is_own_uri as is_own_uri
 from .protocol import vehicle_uri as vehicle_uri

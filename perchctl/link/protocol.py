@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from perchctl.errors import InvalidValue
+from perchctl.extensions import has_extension_form
 from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
@@ -138,6 +139,11 @@ then run:
   sudo usermod -a -G plugdev $USER
   sudo udevadm control --reload-rules && sudo udevadm trigger
 log in again, and plug the radio or the vehicle in again."""
+
+
+def is_own_uri(uri: str) -> bool:
+    """True for your own link, ``my_module:MyLink``; a scheme such as ``radio`` is no module."""
+    return has_extension_form(uri, FORMS)
 
 
 def check_uri(uri: str) -> str:

@@ -13,10 +13,12 @@ from .records import Turn as Turn
 from .records import TurnInputs as TurnInputs
 from .records import UnfilteredPose as UnfilteredPose
 from .records import Watcher as Watcher
+from .report import PROFILE_ROWS as PROFILE_ROWS
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport
+from .report import Rest as Rest
 from .report import Touchdown as Touchdown
-from .report import rest_text as rest_text
+from .report import find_rest as find_rest
 from .state import ContactError as ContactError
 from .state import Mismatch as Mismatch
 from .state import Observation as Observation

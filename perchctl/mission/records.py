@@ -11,6 +11,7 @@ from typing import Literal, Protocol
 
 from perchctl.geometry import Array
 from perchctl.mission.context import Context
+from perchctl.mission.lander import RestState
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
 from perchctl.mission.table import position_loss_text
 from perchctl.profile import Profile
@@ -18,7 +19,6 @@ from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_re
 from perchctl.vision import CameraErrors, PictureKind, PipelineOutput, TargetEstimate
 
 TurnRole = Literal["waiting", "redone", "flown", "failed"]
-RESCUE = " in flight: "
 
 
 class EventKind(Enum):
@@ -40,16 +40,13 @@ class Event:
     row: str = ""  # the table's transition; empty at the start and where there was none
     severity: Severity = Severity.CONTINUE
     simulated: str = ""  # what the simulated scenario did that led to it
+    rest: RestState | None = None  # where a rescue found the vehicle; None in all other events
 
     @classmethod
-    def of_rescue(cls, t_s: float, error: BaseException, rest: str) -> Event:
-        """The note on a vehicle's fate after an error in flight; `rest`: by `rest_text`."""
-        return cls(t_s, EventKind.NOTE, f"{type(error).__name__}{RESCUE}{rest}")
-
-    @property
-    def is_rescue(self) -> bool:
-        """True if `of_rescue` created the event."""
-        return self.kind is EventKind.NOTE and RESCUE in self.reason
+    def of_rescue(cls, t_s: float, error: BaseException, rest: RestState, text: str) -> Event:
+        """The note on a vehicle's fate after an error in flight, as the rescue found it."""
+        reason = f"{type(error).__name__} in flight: {text}"
+        return cls(t_s, EventKind.NOTE, reason, rest=rest)
 
     @classmethod
     def of_tick(
@@ -189,7 +186,8 @@ class Tick:
 
 
 class Watcher(Protocol):
-    """Receiver of ticks and events: flight log, panel, live page. Its methods must not raise."""
+    """Receiver of ticks and events: flight log, panel, live page. One that raises is detached, and
+    the flight goes on without it; an attribute `name` names it in the message."""
 
     def tick(self, tick: Tick) -> None:
         """Handle a turn that was flown."""

@@ -31,6 +31,10 @@ LATENCY_GATE_S = 0.02  # 30 ms make an alignment swing by centimetres
 TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
 
 
+PROFILE_ROWS = frozenset({"position-astray", "latency", "mounting"})
+"""The rows of the table whose reason asks to look at the profile's camera or positioning."""
+
+
 @dataclass(frozen=True)
 class Touchdown:
     """The downward speed on meeting the floor, and the largest acceleration of 10 ms samples."""
@@ -53,7 +57,8 @@ class Touchdown:
 @dataclass(frozen=True)
 class Findings:
     """Latency, and the camera's turn from what the profile says about body x, y and z, each with
-    one standard deviation; `advice` in sentences, empty if the profile fits."""
+    one standard deviation; `advice` in sentences, empty if the profile fits, and for a simulated
+    vehicle: its camera is the scenario's, and tells nothing of a real one."""
 
     latency_s: float
     latency_sigma_s: float
@@ -62,12 +67,15 @@ class Findings:
     advice: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, seen: CameraErrors, camera: CameraConfig) -> Findings:
-        """The flight's findings, with advice on each that is surely beyond its limit."""
+    def of(cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False) -> Findings:
+        """The flight's findings, with advice on each that is surely beyond its limit, unless
+        `simulated`."""
         latency_s = camera.start_latency_s + seen.delay_s
         x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
         found, advice = cls(latency_s, seen.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
+        if simulated:
+            return found
         set_here = not isinstance(camera.latency_s, str)  # else the measured one is used
         if set_here and _is_off(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
             advice.append(
@@ -114,6 +122,12 @@ class FlightReport:
     findings: Findings | None = None  # of latency and mounting, where it was long enough
     contact: ContactError | None = None  # of what hangs
     touchdown: Touchdown | None = None  # of what met the floor
+    detached: tuple[str, ...] = ()  # a sentence for each watcher that raised, and was left out
+
+    @property
+    def blames_profile(self) -> bool:
+        """True if a row of `PROFILE_ROWS` decided in the flight."""
+        return any(event.row in PROFILE_ROWS for event in self.history)
 
     @classmethod
     def of(
@@ -123,8 +137,10 @@ class FlightReport:
         profile: Profile,
         history: tuple[Event, ...],
         consistency: CameraErrors | None,
+        *,
+        simulated: bool = False,
     ) -> FlightReport:
-        """The report of a mission that is over, by its last tick."""
+        """The report of a mission that is over, by its last tick; `simulated`: the vehicle was."""
         hangs, contact = state.phase is Phase.PERCHED, state.contact
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
@@ -137,23 +153,37 @@ class FlightReport:
             # The telemetry at hand is older than an emergency stop, which always locks.
             locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
             history=history,
-            findings=None if consistency is None else Findings.of(consistency, profile.camera),
+            findings=None
+            if consistency is None
+            else Findings.of(consistency, profile.camera, simulated=simulated),
             contact=contact if placed else None,
             touchdown=find_touchdown(Context(state, obs, profile)),
         )
 
 
-def rest_text(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> str | None:
-    """Return where the vehicle is, in words without a full stop, with its touchdown if that was
-    hard; None until its motors have been seen off for `off_s`."""
+@dataclass(frozen=True)
+class Rest:
+    """Where a vehicle came to rest, and how hard it met the floor if it did."""
+
+    state: RestState
+    touchdown: Touchdown | None = None
+
+    @property
+    def text(self) -> str:
+        """The rest in words without a full stop, with its touchdown if that was hard."""
+        if self.touchdown is None or not self.touchdown.is_hard:
+            return self.state.value
+        return f"{self.state.value}; it {self.touchdown.text}"
+
+
+def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
+    """Return where the vehicle is; None until its motors have been seen off for `off_s`."""
     c = Context(state, obs, profile)
     if c.held_s(Condition.DOWN) < off_s:
         return None
-    finding, touchdown = find_rest_state(c), find_touchdown(c)
-    hangs = finding in (RestState.HANGS, RestState.HELD)
-    if hangs or touchdown is None or not touchdown.is_hard:
-        return finding.value
-    return f"{finding.value}; it {touchdown.text}"
+    found = find_rest_state(c)
+    hangs = found in (RestState.HANGS, RestState.HELD)
+    return Rest(found, None if hangs else find_touchdown(c))
 
 
 def find_touchdown(c: Context) -> Touchdown | None:

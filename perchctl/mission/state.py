@@ -128,7 +128,7 @@ class ContactError:
 
 
 class Operator(IntEnum):
-    """The operator's command, which only rises: Ctrl-C once lands, twice stops."""
+    """The operator's command, which only rises: `LAND`, and `STOP`, which cuts the motors."""
 
     NONE = 0
     LAND = 1

@@ -280,6 +280,17 @@ def has_recovered(c: Context) -> bool:
     return steady and c.state.contact_z_m is None
 
 
+def unsteady_reason(c: Context) -> str:
+    """Text: what kept a recovering vehicle from being steady, as it was seen; no cause is known."""
+    seen = [f"it moves at {c.speed_mps:.2f} m/s"] if math.isfinite(c.speed_mps) else []
+    if c.placed and c.state.setpoint is not None:
+        seen.append(f"it is {_away_m(c):.2f} m beside its setpoint")
+    if c.state.contact_z_m is not None:
+        seen.append("it has not come away from its contact")
+    text = f"not steady {c.planner.recover.timeout_s:g} s after the attempt"
+    return f"{text}: {', '.join(seen)}" if seen else text
+
+
 def lacks_charge_to_begin(c: Context) -> bool:
     """True if an attempt or a retry is due, and the battery has not enough charge for it."""
     begins = is_aligned(c) if c.state.phase is P.ALIGN else has_recovered(c)
@@ -399,7 +410,7 @@ TABLE: tuple[Transition, ...] = (
     motor_cut_row(
         "operator-stop",
         lambda c: c.obs.operator >= Operator.STOP,
-        "second Ctrl-C: emergency stop",
+        "the operator cut the motors",
         O.EMERGENCY,
     ),
     Transition(
@@ -717,7 +728,7 @@ TABLE: tuple[Transition, ...] = (
         "recover-timeout",
         {P.RECOVER},
         lambda c: c.in_phase_s > c.planner.recover.timeout_s,
-        "the vehicle does not become steady",
+        unsteady_reason,
     ),
     # --- landing ---
     Transition(

@@ -27,6 +27,8 @@ from perchctl.positioning.feed import BodyPose, CaptureFrame, CaptureSource, Pos
 from perchctl.profile import PositioningConfig
 
 SILENT_S = 0.3
+LATE_S = 0.5
+"""So long after a burst of late frames it still explains that no frame is used."""
 KEPT = 64
 """Frames that wait to be read; older ones fall out."""
 LONGEST_LINE = 300
@@ -56,6 +58,32 @@ class CaptureFailure:
 
     text: str
     is_loaded: bool = True
+
+
+@dataclass(frozen=True)
+class LateFrames:
+    """Frames after a pause of `pause_s` are not used: how long they have waited is not known.
+    `count`: how many came at once after the pause before; 0 if these were no burst."""
+
+    count: int
+    pause_s: float
+
+    def text(self, who: str) -> str:
+        """What is wrong with the capture `who`, and what to do."""
+        if self.count == 0:
+            return (
+                f"{who} has paused for {self.pause_s:.2f} s, and a frame after a pause may be old: "
+                f"it is not used"
+            )
+        if self.count == 1:
+            return (
+                f"{who} sends a frame only every {self.pause_s:.2f} s, and such frames are not "
+                f"used; set it to at least 50 Hz"
+            )
+        return (
+            f"{who} sends its frames late, in bursts ({self.count} at once after "
+            f"{self.pause_s:.2f} s), and late frames are not used; connect it by cable"
+        )
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
@@ -100,6 +128,7 @@ class MotionCapture:
         self._setup, self._who, self._body, self._clock = setup, who, body, clock
         self._frames: deque[CaptureFrame] = deque(maxlen=KEPT)
         self._framed_s: float | None = None
+        self._late: tuple[float, LateFrames] | None = None  # when it was heard of
         self._settled = threading.Event()  # by a first frame, or an end before it
         self._closed = False
         self._ended: str | None = None
@@ -129,6 +158,8 @@ class MotionCapture:
         if self._ended is not None:
             return self._ended
         silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
+        if self._late is not None and now_s - self._late[0] <= LATE_S and silent_s > PAUSE_S:
+            return self._late[1].text(self._who)
         if silent_s <= SILENT_S:
             return None
         what = "no body" if self._setup.skip_empty else "no frame"
@@ -160,6 +191,8 @@ class MotionCapture:
         self._threads.append(reading)
         reading.start()
         if not self._settled.wait(self._setup.timeout_s):
+            if self._late is not None:
+                raise ConnectionFailed(self._late[1].text(self._who))
             raise ConnectionFailed(
                 f"no {self._who}: no frame within {self._setup.timeout_s:g} s (does it stream, is "
                 f"the address right?){self._words()}"
@@ -172,7 +205,10 @@ class MotionCapture:
     def _read_frames(self, channel: Channel) -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
-                message: tuple[float, Bodies] | CaptureFailure = channel.receive()
+                message: tuple[float, Bodies] | LateFrames | CaptureFailure = channel.receive()
+                if isinstance(message, LateFrames):
+                    self._late = self._clock(), message
+                    continue
                 if isinstance(message, CaptureFailure):
                     self._failed = message
                     failed = "" if self._framed_s is None else " failed"
@@ -214,7 +250,10 @@ class MotionCapture:
 START_TIMEOUT_S = 30.0
 MOST_HZ = 500.0
 """No system is faster; what comes faster is not a measurement, and would keep the parent busy."""
-PAUSE_S, AT_ONCE_S = 0.1, 2e-4
+PAUSE_S = 0.1
+"""After a pause as long as this the library may hand out what waited in its queue."""
+AT_ONCE_S = 1e-3
+"""Frames closer than this waited in the queue: no system sends so fast."""
 
 Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, float]]]
 """Position and quaternion (w, x, y, z) by name: nothing of the library travels."""
@@ -247,14 +286,21 @@ def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
     """Send frames as they come, but none of an unknown age.
 
     After a pause the library may hand out what has waited in its queue: the first frame, and each
-    that then comes without any waiting, is not passed on.
+    that then comes without any waiting, is not passed on. The parent is told why.
     """
     sent_s, behind = -1.0, False
+    began_s, newest_s, count = -1.0, -1.0, 0  # of the frames since the last pause
     while True:
         asked_s = time.monotonic()
         client.waitForNextFrame()
         now_s = time.monotonic()
-        behind = now_s - asked_s > PAUSE_S or (behind and now_s - asked_s < AT_ONCE_S)
+        waited_s = now_s - asked_s
+        if waited_s > PAUSE_S:
+            is_burst = newest_s - began_s < PAUSE_S
+            channel.send(LateFrames(count if is_burst else 0, waited_s))
+            began_s, count = now_s, 0
+        newest_s, count = now_s, count + 1
+        behind = waited_s > PAUSE_S or (behind and waited_s < AT_ONCE_S)
         if behind or now_s - sent_s < 1.0 / MOST_HZ:
             continue
         bodies: Bodies = {}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, WithJsonSchema, model_validator
 
-from perchctl.extensions import PATTERN
+from perchctl.extensions import PATTERN, has_extension_form
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 SPARE_S = 0.02
@@ -19,9 +18,12 @@ _HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"
 
 
 def _known_system(system: str) -> str:
-    if system not in SYSTEMS and re.match(PATTERN, system) is None:
-        raise ValueError(f"{system!r} is none of {', '.join(SYSTEMS)}, nor my_module:MySource")
-    return system
+    if system in SYSTEMS or has_extension_form(system, SYSTEMS):
+        return system
+    known, colon, _host = system.partition(":")
+    if colon and known.lower() in SYSTEMS:
+        raise ValueError(f"{system!r} is {known.lower()} and a host: write system and host apart")
+    raise ValueError(f"{system!r} is none of {', '.join(SYSTEMS)}, nor my_module:MySource")
 
 
 SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")

@@ -128,6 +128,7 @@ def event_record(event: Event) -> dict[str, Any]:
         "severity": event.severity.name.lower().replace("_", " "),
         "reason": event.reason,
         "simulated": event.simulated or None,
+        "rest": None if event.rest is None else event.rest.name.lower(),
     }
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.mission import ContactError, Findings, Touchdown
+from perchctl.mission import PROFILE_ROWS, ContactError, Findings, Touchdown
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -44,6 +44,8 @@ class FlightSummary:
         touchdown: how the vehicle met the floor, as far as telemetry shows it.
         lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
         recording: its summary; None without a recording, and in a log that is read back.
+        simulated: the vehicle was; then nothing here is advice for the profile of a real one.
+        blames_profile: a row of `PROFILE_ROWS` decided, whose reason asks to look at the profile.
     """
 
     outcome: str
@@ -61,6 +63,8 @@ class FlightSummary:
     lost_records: int = 0
     log_problem: str | None = None
     recording: RecordingEnd | None = None
+    simulated: bool = False
+    blames_profile: bool = False
 
     @classmethod
     def from_log(cls, log: FlightLog) -> FlightSummary:
@@ -72,6 +76,10 @@ class FlightSummary:
         end: Mapping[str, Any] = log.summary or unknown
         last = log.records[-1] if log.records else {}
         battery_min_v = float(np.min(known_v)) if known_v.size else None
+        simulated = is_simulated(log.header)
+        findings = _part_in(end, Findings, _FINDINGS)
+        if simulated and findings is not None:  # logs by 0.3.0 have advice in spite of it
+            findings = replace(findings, advice=())
         return cls(
             outcome=str(end.get("outcome", "unknown")),
             reason=str(end.get("reason", "")),
@@ -82,11 +90,13 @@ class FlightSummary:
             battery_min_v=end.get("battery_min_v") or battery_min_v,
             locked=bool(end.get("locked", False)),
             fell=bool(end.get("fell", False)),
-            findings=_part_in(end, Findings, _FINDINGS),
+            findings=findings,
             contact=_part_in(end, ContactError, _CONTACT),
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
+            simulated=simulated,
+            blames_profile=any(event.get("row") in PROFILE_ROWS for event in log.events),
         )
 
     def as_record(self) -> dict[str, Any]:
@@ -112,6 +122,8 @@ class FlightSummary:
         lines = [f"{self.outcome.upper()}: {self.reason}".rstrip(": ")]
         if self.cause and self.cause != self.outcome:
             lines[0] += f" [{self.cause}]"
+        if self.simulated and self.blames_profile:
+            lines.append("note:      camera and positions were simulated: change no real profile")
         if self.miss_m is not None:
             lines.append(f"miss:      {self.miss_m * 1e3:.1f} mm")
         if self.contact is not None:
@@ -139,6 +151,11 @@ class FlightSummary:
         if log_path is not None:
             lines.append(f"log:       {log_path}")
         return "\n".join(lines)
+
+
+def is_simulated(header: Mapping[str, Any]) -> bool:
+    """True if a log's header is that of a simulated vehicle."""
+    return str(header.get("uri", "")).startswith("sim://")
 
 
 # A part of the summary by the record's keys and its own fields, in their order.

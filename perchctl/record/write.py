@@ -27,7 +27,7 @@ from perchctl.record.disk import BackgroundWriter, DiskFile, create_file
 from perchctl.record.exact import encode_line, json_line, to_exact_json
 from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
-from perchctl.record.summary import FlightSummary, RecordingEnd
+from perchctl.record.summary import FlightSummary, RecordingEnd, is_simulated
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 if TYPE_CHECKING:
@@ -55,8 +55,11 @@ class LogWatcher:
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight goes on.
         truth: returns the true state at a tick; set by a simulation.
+        simulated: the header is that of a simulated vehicle.
         recorder: records the frames of the watched source; None without a recording.
     """
+
+    name = "the flight log"
 
     def __init__(self, path: Path, header_line: bytes, live: bool, file: DiskFile) -> None:
         """Write the header into a new file. Raises OSError."""
@@ -65,6 +68,7 @@ class LogWatcher:
         self.problem: str | None = None
         self.unencodable: str | None = None
         self.truth: Callable[[], Truth] | None = None
+        self.simulated = False
         self.recorder: Recorder | None = None
         self._battery_min_v: float | None = None
         self._ticks = 0
@@ -72,7 +76,7 @@ class LogWatcher:
         self._file = file
         self._writer = BackgroundWriter(MOST_WAITING, "perchctl-log", live)
         self._closed = False
-        self._unfinished = 0
+        self._unfinished = self._unmade = 0
         # Below: of the thread that writes.
         self._failed = 0
         self._synced_s = math.inf
@@ -80,7 +84,7 @@ class LogWatcher:
     @property
     def lost_records(self) -> int:
         """How many records could not be written."""
-        return self._writer.refused_jobs + self._failed + self._unfinished
+        return self._writer.refused_jobs + self._failed + self._unfinished + self._unmade
 
     @property
     def loss_reason(self) -> str | None:
@@ -100,7 +104,9 @@ class LogWatcher:
             path.parent.mkdir(parents=True, exist_ok=True)
             for free in _free_names(path):
                 with suppress(FileExistsError):
-                    return create_file(free, live, partial(cls, free, line, live))
+                    log = create_file(free, live, partial(cls, free, line, live))
+                    log.simulated = is_simulated(header)
+                    return log
             raise AssertionError("unreachable")
         except OSError as error:
             raise InvalidValue(
@@ -172,11 +178,16 @@ class LogWatcher:
         if battery_v >= NO_BATTERY_READING_V:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
-        record = tick_record(tick, position_m, miss_m)
-        self.write(record)
+        record = None
+        try:
+            record = tick_record(tick, position_m, miss_m)
+            self.write(record)
+        except Exception as error:  # whatever it is: only this record is lost
+            self._unmade += 1
+            self._remember_unencodable(error)
         if tick.turn is not None:
             self.turn(tick.turn)
-        if self.recorder is not None:
+        if self.recorder is not None and record is not None:
             self.recorder.write_tick(record)
 
     def write(self, record: Mapping[str, Any]) -> None:
@@ -217,6 +228,8 @@ class LogWatcher:
             findings=report.findings,
             contact=report.contact,
             touchdown=report.touchdown,
+            simulated=self.simulated,
+            blames_profile=report.blames_profile,
         )
         self.end(summary.as_record())
         return replace(
@@ -271,14 +284,13 @@ class LogWatcher:
             self._remember(_explain(error))
         except Exception as error:  # whatever it is: the thread outlives its record
             self._failed += 1
-            why = str(error) or type(error).__name__
-            self.unencodable = self.unencodable or f"a record has no form in the flight log: {why}"
+            self._remember_unencodable(error)
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
             # What was waited for in vain is in the file by now.
             problem = None if self.problem == NO_ANSWER else self.problem
-            lost_records = self._writer.refused_jobs + self._failed
+            lost_records = self._writer.refused_jobs + self._failed + self._unmade
             lost = {"lost_records": lost_records, "problem": problem or self.unencodable}
             self._store(partial(encode_line, {"kind": "summary", **summary, **lost}))
         self._sync_to_disk()
@@ -293,6 +305,10 @@ class LogWatcher:
 
     def _remember(self, problem: str) -> None:
         self.problem = self.problem or problem
+
+    def _remember_unencodable(self, error: Exception) -> None:
+        why = str(error) or type(error).__name__
+        self.unencodable = self.unencodable or f"a record has no form in the flight log: {why}"
 
 
 def sent_line(sent: SentCommand) -> bytes:

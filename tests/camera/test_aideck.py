@@ -12,14 +12,17 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
+from perchctl.camera import open_camera
 from perchctl.camera.aideck import STALLED_S, AiDeckSource, MosaicFilter, has_mosaic, remove_mosaic
 from perchctl.camera.source import LiveSource
+from perchctl.errors import TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
 from tests.helpers.aideck import (
     AiDeck,
     Pause,
     bayer,
+    chunks,
     console,
     header,
     jpeg,
@@ -110,6 +113,7 @@ def test_a_picture_that_stalls_is_dropped(deck: AiDeck, read: Read) -> None:
 SMALLER = jpeg_packets(picture(80, (162, 122)))
 SIZE = int.from_bytes(SMALLER[0][-4:], "little")
 WHOLE = raw_packets(picture(80))
+WHOLE_JPEG = cv2.imencode(".jpg", picture(80))[1].tobytes()
 
 
 @pytest.mark.parametrize("fault", [
@@ -148,6 +152,67 @@ def test_it_connects_anew(end: list[bytes | threading.Event], deck: AiDeck, read
     after = next_frame(source)
     assert (level(after), after.index) == (160, 1), "the rest of the broken one is no picture"
     assert source.connections >= 2
+
+
+# --- What it says when no picture comes -------------------------------------------------------
+
+OFF_AND_ON = "switch the Crazyflie off and on"
+TRUNCATED = header(324, 244, len(WHOLE_JPEG) - 2, 1) + b"".join(chunks(WHOLE_JPEG[:-2]))
+DAMAGED = header(324, 244, 500, 1) + packet(b"\xff\xd8\xff\xe0" + bytes(496))
+NEVER_WHOLE = [
+    ([NEVER], f"connected, but it sends nothing: {OFF_AND_ON}"),
+    ([], f"connected, but the stream ends without a picture: {OFF_AND_ON}"),
+    ([console(), NEVER], "it sends, but no picture: does wifi-img-streamer run in the deck?"),
+    ([b"HTTP/1.1 200 OK\r\n", NEVER], "is not of Bitcraze's wifi-img-streamer: is that the"),
+    ([TRUNCATED, NEVER], "pictures come and are dropped (1 so far): the JPEG is not whole, its e"),
+    ([TRUNCATED * 3, NEVER], "pictures come and are dropped (3 so far)"),
+    ([DAMAGED, NEVER], "pictures come and are dropped (1 so far): the JPEG is damaged"),
+    ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "has 162x122 px, and its header"),
+    ([b"".join(WHOLE[:-1]) + packet(bytes(1020)), NEVER], "its header announces 79056"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("script", "words"), NEVER_WHOLE)
+def test_a_deck_without_a_whole_picture_is_not_called_a_receiver(
+    script: list[bytes | threading.Event], words: str, deck: AiDeck
+) -> None:
+    """It says what came, and advises what helps a deck; nothing else is known."""
+    for _ in range(20):
+        deck.scripts.put(script)
+    with pytest.raises(TimedOut) as refused:
+        open_camera(deck.url, Clock(), timeout_s=0.5)
+    text = str(refused.value)
+    assert words in text
+    assert text.startswith(f"{deck.url}: no first frame within 0.5 s: ") or "5 attempts" in text
+    assert "receiver" not in text
+
+
+def test_a_deck_that_is_not_there_is_not_told_to_be_switched(deck: AiDeck) -> None:
+    deck.close()
+    with pytest.raises(TimedOut, match="connection refused: is this computer in the deck's Wi-Fi"):
+        open_camera(deck.url, Clock(), timeout_s=0.3)
+
+
+@pytest.mark.parametrize("padding", [b"\0", bytes(2), bytes(700), b"\xff\xd9"])
+def test_what_stands_behind_a_jpeg_s_end_is_padding(
+    padding: bytes, deck: AiDeck, read: Read
+) -> None:
+    data = WHOLE_JPEG + padding
+    deck.scripts.put([header(324, 244, len(data), 1) + b"".join(chunks(data)), NEVER])
+    frame = next_frame(read())
+    assert level(frame) == 80
+    assert frame.encoded == WHOLE_JPEG
+
+
+def test_pictures_that_are_dropped_in_flight_are_named(deck: AiDeck, read: Read) -> None:
+    clock, go = Clock(), threading.Event()
+    deck.scripts.put([raw(picture(60)), go, TRUNCATED * 2, NEVER])
+    source = read(clock)
+    assert level(next_frame(source)) == 60
+    clock.t_s += 1.5
+    assert source.problem(clock.t_s) == f"{deck.url} has delivered no frame for 1.5 s"
+    go.set()
+    until(lambda: "are dropped (2 so far)" in (source.problem(clock.t_s) or ""))
 
 
 # --- A colour camera ----------------------------------------------------------------------

@@ -6,12 +6,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from perchctl.camera import open_camera
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     DeviceSource,
@@ -20,7 +22,7 @@ from perchctl.camera.device import (
     open_video_capture,
 )
 from perchctl.camera.source import LiveSource
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.waiting import until
@@ -184,3 +186,17 @@ def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> N
     assert (level(frame), frame.index, frame.t_arrival_s) == (160, 1, 102.0)
     assert source.problem(102.0) is None
     assert not again.released.is_set()
+
+
+@pytest.mark.parametrize(("read", "words"), [
+    (lambda: (False, None), "connected, but it sends nothing: if it is a receiver: is the camera"),
+    (lambda: (True, "torn"), r"pictures come and are dropped \(\d+ so far\): they cannot be dec"),
+])  # fmt: skip
+def test_a_camera_without_a_picture_says_what_came(
+    read: Callable[[], Any], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it is a receiver is not known."""
+    capture = SimpleNamespace(read=read, release=lambda: None)
+    monkeypatch.setattr("perchctl.camera.open.open_video_capture", lambda *_: capture)
+    with pytest.raises(TimedOut, match=f"camera:0: no first frame within 0.2 s: {words}"):
+        open_camera("camera:0", Clock(), timeout_s=0.2)

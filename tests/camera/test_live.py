@@ -31,6 +31,10 @@ def server(opened: list[LiveSource]) -> Iterator[MjpegServer]:
     server.close()
 
 
+NO_PIXELS = b"\xff\xd8\xff\xc0\x00\x11\x08\x00\x30\x00\x40\x01" + bytes(9) + b"\xff\xd9"
+"""A JPEG of 64x48 px whose structure is whole."""
+
+
 def stream(
     server: MjpegServer, clock: Clock, opened: list[LiveSource], **options: float
 ) -> MjpegSource:
@@ -139,7 +143,38 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     gate.set()
     until(lambda: source.problem(100.0) is not None)
     assert source.connections == 2 + source.max_failures
-    assert "gave no picture in 5 attempts: the stream ended" in str(source.problem(100.0))
+    assert "gave no picture in 5 attempts: connected, but the stream ends without a picture" in str(
+        source.problem(100.0)
+    )
+
+
+HTML = b"<html>the camera's page</html>"
+
+
+@pytest.mark.parametrize(("script", "words"), [
+    ([threading.Event()], "connected, but it sends nothing: does another program use it?"),
+    ([HTML, threading.Event()], "it sends no type, and no whole JPEG: is it the stream's own addr"),
+    ([part(jpeg(60)[:300]), threading.Event()], "it sends no type, and no whole JPEG"),
+    ([part(resized(jpeg(60), 5000, 4000)), threading.Event()], "pictures come and are dropped (1 "
+     "so far): they have 5000x4000 px"),
+    ([part(NO_PIXELS), threading.Event()], "pictures come and are dropped (1 so far): the "
+     "JPEG cannot be decoded"),
+])  # fmt: skip
+def test_a_stream_without_a_picture_says_what_came(
+    script: list[bytes | threading.Event], words: str, server: MjpegServer
+) -> None:
+    for _ in range(20):
+        server.scripts.put(script)
+    with pytest.raises(TimedOut) as refused:
+        open_camera(server.url, Clock(), timeout_s=0.4)
+    assert f"no first frame within 0.4 s: {words}" in str(refused.value)
+    assert "receiver" not in str(refused.value)
+
+
+def test_nobody_listens(server: MjpegServer) -> None:
+    server.close()
+    with pytest.raises(TimedOut, match="connection refused: is the address right, and is the cam"):
+        open_camera(server.url, Clock(), timeout_s=0.4)
 
 
 def test_no_first_frame_in_time(server: MjpegServer) -> None:

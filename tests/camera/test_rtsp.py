@@ -142,6 +142,17 @@ def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
     assert "secret" not in str(caught.value)
 
 
+def test_a_stream_without_a_picture_says_so(server: RtspServer, opened: list[LiveSource]) -> None:
+    never = threading.Event()
+    for _ in range(9):
+        server.scripts.put([never])
+    times_s = {"connect_timeout_s": 0.2, "read_timeout_s": 0.2}
+    source = begun(RtspSource(server.url(), 0.0, Clock()), opened, **times_s)
+    until(lambda: "first frame within 1 s: connected, but" in str(source.no_first_frame(1.0)))
+    assert "does another program use it?" in str(source.no_first_frame(1.0))
+    never.set()
+
+
 def test_what_piled_up_is_known_to_be_old() -> None:
     waiting = TransferDelay()
     for k in range(50):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -23,11 +25,11 @@ from perchctl.campaign import (
     rate_text,
 )
 from perchctl.campaign.results import ENDS, worst_first
-from perchctl.errors import Interrupted, SafetyAbort
+from perchctl.errors import Interrupted, LogIncomplete, SafetyAbort
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.simulate import print_log_folder, run_campaign
+from perchctl.commands.simulate import run_campaign
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT, short_profile
 from tests.helpers.results import aborted, landed, perched
@@ -116,9 +118,28 @@ def test_with_nothing_flown_there_is_nothing_to_report() -> None:
         run_campaign(lambda *_: None, pytest.fail, 2, nullcontext(None))  # type: ignore[arg-type]
 
 
-def test_logs_that_lack_something_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
-    print_log_folder([PERCHED, replace(PERCHED, log_problem="no space left")], Path("logs"))
-    assert capsys.readouterr().err.endswith("1 of 2 logs are incomplete: no space left\n")
+@pytest.mark.parametrize("faults", [(), ("--faults", "disk-full")])
+@pytest.mark.parametrize("lost", [0, 1])
+def test_logs_that_lack_something_are_an_error(
+    lost: int, faults: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A campaign for its logs has not done what was asked."""
+    flown: list[Any] = [PERCHED, replace(PERCHED, seed=9, log_problem="no space left")]
+
+    def fly_all(
+        _fly: object, seeds: object, _executor: object, note: Callable[[Any], None]
+    ) -> None:
+        for result in flown[: 1 + lost]:
+            note(result)
+
+    monkeypatch.setattr("perchctl.campaign.fly_all", fly_all)
+    for name in ("fault_summary", "fault_table"):
+        monkeypatch.setattr(f"perchctl.faults.{name}", lambda results: {})
+    said = run("simulate", "-n", str(1 + lost), "--log-dir", str(tmp_path), "--json", *faults)
+    assert said.code == (LogIncomplete.exit_code if lost else 0)
+    sentence = "1 of 2 logs are incomplete: no space left"
+    assert (sentence in said.stderr) == bool(lost)
+    assert json.loads(said.stdout).get("error") == (sentence if lost else None)
 
 
 def test_where_none_took_off_it_is_not_the_seeds() -> None:

@@ -23,7 +23,7 @@ from perchctl.check import Row, Verdict, camera
 from perchctl.check import profile as of_profile
 from perchctl.check.rehearsal import Rehearsal, rehearse
 from perchctl.check.row import Finding, evaluate_row
-from perchctl.errors import NotFound
+from perchctl.errors import NotFound, TimedOut
 from perchctl.faults.edges import CameraFault, FaultyCamera
 from perchctl.faults.effects import FOR_EVER
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
@@ -227,13 +227,36 @@ def test_what_a_camera_delivers_otherwise_makes_its_row(
 
 @pytest.mark.parametrize(("text", "advice"), [
     ("camera:7 was not found; there are camera:0; plug in the camera", "plug in the camera"),
-    ("http://x: no answer", "--cameras lists"),
+    ("http://x: no answer", "see docs/check.md"),
+    ("camera:0 cannot be opened", "--cameras lists"),
 ])  # fmt: skip
 def test_a_missing_camera_skips_the_rest(text: str, advice: str) -> None:
     first, *rest = camera.failed_camera_rows(NotFound(text), PROFILE)
     assert (first.name, first.verdict) == ("camera", Verdict.FAIL)
     assert advice in first.advice
+    assert text.startswith("camera:") or "--cameras" not in first.advice
     assert {r.verdict for r in rest} == {Verdict.SKIPPED}
+
+
+@pytest.mark.parametrize(("scheme", "gone", "lossy"), [
+    ("camera", "plug", "receiver"), ("aideck", "switch the Crazyflie off and on", "the deck"),
+    ("http", "switch the camera off and on", "network"), ("sim", "start it again", "close other"),
+])  # fmt: skip
+def test_the_advice_fits_the_kind_of_source(scheme: str, gone: str, lossy: str) -> None:
+    """An AI-deck has no receiver, and a simulated camera no cable."""
+    silent, nothing = altered(scheme=scheme, silent_s=2.0), Rehearsal(live=True, scheme=scheme)
+    assert gone in rows_of(silent)["lost frames"].advice
+    assert gone in rows_of(nothing)["frame rate"].advice
+    late = altered(scheme=scheme, arrivals=gaps(*[0.03] * 20, 0.7))
+    assert lossy in rows_of(late)["lost frames"].advice
+
+
+def test_the_advice_of_an_error_is_the_row_s() -> None:
+    error = TimedOut("aideck://x: no first frame within 8 s: connected: switch it off and on")
+    error.advice = "switch it off and on"
+    first, *_ = camera.failed_camera_rows(error, PROFILE)
+    assert first.found == "aideck://x: no first frame within 8 s: connected"
+    assert first.advice == "switch it off and on"
 
 
 # --- The rehearsal itself, and the computer ---------------------------------------------

@@ -15,7 +15,13 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import Row, Verdict
 from perchctl.check.row import evaluate_rows
-from perchctl.check.vehicle import VEHICLE, VehicleStatus, query_vehicle
+from perchctl.check.vehicle import (
+    BUSY_ADVICE,
+    VEHICLE,
+    VehicleStatus,
+    query_vehicle,
+    wake_delays,
+)
 from perchctl.link import ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim import Scenario, SimProcess
@@ -35,6 +41,7 @@ from perchctl.vehicle import (
 )
 from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
 from tests.helpers.mission import BY_TARGET, MOCAP, READY
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.long
 
@@ -145,6 +152,8 @@ GOOD = VehicleStatus(
 
 
 TWO_CELLS_V = (4.5, 6.05, 8.38)  # down to the protection of each cell; empty; full
+
+
 def running_away(mps: float) -> list[Telemetry]:
     """Five seconds in which the estimate leaves while the accelerometer reads 1 g."""
     times = (0.01 * k for k in range(501))
@@ -193,6 +202,40 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
     ("battery", "fail", {"telemetry": said(battery_v=0.0)}),
     ("battery", "fail", {"telemetry": said(battery_behind_s=3.0)}),
 ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("uri", "words"), [
+    ("radio://0/80/2M/E7E7E7E7E7", "bring the radio nearer"), ("usb://0", "cable"),
+    ("udp://10.0.0.7:2390", "network"), ("sim://", "simulated vehicle runs on this computer"),
+])  # fmt: skip
+def test_the_advice_fits_the_kind_of_link(uri: str, words: str) -> None:
+    """No radio is brought nearer where there is none."""
+    good = replace(GOOD, uri=uri, link_quality=None)
+    for bad_s in ([0.004] * 80 + [math.inf] * 20, [math.inf] * 100, [0.2] * 100):
+        (row,) = (
+            r for n, r in rows_of(replace(good, round_trips_s=bad_s)).items() if n == "packets"
+        )
+        assert row.verdict is Verdict.FAIL
+        assert words in row.advice
+        assert ("radio" in row.advice) == uri.startswith("radio")
+
+
+def test_a_busy_computer_is_named_where_it_explains_the_late_packets() -> None:
+    late = replace(GOOD, round_trips_s=[0.09] * 100, wake_delays_s=[0.001] * 50)
+    assert "computer" not in rows_of(late)["packets"].found
+    row = rows_of(replace(late, wake_delays_s=[0.001] * 90 + [0.06] * 10))["packets"]
+    assert row.verdict is Verdict.WARN or row.verdict is Verdict.FAIL
+    assert row.found.endswith("this computer late by 60 ms")
+    assert row.advice == BUSY_ADVICE
+    # What is lost is not lost by being late.
+    lost = replace(late, round_trips_s=[0.004] * 80 + [math.inf] * 20, wake_delays_s=[0.06] * 50)
+    assert "bring the radio nearer" in rows_of(lost)["packets"].advice
+
+
+def test_how_late_this_computer_wakes_is_measured() -> None:
+    with wake_delays() as delays_s:
+        until(lambda: len(delays_s) > 3)
+    assert min(delays_s) >= 0.0
 
 
 @pytest.mark.parametrize(("name", "verdict", "changes"), ALONE)

@@ -11,8 +11,8 @@ from tests.helpers.recording import camera
 
 
 @pytest.fixture
-def stops() -> list[str]:
-    """One entry for each time that STOP has been pressed."""
+def ordered() -> list[str]:
+    """The orders of the page's buttons, as often as they were pressed."""
     return []
 
 
@@ -23,9 +23,13 @@ def clock() -> list[float]:
 
 
 @pytest.fixture
-def page(stops: list[str], clock: list[float]) -> Iterator[LivePage]:
+def page(ordered: list[str], clock: list[float]) -> Iterator[LivePage]:
     served = LivePage(
-        camera(), "perchctl test", on_stop=lambda: stops.append("STOP"), clock=lambda: clock[0]
+        camera(),
+        "perchctl test",
+        lambda: ordered.append("land"),
+        lambda: ordered.append("cut"),
+        clock=lambda: clock[0],
     )
     yield served
     served.close()

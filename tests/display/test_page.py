@@ -1,4 +1,4 @@
-"""The live page over HTTP: picture and numbers, who may ask for them, and what STOP accepts."""
+"""The live page over HTTP: picture and numbers, who may ask, and what its buttons accept."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ import pytest
 
 from perchctl.display import LivePage, Sketch
 from perchctl.display.live import TOKEN_HEADER, draw_sketch
-from tests.helpers.live_page import CORNERS, ask, stop
+from tests.helpers.live_page import CORNERS, ask, press
 from tests.helpers.recording import camera
+
+BUTTONS = ("land", "cut")
 
 
 def test_the_page_needs_nothing_from_elsewhere(page: LivePage) -> None:
@@ -73,11 +75,11 @@ def test_an_axis_behind_the_camera_and_a_wild_corner_are_left_out() -> None:
     assert (draw_sketch(Sketch(image, wild, pose), camera()) == 110).all()
 
 
-def test_without_stop_there_is_none() -> None:
+def test_a_page_without_a_flight_has_no_buttons() -> None:
     page = LivePage(camera(), "t")
     try:
-        assert json.loads(ask(page.url, "/state")[1])["stop"] == "none"
-        assert stop(page.url, page.token) == 403
+        assert json.loads(ask(page.url, "/state")[1])["orders"] == "none"
+        assert [press(page.url, page.token, name) for name in BUTTONS] == [403, 403]
     finally:
         page.close()
 
@@ -97,16 +99,32 @@ def test_what_fails_is_remembered_and_not_raised(page: LivePage) -> None:
 # --- who may do what --------------------------------------------------------------------
 
 
-def test_stop_needs_the_token(page: LivePage, stops: list[str]) -> None:
-    for token in ("", "wrong", "w\xf6rng"):
-        assert stop(page.url, token) == 403
-    assert ask(page.url, f"/stop?token={page.token}", "POST")[0] == 403  # a form can send that
-    assert ask(page.url, "/stop", "GET", **{TOKEN_HEADER: page.token})[0] == 404
-    assert stops == []
-    for _ in range(3):  # again changes nothing
-        assert stop(page.url, page.url.partition("token=")[2]) == 200
-    assert stops == ["STOP"]
-    assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
+def test_a_button_needs_the_token(page: LivePage, ordered: list[str]) -> None:
+    for button in BUTTONS:
+        for token in ("", "wrong", "w\xf6rng"):
+            assert press(page.url, token, button) == 403
+        # A form can send that.
+        assert ask(page.url, f"/{button}?token={page.token}", "POST")[0] == 403
+        assert ask(page.url, f"/{button}", "GET", **{TOKEN_HEADER: page.token})[0] == 404
+    assert press(page.url, page.token, "stop") == 404
+    assert ordered == []
+    for button in BUTTONS:
+        assert press(page.url, page.url.partition("token=")[2], button) == 200
+        assert ordered.pop() == button
+        assert json.loads(ask(page.url, "/state")[1])["orders"] == button
+    assert press(page.url, page.token) == 200  # after the cut landing changes nothing
+    assert json.loads(ask(page.url, "/state")[1])["orders"] == "cut"
+
+
+def test_an_order_that_fails_is_not_shown_as_given() -> None:
+    page = LivePage(camera(), "t", lambda: None, lambda: 1 / 0)  # type: ignore[arg-type]
+    try:
+        with pytest.raises(http.client.RemoteDisconnected):
+            press(page.url, page.token, "cut")
+        assert json.loads(ask(page.url, "/state")[1])["orders"] == "ready"
+        assert page.problem == "ZeroDivisionError: division by zero"
+    finally:
+        page.close()
 
 
 @pytest.mark.parametrize(
@@ -119,9 +137,13 @@ def test_a_foreign_host_is_refused(page: LivePage, host: str) -> None:
         assert page.token.encode() not in body
 
 
-def test_stop_refuses_a_foreign_host_and_origin(page: LivePage, stops: list[str]) -> None:
-    assert stop(page.url, page.token, Host="evil.example") == 403
-    assert stop(page.url, page.token, Origin="http://evil.example") == 403
-    assert stop(page.url, page.token, Origin="null") == 403
-    assert stops == []
-    assert stop(page.url, page.token, Origin="http://localhost:9", Host="localhost:9") == 200
+@pytest.mark.parametrize("button", BUTTONS)
+def test_a_button_refuses_a_foreign_host_and_origin(
+    page: LivePage, ordered: list[str], button: str
+) -> None:
+    url, token = page.url, page.token
+    assert press(url, token, button, Host="evil.example") == 403
+    assert press(url, token, button, Origin="http://evil.example") == 403
+    assert press(url, token, button, Origin="null") == 403
+    assert ordered == []
+    assert press(url, token, button, Origin="http://localhost:9", Host="localhost:9") == 200

@@ -1,8 +1,10 @@
-"""The live page of a flight: what it shows, how old that is, what STOP does, and how it ends."""
+"""The live page of a flight: what it shows, how old that is, what its buttons do, and its end."""
 
 from __future__ import annotations
 
 import json
+import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,16 +15,24 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.commands.fly import flight_page
-from perchctl.display import FlightPage, LivePage, Sketch
+from perchctl.display import FlightPage, FlightPanel, LivePage, Sketch
 from perchctl.display.live import LAST_READ_S
 from perchctl.errors import Interrupted
 from perchctl.flight import FlyOptions, OperatorSwitch
-from perchctl.flight.operator import AGAIN_S, HELD_S
-from perchctl.mission import FlightReport, Operator, Outcome, Phase, Watcher
+from perchctl.mission import (
+    Event,
+    FlightReport,
+    Operator,
+    Outcome,
+    Phase,
+    Rest,
+    RestState,
+    Watcher,
+)
 from perchctl.profile import load_profile
 from perchctl.vision import Frame, MarkerPose, PipelineOutput
 from perchctl.vision.types import Detection, Detections, Stage
-from tests.helpers.live_page import CORNERS, ask, stop, tick
+from tests.helpers.live_page import CORNERS, ask, press, tick
 from tests.helpers.mission import entered, note
 
 START_S = 100.0
@@ -88,6 +98,10 @@ def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     flight.watch_source(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
+    torn = Frame(0, 0.0, None)  # type: ignore[arg-type]
+    page._changed = None  # type: ignore[assignment]
+    assert FlightPage(page, 0.15, 0.03).watch_source(one_frame(torn)).poll(0.0) is torn
+    page._changed = threading.Condition()
     assert flight.problem is None
     flight.tick(tick(1.0, output="no output"))
     state_of(page)
@@ -115,35 +129,34 @@ def test_after_the_flight_nothing_is_due_and_nothing_to_stop(
     page: LivePage, clock: list[float], phase: Phase
 ) -> None:
     flight = FlightPage(page, 0.15, 0.03)
-    assert stop(page.url, page.token) == 200
+    assert press(page.url, page.token) == 200
     flight.tick(tick(START_S))
-    assert state_of(page)["stop"] == "requested"
+    assert state_of(page)["orders"] == "land"
     flight.tick(tick(START_S + 1.0, phase.value))
     clock[0] += 9.0
     state = state_of(page)
-    assert (state["age_s"], state["stop"]) == (None, "over")
+    assert (state["age_s"], state["orders"]) == (None, "over")
 
 
-# --- STOP ------------------------------------------------------------------------------------
+# --- the buttons -----------------------------------------------------------------------------
 
 OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 
 
-def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
-    now_s = [100.0]
-    switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])
+def test_land_is_one_ctrl_c_and_never_two_and_cut_motors_stops_at_once(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    switch = OperatorSwitch(listening=True)
     with flight_page(OPTIONS, True, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
         for _ in range(2):
-            assert stop(flight.page.url, flight.page.token) == 200
+            assert press(flight.page.url, flight.page.token) == 200
             assert switch.read() is Operator.LAND
         switch.press()
-        assert switch.read() is Operator.LAND  # the first Ctrl-C repeats STOP
-        now_s[0] += AGAIN_S
-        switch.press()
-        now_s[0] += HELD_S
+        assert switch.read() is Operator.LAND  # the first Ctrl-C repeats Land
+        assert press(flight.page.url, flight.page.token, "cut") == 200
         assert switch.read() is Operator.STOP
 
 
@@ -159,11 +172,12 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     flight.fail(Interrupted("interrupted before take-off"), None)
     card = state_of(page)["card"]
     assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
-    flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
+    found = Rest(RestState.UNKNOWN)
+    flight.event(Event.of_rescue(START_S, RuntimeError(), found.state, found.text))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
     flight.fail(RuntimeError("boom"), tmp_path)
     rows = state_of(page)["card"]["rows"]
-    assert rows[0][1].endswith("the motors are off")
+    assert rows[0][1] == f"RuntimeError in flight: {RestState.UNKNOWN.value}"
     assert "report" in dict(rows)
     assert waited_s == [LAST_READ_S]  # for somebody who looks, as at the second end
 
@@ -190,8 +204,14 @@ def last_state(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_the_page_of_a_flight_ends_with_its_card(
-    options: FlyOptions, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
+    options: FlyOptions,
+    monkeypatch: pytest.MonkeyPatch,
+    last_state: dict[str, Any],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """And what fell silent on the way is named."""
+    monkeypatch.setattr(FlightPanel, "_draw_once", lambda self: 1 / 0)
+
     def session(_options: object, log: Watcher, display: Watcher, *more: Any) -> Any:
         _switch, page, asks = more
         assert not asks
@@ -201,10 +221,13 @@ def test_the_page_of_a_flight_ends_with_its_card(
         report = FlightReport(
             Phase.LANDED, Outcome.TARGET_NOT_FOUND, "target not found", 0, 9.0, False
         )
-        return report, None
+        return replace(report, detached=("a callback was detached",)), None
 
     monkeypatch.setattr(fly, "_session", session)
     assert fly.fly_and_report(options, as_json=False, view=True) == 50
+    said = capsys.readouterr().err
+    assert "perchctl: the display fell silent: ZeroDivisionError" in said
+    assert "perchctl: a callback was detached" in said
     card = last_state["card"]
     assert card["outcome"] == "LANDED"
     assert card["reason"].startswith("target not found")

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from perchctl.display import FlightPanel
 from perchctl.display.panel import status_panel, status_rows
+from perchctl.flight import KEY_HELP, STOP_HELP
 from perchctl.mission import Phase
 from tests.helpers.live_page import tick
 from tests.helpers.mission import entered, held, note
@@ -69,9 +70,11 @@ def test_a_new_phase_is_shown_without_waiting_and_the_last_one_stays(
 def test_the_panel_on_a_terminal(terminal: Terminal) -> None:
     reporter = FlightPanel(terminal)
     reporter.event(note(100.0, "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b"))
+    reporter.help = STOP_HELP, KEY_HELP
     reporter.tick(tick(phase="LANDING"))
     reporter.close()
     assert reporter.failure is None
+    assert STOP_HELP in terminal.getvalue()
     text = ESCAPE.sub("", terminal.getvalue())
     assert "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b" in text
     assert "x -12.3  y +4.5  z +123.4 cm   yaw -166.2 deg" in text
@@ -110,8 +113,10 @@ def test_the_panel_fits_into_80_columns(changes: dict[str, Any]) -> None:
     shown = tick(**changes)
     console = Console(width=80, file=io.StringIO(), highlight=False, markup=False)
     with console.capture() as capture:
-        console.print(status_panel(shown))
+        console.print(status_panel(shown, STOP_HELP, KEY_HELP))
     lines = capture.get().splitlines()
+    assert STOP_HELP in lines[-1]
+    assert KEY_HELP in lines[0]
     assert len(lines) == 8
     assert max(Text(line.rstrip()).cell_len for line in lines) + len("^C") <= 80
     for name, _ in status_rows(shown):

@@ -62,11 +62,11 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
     for seed in range(50):
         case = draw_fault_case(BY_NAME[name], Phase.ALIGN, np.random.default_rng(seed), SCENARIO)
         presses_s = case.effects[0].keywords["presses_s"]
-        # It is asked the time at each press, and once more when it is read.
-        times_s = iter((*presses_s, presses_s[-1]))
-        switch = OperatorSwitch(listening=True, clock=times_s.__next__)
-        for _ in presses_s:
+        now_s = [0.0]
+        switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])  # noqa: B023
+        for now_s[0] in presses_s:
             switch.press()
+        now_s[0] += 1.0
         assert (switch.read() is Operator.STOP) is stops
         assert (emergency_stop_s(presses_s) is not None) is stops
 

@@ -251,7 +251,7 @@ def test_a_landing_that_was_to_be_seen_is_not_unconfirmed(
     assert script.show(truth, 0.6, **changes).flags == flags
 
 
-# --- the end, the second Ctrl-C, the lock -------------------------------------------------------
+# --- the end, the order to cut, the lock ----------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -276,16 +276,17 @@ def every(period_s: float, for_s: float) -> list[float]:
     [
         ([], None),
         ([3.0], None),
-        ([3.0, 3.4], None),
-        ([3.0, 3.6], 3.6),
-        ([3.0, 3.2, 3.4, 3.6], None),
-        ([3.0, 3.2, 3.4, 3.8], 3.8),
-        (every(0.03, 1.9), None),
-        (every(0.14, 1.9), None),
-        (every(0.1, 2.5), 2.0),
+        ([3.0, 3.2], None),
+        ([3.0, 3.4], 3.63),
+        ([3.0, 4.2], 4.2),
+        ([3.0, 3.2, 3.4], 3.4),
+        ([3.0, 3.5, *(3.53 + 0.03 * k for k in range(14))], None),
+        ([3.0, 3.5, *(3.53 + 0.03 * k for k in range(20))], 4.01),
+        (every(0.14, 1.9), 0.28),
+        (every(0.33, 1.9), 0.56),
     ],
 )
-def test_which_press_is_the_second(presses_s: list[float], second_s: float | None) -> None:
+def test_when_presses_order_a_stop(presses_s: list[float], second_s: float | None) -> None:
     found_s = emergency_stop_s(presses_s)
     assert found_s == (None if second_s is None else pytest.approx(second_s))
 

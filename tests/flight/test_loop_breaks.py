@@ -12,7 +12,7 @@ import pytest
 
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
-from perchctl.mission import EventKind, Operator, Outcome, Phase, Tick
+from perchctl.mission import EventKind, Operator, Outcome, Phase, RestState, Tick
 from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS
 from perchctl.perception import perception
 from perchctl.profile import Profile
@@ -131,6 +131,7 @@ def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> 
     assert link.own == []  # no setpoint that would take the landing back
     said = rig.watcher.events[-1]
     assert said.kind is EventKind.NOTE
+    assert (said.rest is RestState.UNSEEN) is not heard
     assert "Broken in flight" in said.reason
     assert ("motors are off" in said.reason) is heard
     assert ("could not be confirmed" in said.reason) is not heard

@@ -57,7 +57,7 @@ def broken(rig: Rig, error: type[BaseException], told: Told | None = None) -> To
     """A flight that ends by that error."""
     told = told or Told()
     with pytest.raises(error):
-        fly(replace(rig.parts(), watchers=(told,)))
+        fly(replace(rig.parts(), judges=(told,)))
     return told
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -288,6 +290,47 @@ def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
     rig.operator = Operator.STOP
     cuts = [rig.poll(0.2 + 0.05 * i, None) for i in range(1000)]
     assert cuts.count(EmergencyStop()) == MAX_CUTS
+
+
+# --- two threads ---------------------------------------------------------------------------------
+
+
+class Noting(Watchdog):
+    """Notes which fields are written."""
+
+    def __init__(self, operator: Callable[[], Operator]) -> None:
+        object.__setattr__(self, "written", set())
+        super().__init__(PROFILE, operator)
+        self.written.clear()
+
+    def __setattr__(self, name: str, value: object) -> None:
+        self.written.add(name)
+        super().__setattr__(name, value)
+
+    def take(self) -> set[str]:
+        written, self.written = self.written, set()
+        return written - {"written"}
+
+
+def test_no_field_is_written_by_both_threads() -> None:
+    """They share no lock: what both wrote, one of them could undo."""
+    by_loop: set[str] = set()
+    by_link: set[str] = set()
+    for order, command in itertools.product(Operator, (HOVER, EmergencyStop())):
+        rig = Rig()
+        rig.operator = order
+        rig.dog = dog = Noting(partial(getattr, rig, "operator"))
+        rig.turn(T_S, command)
+        by_loop |= dog.take()
+        for silent_s in (0.02, 0.15, 0.5, 1.1, 1.3):
+            rig.after(silent_s)
+        by_link |= dog.take()
+        dog.note_rescue()
+        dog.end(motors_off=True)
+        by_loop |= dog.take()
+    assert {"_last", "_closing", "_motors_off"} < by_loop
+    assert {"_held", "_way_down", "_cuts", "overruled_s"} < by_link
+    assert not by_loop & by_link
 
 
 # --- a position from outside that has stopped coming -------------------------------------

@@ -86,7 +86,12 @@ class Client:
             raise RuntimeError("subject table changed")
         if self.fault == "prints":
             os.write(2, b"Unrecognized Packet Type." * 4000)
-        time.sleep(3e-4 if self.fault == "floods" else 0.002)
+        if self.fault == "pauses" and self.count % 400 == 0:
+            time.sleep(0.15)
+        if self.fault == "bursts":
+            time.sleep(0.0 if self.count % 12 else 0.15)
+            return
+        time.sleep({"floods": 3e-4, "slow": 0.15}.get(self.fault, 0.002))
 
     @property
     def rigidBodies(self):

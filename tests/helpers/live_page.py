@@ -1,4 +1,4 @@
-"""What the tests of the displays share: a moment of a flight, asking the page, and its STOP."""
+"""What the tests of the displays share: a moment of a flight, asking the page, and its buttons."""
 
 from __future__ import annotations
 
@@ -55,5 +55,6 @@ def ask(
         connection.close()
 
 
-def stop(url: str, token: str, **headers: str) -> int:
-    return ask(url, "/stop", "POST", **{TOKEN_HEADER: token}, **headers)[0]
+def press(url: str, token: str, button: str = "land", **headers: str) -> int:
+    """The status that a button, ``land`` or ``cut``, is answered with."""
+    return ask(url, f"/{button}", "POST", **{TOKEN_HEADER: token}, **headers)[0]

@@ -22,6 +22,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
+    Rest,
     SentCommand,
     Tick,
 )
@@ -248,7 +249,7 @@ class Camera:
 
 @dataclass
 class Watcher:
-    """Remembers what it saw; `on_tick` may raise, or steer."""
+    """Remembers what it saw; `on_tick` may steer, or raise, which ends the flight of a `Rig`."""
 
     on_tick: Callable[[Tick], None] = lambda tick: None
     ticks: list[Tick] = field(default_factory=list)
@@ -283,15 +284,15 @@ class Rig:
             self.clock or Clock(self.link),
             self.profile,
             self.setup,
-            (self.watcher,),
-            self.operator,
+            operator=self.operator,
             positions=self.positions,
+            judges=(self.watcher,),
         )
 
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> str:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rest:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
+from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import Findings
+from perchctl.mission import PROFILE_ROWS, Findings
+from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraErrors
 
@@ -43,3 +47,18 @@ def test_only_what_is_surely_beyond_its_gate_is_an_advice(
     assert found.latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)
     assert bool(found.advice) is bool(words)
     assert words in "".join(found.advice)
+    # The scenario's camera is nobody's: it says nothing of the profile.
+    dreamt = Findings.of(seen, camera, simulated=True)
+    assert dreamt == replace(found, advice=())
+
+
+def test_each_row_that_blames_the_profile_is_known() -> None:
+    """By what its function says: a row that names keys of camera or positioning, or how to measure
+    them, is one."""
+    blames = {
+        row.name
+        for row in TABLE
+        if callable(row.reason)
+        and re.search(r"camera\.(mount|latency)|check --lift", inspect.getsource(row.reason))
+    }
+    assert blames == PROFILE_ROWS

@@ -342,6 +342,22 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     assert (state.phase, state.row, state.outcome) == (P.PERCHED, "hung-but-locked", O.OPERATOR)
 
 
+def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
+    """No cause is: a wind, a weak motor and a wrong gain look alike from here."""
+    sample = at(velocity_mps=(0.3, 0.0, 0.0))(BEGIN_S)
+    x_m, y_m, z_m = sample.telemetry.position_m
+    state = replace(
+        state_in(P.RECOVER), entered_s=0.0, setpoint=PositionSetpoint(x_m + 0.31, y_m, z_m, 0.0)
+    )
+    context = planner.Context(state, sample, PROFILE)
+    row = first_transition(context, TABLE)
+    assert row is not None
+    text = row.reason_text(context)
+    assert text.startswith("not steady 6 s after the attempt: it moves at 0.30 m/s, it is 0.31 m")
+    hangs = planner.Context(replace(state, contact_z_m=z_m), sample, PROFILE)
+    assert row.reason_text(hangs).endswith("it has not come away from its contact")
+
+
 # --- severity ------------------------------------------------------------------------------
 
 ROGUE = Transition("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")

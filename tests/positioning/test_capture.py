@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,7 +20,7 @@ import perchctl
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.positioning import PositionFeed, open_capture
 from perchctl.positioning import capture as capture_module
-from perchctl.positioning.capture import CaptureSetup, MotionCapture, capture_setup
+from perchctl.positioning.capture import CaptureSetup, LateFrames, MotionCapture, capture_setup
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 from tests.helpers.capture import LIBRARY
@@ -125,6 +127,45 @@ def test_what_ends_on_the_way_is_named_and_closing_ends_the_process(
     capture.close()
     assert capture._child.poll() is not None
     assert not any(thread.is_alive() for thread in capture._threads)
+
+
+@pytest.mark.parametrize(("waits_s", "counts"), [
+    ([0.01] * 3 + [0.12, *[1e-5] * 11] * 3 + [0.12], [0, 12, 12, 12]),
+    ([0.2] * 4, [0, 1, 1, 1]),
+    ([0.01] * 30 + [0.12] + [0.01] * 30 + [0.12], [0, 0]),
+])  # fmt: skip
+def test_the_frames_between_two_pauses_are_counted(
+    waits_s: list[float], counts: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, sent = Clock(), list[object]()
+    monkeypatch.setattr(capture_module, "time", SimpleNamespace(monotonic=clock))
+    channel: Any = SimpleNamespace(send=sent.append)
+    with pytest.raises(RuntimeError):
+        capture_module._pass_on(Client(clock, waits_s), channel, False)
+    assert [late.count for late in sent if isinstance(late, LateFrames)] == counts
+
+
+@pytest.mark.parametrize(("fault", "words"), [
+    ("bursts", r"vicon:bursts sends its frames late, in bursts \(12 at once after 0\.1\d s\), and "
+     "late frames are not used; connect it by cable"),
+    ("slow", r"vicon:slow sends a frame only every 0\.1\d s, and such frames are not used; set it"),
+])  # fmt: skip
+def test_frames_that_come_late_are_not_called_silence(
+    faulty: Callable[..., MotionCapture], fault: str, words: str
+) -> None:
+    """They come, and each may be old; what helps is not what helps against silence."""
+    with contextlib.suppress(ConnectionFailed):  # a burst that is slow by chance has a good frame
+        capture = faulty(fault, timeout_s=1.0)
+        until(lambda: re.search(words, problem(capture)))
+        return
+    with pytest.raises(ConnectionFailed, match=words):
+        faulty(fault, timeout_s=1.0)
+
+
+def test_one_pause_is_no_burst(faulty: Callable[..., MotionCapture]) -> None:
+    capture = faulty("pauses")
+    until(lambda: "has paused for 0.1" in problem(capture))
+    until(lambda: problem(capture) == "")
 
 
 def test_a_flood_of_frames_fills_nothing(faulty: Callable[..., MotionCapture]) -> None:
@@ -286,10 +327,11 @@ def test_what_waited_in_the_library_s_queue_is_not_passed_on_as_new(
     """After a pause come the frames of the pause, one upon the other, the oldest first."""
     clock, sent = Clock(), list[tuple[float, object]]()
     monkeypatch.setattr(capture_module, "time", SimpleNamespace(monotonic=clock))
-    steady, queued = [0.01] * 3, [0.5, 1e-5, 1e-5, 1e-5]
+    steady, queued = [0.01] * 3, [0.5, 1e-5, 1e-5, 9e-4]
     channel: Any = SimpleNamespace(send=sent.append)
     with pytest.raises(RuntimeError):
         capture_module._pass_on(Client(clock, steady + queued + steady), channel, False)
     begun_s = 100.0 + sum(steady) + sum(queued)
+    assert sent.pop(3) == LateFrames(0, pytest.approx(0.5))
     assert len(sent) == 2 * len(steady)
     assert not [t_s for t_s, _ in sent if 100.0 + sum(steady) + 1e-6 < t_s <= begun_s + 1e-6]

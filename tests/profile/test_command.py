@@ -103,6 +103,19 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
     assert one.link.uri.startswith("radio://")
 
 
+@pytest.mark.parametrize(("confirmed", "code"), [
+    ("\n", 0), ("y\n", 0), ("YES\n", 0), ("n\n", 2), ("No\n", 2), ("quit\n", 2), ("", 2),
+    ("nope\nn\n", 2), ("nope\n\n", 0), ("back\n\n\n", 0),
+])  # fmt: skip
+def test_nothing_is_written_after_a_no(confirmed: str, code: int, tmp_path: Path) -> None:
+    output = tmp_path / "mine.yaml"
+    done = new(output, typed="\n" * len(QUESTIONS) + confirmed)
+    assert done.exit_code == code
+    assert output.exists() is (code == 0)
+    assert ("nothing was written" in done.stderr) is (code != 0)
+    assert ("found 'nope'" in done.stderr) is ("nope" in confirmed)
+
+
 @pytest.mark.parametrize("front", sorted(PICTURE_EDGES))
 def test_a_mirrored_picture_is_named(front: str, tmp_path: Path) -> None:
     plain, mirrored = left_edges(front)

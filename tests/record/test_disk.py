@@ -8,6 +8,7 @@ import json
 import os
 import threading
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ import pytest
 from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions
-from perchctl.mission import FlightReport, Outcome, Phase, SentCommand
+from perchctl.mission import FlightReport, Outcome, Phase, PlannerState, SentCommand
 from perchctl.profile import apply_settings, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
-from perchctl.vehicle import EmergencyStop
+from perchctl.vehicle import EmergencyStop, Idle
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
 from tests.helpers.waiting import stopwatch
@@ -90,6 +91,19 @@ def test_a_record_without_a_form_costs_itself_alone(
     end = read_log(log.path).summary
     assert end is not None
     assert (end["lost_records"], end["problem"]) == (1, summary.log_problem)
+
+
+def test_a_tick_without_a_form_costs_itself_alone(tmp_path: Path) -> None:
+    """A log that raised would be left out of its flight."""
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
+    good = synthetic.tick(1.0, synthetic.telemetry(), Idle(), PlannerState())
+    for tick in (good, replace(good, t_s=1.02, command="fly!"), replace(good, t_s=1.04)):  # type: ignore[arg-type]
+        log.tick(tick)
+    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
+    assert [r["t_s"] for r in read_log(log.path).records] == [1.0, 1.04]
+    assert summary is not None
+    assert summary.lost_records == 1
+    assert "no form" in (summary.log_problem or "")
 
 
 @pytest.mark.parametrize("live", [False, True])
@@ -226,3 +240,23 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
     told = json.loads(said.out)
     assert (told["exit_code"], told["lost_records"]) == (code, int(full))
     assert ("No space left on device" in said.err) is full
+
+
+@pytest.mark.parametrize(("outcome", "code"), [(Outcome.PERCHED, 30), (Outcome.SAFETY, 52)])
+def test_a_result_that_stdout_does_not_take_is_in_the_exit_code(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    outcome: Outcome,
+    code: int,
+) -> None:
+    def session(*_: Any) -> Any:
+        return FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False), None
+
+    quiet = apply_settings(load_profile("sim"), ["log.plot=false"])
+    options = FlyOptions(quiet, Path("sim.yaml"), "sim://", "sim:", log_dir=tmp_path)
+    monkeypatch.setattr(fly, "_session", session)
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        assert fly.fly_and_report(options, as_json=False, view=False) == code
+    assert "the result cannot be written: No space left on device" in capsys.readouterr().err

@@ -11,11 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.mission import ExternalPositions, Phase, PlannerState
+from perchctl.mission import (
+    Event,
+    EventKind,
+    ExternalPositions,
+    Findings,
+    FlightReport,
+    Outcome,
+    Phase,
+    PlannerState,
+    RestState,
+)
 from perchctl.mission.state import BatteryOutlook
-from perchctl.record import LogWatcher, path_beside, read_log
+from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_rounded_json
-from perchctl.record.fields import FIELDS, tick_record
+from perchctl.record.fields import FIELDS, event_record, tick_record
 from perchctl.record.messages import TICK_SCHEMA
 from perchctl.record.write import log_path
 from perchctl.vehicle import (
@@ -123,3 +133,31 @@ def test_every_field_is_filled_by_something() -> None:
 @pytest.mark.parametrize("name", ["x.jsonl", "x.jsonl.gz", "x.mcap"])
 def test_the_recording_is_found_by_the_log_the_packed_log_and_itself(name: str) -> None:
     assert path_beside(f"logs.d/{name}", ".mcap") == Path("logs.d") / "x.mcap"
+
+
+@pytest.mark.parametrize("uri", ["sim://", "radio://0/80/2M/E7E7E7E7E7"])
+def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -> None:
+    """As it ends, and as its log is read: the simulated camera is the scenario's."""
+    landing = Event(1.0, EventKind.PHASE, "camera seems turned", Phase.LANDING, "mounting")
+    found = Findings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(uri=uri))
+    log.event(landing)
+    ended = log.close(
+        FlightReport(
+            Phase.LANDED, Outcome.SAFETY, "camera seems turned", 0, 9.0, False, (landing,), found
+        )
+    )
+    assert ended is not None
+    read = FlightSummary.from_log(read_log(log.path))
+    for summary in (ended, read):
+        assert ("change no real profile" in summary.text()) is (uri == "sim://")
+    assert ("set camera.latency_s" in read.text()) is (uri != "sim://")
+
+
+@pytest.mark.parametrize("rest", RestState)
+def test_a_rescue_is_a_note_with_its_rest(rest: RestState) -> None:
+    """A reader needs no prose to tell where the vehicle is."""
+    record = event_record(Event.of_rescue(9.0, ValueError(), rest, rest.value))
+    assert (record["event"], record["rest"]) == ("note", rest.name.lower())
+    assert record["reason"] == f"ValueError in flight: {rest.value}"
+    assert event_record(Event(9.0, EventKind.NOTE, "a note in flight: "))["rest"] is None

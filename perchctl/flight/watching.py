@@ -1,0 +1,149 @@
+"""Those who look on at a flight, each until it raises: none of them ends it.
+
+A panel, a page, a callback or a log may fail in any tick. It is then detached, which is reported to
+the others, and the flight goes on without it. Two things are raised, and the loop lands the vehicle
+first: an error of the judges, without which a simulated flight would prove nothing, and an exit
+(KeyboardInterrupt, SystemExit), by which a program asks for its end.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeGuard, TypeVar
+
+from perchctl.extensions import error_at
+from perchctl.mission import Event, SentCommand, Tick, Turn, Watcher
+
+T = TypeVar("T")
+
+SLOW_S = 0.25
+"""A call that takes longer is reported: meanwhile the watchdog steers."""
+
+
+class TurnWatcher(Watcher, Protocol):
+    """A watcher of all that a flight log holds: also of the turns without a tick, before take-off
+    or decided again, and of the commands that the link sends in the loop's place."""
+
+    def turn(self, turn: Turn) -> None: ...
+
+    def sent(self, sent: SentCommand) -> None:
+        """Take a command sent in the loop's place; in another thread, so never wait."""
+
+
+class Watchers:
+    """Hands a flight's events, ticks, turns and sent commands to each watcher.
+
+    `judges` are never detached. `now` is the loop's clock, `remarks` returns new notes.
+
+    Attributes:
+        detached: a sentence for each watcher that was detached, in their order.
+    """
+
+    def __init__(
+        self,
+        watchers: Sequence[Watcher],
+        now: Callable[[], float],
+        remarks: Callable[[], Sequence[str]] = tuple,
+        judges: Sequence[Watcher] = (),
+    ) -> None:
+        self.detached: list[str] = []
+        self._active: tuple[Watcher, ...] = (*judges, *watchers)
+        self._judges = {id(judge) for judge in judges}
+        self._now, self._remarks = now, remarks
+        self._lock = threading.Lock()  # `sent` comes from the link's thread
+        self._notes: list[str] = []
+        self._slow: set[str] = set()
+        self._log_problem: str | None = None
+
+    @property
+    def have_log(self) -> bool:
+        """True if one of them takes whole turns."""
+        return any(takes_turns(watcher) for watcher in self._active)
+
+    @property
+    def problem(self) -> str | None:
+        """Why records of the flight are lost, else None."""
+        for watcher in self._active:
+            try:
+                if watcher.problem:
+                    return watcher.problem
+            except Exception as error:
+                if id(watcher) in self._judges:
+                    raise
+                self._detach(watcher, error)
+        return self._log_problem
+
+    def event(self, event: Event) -> None:
+        for watcher in self._active:
+            self._call(watcher, watcher.event, event)
+
+    def tick(self, tick: Tick) -> None:
+        for watcher in self._active:
+            self._call(watcher, watcher.tick, tick)
+
+    def turn(self, turn: Turn) -> None:
+        for watcher in self._active:
+            if takes_turns(watcher):
+                self._call(watcher, watcher.turn, turn)
+
+    def sent(self, sent: SentCommand) -> None:
+        """Hand on a command sent in the loop's place, in the link's thread. Never raises: the next
+        command must go out all the same."""
+        for watcher in self._active:
+            if takes_turns(watcher):
+                try:
+                    watcher.sent(sent)
+                except BaseException as error:  # an exit would end the link's thread
+                    self._detach(watcher, error)
+
+    def take_notes(self) -> list[str]:
+        """What is worth a line of the flight's events since the last call: remarks on the
+        recording, watchers that were detached, and slow ones."""
+        try:
+            remarks = [*self._remarks()]
+        except Exception as error:
+            remarks, self._remarks = [], tuple
+            self._report(f"the remarks on this flight have ended: {error_at(error)}")
+        with self._lock:
+            notes, self._notes = self._notes, []
+        return [*remarks, *notes]
+
+    def _call(self, watcher: Watcher, method: Callable[[T], None], value: T) -> None:
+        began_s = self._now()
+        try:
+            method(value)
+        except Exception as error:
+            if id(watcher) in self._judges:
+                raise
+            self._detach(watcher, error)
+        took_s = self._now() - began_s
+        if took_s > SLOW_S and (name := watcher_name(watcher)) not in self._slow:
+            self._slow.add(name)
+            self._report(f"{name} took {took_s:.1f} s: the flight was not steered meanwhile")
+
+    def _detach(self, watcher: Watcher, error: BaseException) -> None:
+        sentence = f"{watcher_name(watcher)} raised {error_at(error)}"
+        with self._lock:
+            if all(other is not watcher for other in self._active):
+                return  # in the other thread
+            self._active = tuple(other for other in self._active if other is not watcher)
+            self.detached.append(f"{sentence}: it was detached, and the flight went on")
+            if takes_turns(watcher):  # the loop reports it, as any problem of a log
+                self._log_problem = self._log_problem or sentence
+                return
+        self._report(f"{sentence}: it is detached, and the flight goes on")
+
+    def _report(self, note: str) -> None:
+        with self._lock:
+            self._notes.append(note)
+
+
+def takes_turns(watcher: Watcher) -> TypeGuard[TurnWatcher]:
+    """True for a `TurnWatcher`. `isinstance` would read its `problem`, too, which may raise."""
+    return all(callable(getattr(watcher, name, None)) for name in ("turn", "sent"))
+
+
+def watcher_name(watcher: Watcher) -> str:
+    """The name of a watcher in a message: its attribute `name`, or its class."""
+    return str(getattr(watcher, "name", "") or type(watcher).__name__)

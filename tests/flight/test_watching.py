@@ -1,0 +1,226 @@
+"""Those who look on: one that raises is left out, the others hear of it, and the flight goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+
+from perchctl.display import FlightPage, FlightPanel
+from perchctl.errors import SafetyAbort
+from perchctl.flight import fly
+from perchctl.flight.watching import SLOW_S
+from perchctl.mission import Event, EventKind, FlightReport, Operator, SentCommand, Tick, Turn
+from perchctl.perception import perception
+from perchctl.record import LogWatcher
+from perchctl.vehicle import PositionSetpoint
+from tests.helpers.loop_rig import Broken, Rig, Vehicle, Watcher, hung_rig
+
+BREAKS_S = 1.2
+LANDS_S = 3.0
+
+
+@dataclass
+class Breaks:
+    """A watcher of which one part raises from `BREAKS_S` on."""
+
+    part: str
+    error: BaseException = field(default_factory=lambda: Broken("by the test"))
+    name: str = "the display"
+    now: Callable[[], float] = lambda: BREAKS_S
+    calls: int = 0
+
+    def _called(self, part: str) -> None:
+        if part == self.part and self.now() >= BREAKS_S:
+            self.calls += 1
+            raise self.error
+
+    def tick(self, tick: Tick) -> None:
+        self._called("tick")
+
+    def event(self, event: Event) -> None:
+        self._called("event")
+
+    @property
+    def problem(self) -> str | None:
+        self._called("problem")
+        return None
+
+
+class BreaksAsALog(Breaks):
+    def turn(self, turn: Turn) -> None:
+        self._called("turn")
+
+    def sent(self, sent: SentCommand) -> None:
+        self._called("sent")
+
+
+def ordered(rig: Rig) -> Rig:
+    """The rig, with the order to land at `LANDS_S`."""
+
+    def land() -> Operator:
+        return Operator.LAND if rig.link.now_s > LANDS_S else Operator.NONE
+
+    rig.operator = land
+    return rig
+
+
+def flown(*broken: Breaks, rig: Rig | None = None, **parts: Any) -> tuple[FlightReport, Watcher]:
+    """A flight with these and a watcher that works, which lands on the operator's order."""
+    rig, works = ordered(rig or Rig()), Watcher()
+    for each in broken:
+        if each.part != "turn":  # which is called before take-off
+            each.now = lambda: rig.link.now_s
+    report = fly(replace(rig.parts(), watchers=(*broken, works), **parts))
+    assert rig.link.said(PositionSetpoint)[-1] > BREAKS_S + 1.0  # it flew on
+    return report, works
+
+
+def notes(watcher: Watcher) -> list[str]:
+    return [event.reason for event in watcher.events if event.kind is EventKind.NOTE]
+
+
+@pytest.mark.parametrize("part", ["tick", "event", "problem"])
+def test_a_watcher_that_raises_is_left_out_and_named(part: str) -> None:
+    breaks = Breaks(part)
+    report, works = flown(breaks)
+    assert report.outcome.value == "operator"
+    assert breaks.calls == 1
+    (said,) = report.detached
+    assert said.startswith("the display raised Broken: by the test (test_watching.py, line ")
+    assert [note for note in notes(works) if note.startswith("the display raised Broken")] or (
+        part == "event"  # at the landing: its note would come in the next tick
+    )
+    assert works.ticks[-1].state.phase.is_over
+
+
+def test_a_watcher_without_a_name_is_named_by_its_class() -> None:
+    report, _ = flown(Breaks("tick", name=""))
+    assert report.detached[0].startswith("Breaks raised Broken")
+
+
+@pytest.mark.parametrize("kind", [FlightPanel, FlightPage, LogWatcher])
+def test_the_flight_s_own_watchers_have_names_for_people(kind: Any) -> None:
+    own = object.__new__(kind)  # raises whatever it is called for
+    own.problem = None
+    rig = ordered(Rig())
+    report = fly(replace(rig.parts(), watchers=(own,)))
+    assert report.detached[0].startswith("the ")
+
+
+@pytest.mark.parametrize("lands", [False, True])
+def test_a_log_that_raises_is_the_profile_s_to_judge(lands: bool) -> None:
+    rig = Rig()
+    rig.profile = rig.profile.with_({"safety.land_on_log_error": lands})
+    breaks = BreaksAsALog("tick")
+    rig, works = ordered(rig), Watcher()
+    breaks.now = lambda: rig.link.now_s
+    report = fly(replace(rig.parts(), watchers=(breaks, works)))
+    assert ("the display raised Broken" in report.reason) is lands
+    assert rig.link.said(PositionSetpoint)[-1] > BREAKS_S
+    assert [note for note in notes(works) if "log of this flight is incomplete" in note]
+    assert breaks.calls == 1
+
+
+@pytest.mark.parametrize("refuses", [False, True])
+def test_a_log_that_raises_before_take_off_may_be_a_refusal(refuses: bool) -> None:
+    rig = ordered(Rig())
+    rig.profile = rig.profile.with_({"safety.land_on_log_error": refuses})
+    breaks = BreaksAsALog("turn")
+    if not refuses:
+        assert flown(breaks, rig=rig)[0].detached
+        return
+    with pytest.raises(SafetyAbort, match="flight log: the display raised Broken"):
+        fly(replace(rig.parts(), watchers=(breaks,)))
+    assert not rig.link.said(PositionSetpoint)
+
+
+@pytest.mark.parametrize("error", [Broken("by the test"), SystemExit(1)])
+def test_a_log_that_raises_in_the_link_s_thread_keeps_no_command_back(
+    error: BaseException,
+) -> None:
+    """The guard lands a hanging loop, and tells of each command that it has sent."""
+    rig, _ = hung_rig(1.0)
+    breaks = BreaksAsALog("sent", error)
+    breaks.now = lambda: BREAKS_S
+    report = fly(replace(rig.parts(), watchers=(breaks,)))
+    assert breaks.calls == 1
+    assert report.detached
+    assert rig.link.z_m == 0.0
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_an_exit_of_a_watcher_lands_first_and_is_raised(error: type[BaseException]) -> None:
+    rig = Rig()
+    breaks = Breaks("tick", error())
+    breaks.now = lambda: rig.link.now_s
+    with pytest.raises(error):
+        fly(replace(rig.parts(), watchers=(breaks,)))
+    assert rig.link.z_m == 0.0
+    assert not rig.link.motors
+
+
+@pytest.mark.parametrize("part", ["tick", "event", "problem"])
+def test_a_judge_that_raises_lands_and_is_raised(part: str) -> None:
+    """A simulated flight without its judge proves nothing."""
+    rig = Rig()
+    breaks = Breaks(part)
+    breaks.now = lambda: rig.link.now_s
+    with pytest.raises(Broken):
+        fly(replace(rig.parts(), judges=(breaks,)))
+    assert rig.link.z_m == 0.0
+
+
+def test_remarks_that_raise_end_and_the_flight_does_not() -> None:
+    asked = []
+
+    def remarks() -> list[str]:
+        asked.append(1)
+        if len(asked) > 60:
+            raise Broken("by the test")
+        return ["the recording is full"] if len(asked) == 50 else []
+
+    _, works = flown(remarks=remarks)
+    assert len(asked) == 61
+    assert "the recording is full" in notes(works)
+    assert [note for note in notes(works) if note.startswith("the remarks on this flight")]
+
+
+def test_a_watcher_that_hangs_is_named_once() -> None:
+    """The watchdog steers meanwhile."""
+    rig = Rig(Vehicle())
+    hung: list[float] = []
+
+    def hang(tick: Tick) -> None:
+        if tick.t_s > BREAKS_S and len(hung) < 2:
+            hung.append(tick.t_s)
+            rig.link.advance_to(rig.link.now_s + SLOW_S + 0.1)
+
+    slow = Watcher(hang)
+    report, works = flown(rig=rig, judges=(slow,))
+    assert report.detached == ()
+    (said,) = [note for note in notes(works) if "not steered" in note]
+    assert said == "Watcher took 0.4 s: the flight was not steered meanwhile"
+    assert len(hung) == 2
+
+
+def test_what_was_left_out_hears_nothing_of_a_rescue_and_the_others_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, works = Rig(), Watcher()
+    breaks = Breaks("tick")
+    breaks.now = lambda: rig.link.now_s
+    real = perception.step
+
+    def step(*arguments: Any) -> Any:
+        if rig.link.now_s > BREAKS_S + 0.5:
+            raise Broken("by the camera")
+        return real(*arguments)
+
+    monkeypatch.setattr(perception, "step", step)
+    with pytest.raises(Broken, match="by the camera"):
+        fly(replace(rig.parts(), watchers=(breaks, works)))
+    assert breaks.calls == 1
+    assert works.events[-1].rest is not None
