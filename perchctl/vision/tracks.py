@@ -85,7 +85,7 @@ def update_tracks(
     if fed and pose is not None:
         name = next(n for n, each in measured.fed.items() if each is pose)
         whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-        sight = FramePose(t_s, pose, fed[name], in_world, whole)
+        sight = FramePose(t_s, pose, fed[name], in_world, whole, camera_alone=attitude is None)
         if state.rival is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
@@ -121,11 +121,22 @@ def update_tracks(
 # it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
 # picture; and to any that was seen more often than a lock that is hardly begun.
 #
+# A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
+# lacks, so a rival is most likely the target, seen from elsewhere. There the lock goes over after
+# `RELOCK_S` in which only the rival was seen, if the rival rests on both markers or the lock never
+# did. A rival that was seen before the target was lost is a second target, and waits `REACQUIRE_S`.
+#
+# While a rival is seen and the target is not, the target's predicted place may be wrong, and its
+# spread covers the rival's place, too.
+#
 # While something is seen where the lock is, the search hands on that and no whole target beside it.
 # Where the state estimate jumps, the target seems to jump in the world, but not in the picture.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
+RELOCK_S = 0.3
+"""How long a camera alone has to see only the rival. Longer: a recording has no target for longer
+after lost frames. Shorter: fewer wrong frames in a row capture the lock."""
 FORGET_S = 10.0
 ESTABLISHED_FRAMES = 5
 """A lock of fewer frames gives way to a rival that was seen more often."""
@@ -145,8 +156,8 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose as a measurement, whether it rests on both markers, and whether the locked
-    target's place is in the picture."""
+    """A frame's pose as a measurement, whether it rests on both markers, whether the locked
+    target's place is in the picture, and whether no vehicle's attitude is known."""
 
     t_s: float
     pose: MarkerPose
@@ -154,6 +165,7 @@ class FramePose:
     in_world: bool
     has_both_markers: bool
     lock_in_view: bool = True
+    camera_alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +225,19 @@ def drop_expired(
     if age_s < -MAX_TRACK_GAP_S or age_s > (FORGET_S if lasting else MAX_TRACK_GAP_S):
         return None, None
     return lock, rival
+
+
+def contradiction(
+    lock: Lock | None, rival: RivalTrack | None, in_world: bool, t_s: float, constants: FilterSetup
+) -> Array | None:
+    """The rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
+
+    Until either is confirmed, the target may be at one place as well as at the other."""
+    if lock is None or rival is None or not lock.in_world == rival.in_world == in_world:
+        return None
+    if rival.track.t_s <= lock.track.t_s:
+        return None
+    return predict_track(rival.track, t_s, constants, with_cov=False).x
 
 
 def update_lock(
@@ -335,6 +360,8 @@ def _watched(
 def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
         return True
+    if sight.camera_alone and _has_jumped(lock, rival, sight):
+        return True
     if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both_markers:
         return False
     if not lock.has_both_markers:
@@ -347,6 +374,15 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
         and rival.whole_frames >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
     )
+
+
+def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
+    """True if the rival is most likely the target, seen by a camera that moved in lost frames."""
+    if rival.since_s < lock.track.t_s or sight.t_s - rival.since_s < RELOCK_S:
+        return False
+    if not lock.has_both_markers:
+        return rival.frames >= ESTABLISHED_FRAMES
+    return sight.has_both_markers and rival.whole_frames >= ESTABLISHED_FRAMES
 
 
 # --- Where the target should be in the next picture ---

@@ -254,7 +254,8 @@ class TargetEstimate:
         tracked: the target was measured at most `kalman.n_max` frames ago. If False, the estimate
             is the target's last place.
         unseen: frames since the last detection.
-        e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,).
+        e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,), which covers the
+            place of a contradicting pose, too, while only that is seen.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: filter's velocity of `e_m` (`kalman.frame: level`) or of the
             target in the world (`kalman.frame: world`), in level axes, (3,).
