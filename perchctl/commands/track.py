@@ -78,8 +78,9 @@ def track(
 
     Poses are in the OpenCV camera frame with cv2.aruco's marker axes: X_cam = R(rvec) X_marker +
     tvec. A JSON line holds frame, t_s, stage (large, both, small, none), large and small (null,
-    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px) and target (null, or rvec_rad,
-    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad). With both markers in sight target is their joint
+    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px), target (null, or rvec_rad,
+    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad) and note (what is wrong with the picture, or why a
+    pose is not the target's; else empty). With both markers in sight target is their joint
     pose; but for stills it is filtered, and goes on for a few frames after stage none.
     yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
     along the camera's x, y, z.
@@ -238,6 +239,7 @@ def track_record(tracked: TrackResult) -> dict[str, Any]:
         "target": None
         if target is None
         else {key: _finite(value) for key, value in vars(target).items()},
+        "note": "; ".join(tracked.notes),
     }
 
 
@@ -263,12 +265,13 @@ def _finite(value: Any) -> Any:
 def text_line(tracked: TrackResult) -> str:
     """Return a result as one line for a terminal, at most 100 columns but for long file names."""
     head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
-    return f"{head}  {_target_text(tracked.target)}"
+    return f"{head}  {_target_text(tracked)}"
 
 
-def _target_text(target: TargetInCamera | None) -> str:
+def _target_text(tracked: TrackResult) -> str:
+    target = tracked.target
     if target is None:
-        return "target not seen"
+        return "target not seen" if tracked.stage == "none" else "target withheld"
     x, y, z = (f"{100.0 * v:+7.2f}" for v in target.tvec_m)
     return f"x {x}  y {y}  z {z} cm  yaw {math.degrees(target.yaw_rad):+7.2f} deg"
 
@@ -278,7 +281,7 @@ def track_state(tracked: TrackResult) -> dict[str, Any]:
     rows = [
         ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
         ["markers", tracked.stage],
-        ["target", _target_text(tracked.target)],
+        ["target", _target_text(tracked)],
     ]
     return {"rows": rows, "note": "; ".join(tracked.notes)}
 
