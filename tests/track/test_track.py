@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import signal
+import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import cv2
@@ -17,7 +18,7 @@ import pytest
 
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.track import TrackResult, TrackSummary, poll_until_stopped, text_line
-from perchctl.errors import InvalidValue
+from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sighting import Tracker
@@ -332,7 +333,7 @@ def test_corners_without_a_pose_are_named() -> None:
     assert notes == ["no pose fits the marker's corners"]
 
 
-def test_a_live_source_is_waited_for_and_its_end_is_told(
+def test_a_live_source_is_waited_for_until_it_has_ended(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     problems = [None, "silent for 2 s", "the stream has ended"]
@@ -342,8 +343,44 @@ def test_a_live_source_is_waited_for_and_its_end_is_told(
     )
     assert [frame.index for frame in poll_until_stopped(source, lambda: 5.0, Stopper())] == [0]
     said = capsys.readouterr().err
-    assert said.startswith("perchctl: silent for 2 s; waiting")
-    assert said.endswith("perchctl: the stream has ended\n")
+    assert said == "perchctl: silent for 2 s; waiting for it (Ctrl-C ends)\n"
+    assert problems == []
+
+
+class Lost:
+    """A camera of one's own that gives three pictures, and then fails."""
+
+    live, finished, size_px = True, False, None
+
+    def __init__(self, clock: Any, config: Any) -> None:
+        self._shown = 0
+
+    def poll(self, now_s: float) -> Frame:
+        self._shown += 1
+        if self._shown > 3:
+            raise OSError("unplugged")
+        return Frame(self._shown, float(self._shown), picture(VIEWS["both"], self._shown))
+
+    def problem(self, now_s: float) -> str | None:
+        return None
+
+    def describe(self) -> str:
+        return "my camera"
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_live_source_that_is_lost_for_good_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("my_camera")
+    module.Camera = Lost  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "my_camera", module)
+    tracked = track("my_camera:Camera")
+    assert tracked.code == ConnectionFailed.exit_code
+    *seen, failure = tracked.lines
+    assert [line["stage"] for line in seen] == ["both"] * 3
+    assert "unplugged" in failure["error"]
+    assert "3 frames in" in tracked.stderr
 
 
 @pytest.mark.parametrize("number", [0, 1])
