@@ -129,6 +129,9 @@ def update_tracks(
 # While a rival is seen and the target is not, the target's predicted place may be wrong, and its
 # spread covers the rival's place, too.
 #
+# A pose that passes the gate may be wrong even so. If the next one fits the track as it was before,
+# and not as it is, the track restarts there.
+#
 # While something is seen where the lock is, the search hands on that and no whole target beside it.
 # Where the state estimate jumps, the target seems to jump in the world, but not in the picture.
 
@@ -142,6 +145,7 @@ ESTABLISHED_FRAMES = 5
 """A lock of fewer frames gives way to a rival that was seen more often."""
 
 _JUMPED = "the state estimate jumped, the target did not"
+_WENT_BACK = "the target is where it was expected before the last pose, which may have been wrong"
 _GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
 _SAME_RANGE = 4.0  # standard deviations
 # What no covariance knows of: calibration, print, latency; beside it a share of the range.
@@ -151,7 +155,7 @@ _PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _TURNED_RAD = math.radians(15.0)  # worth a word
 # How a hovering vehicle moves relative to the target while its estimate jumps.
 _CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-_EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfits
+_EXPLAINED = 0.25  # most that the better of two explanations may leave, of squared misfits
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +207,8 @@ def judge_pose(
         return GateVerdict(accepted=True, rival=rival)
     if not theirs and _goes_on(lock, sight, fit.off):
         return GateVerdict(accepted=True, restarts=True, same_target=True, text=_JUMPED)
+    if not theirs and _goes_back(lock, sight, fit.off, constants):
+        return GateVerdict(accepted=True, restarts=True, same_target=True, text=_WENT_BACK)
     seen = _watched(rival if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
         text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
@@ -252,6 +258,7 @@ def update_lock(
         in_world=sight.in_world,
         frames=1 if before is None else before.frames + 1,
         has_both_markers=sight.has_both_markers or (before is not None and before.has_both_markers),
+        before=None if before is None else before.track,
     )
 
 
@@ -325,6 +332,17 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, off_in_world))
     calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
     return calm and seen < _EXPLAINED * jumped
+
+
+def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup) -> bool:
+    """True if the pose fits the track before the lock's last pose, much better than the track with
+    it, from which it is `off`: at few pictures a second, a single wrong pose is within the gate,
+    and teaches a camera's track a speed."""
+    if lock.before is None or sight.in_world:
+        return False
+    fit, unclaimed = _misfit(lock.before, sight, constants), _unclaimed(_range_m(sight))
+    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.off, off))
+    return fit.squared <= _GATE and before < _EXPLAINED * now
 
 
 # --- rivals ---

@@ -297,13 +297,15 @@ class LastPose:
 @dataclass(frozen=True, eq=False)
 class Lock:
     """The target that the pipeline is locked on: its last track and pose, in the world or the level
-    frame, the number of `frames` with a pose, and whether any pose rested on both markers."""
+    frame, the number of `frames` with a pose, whether any pose rested on both markers, and the
+    track `before` the last pose, None for the first."""
 
     track: MarkerTrack
     pose: MarkerPose
     in_world: bool
     frames: int
     has_both_markers: bool
+    before: MarkerTrack | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from perchctl.vision import (
     TargetEstimate,
     estimate,
 )
-from perchctl.vision.filter import Measurement, make_filter
+from perchctl.vision.filter import Measurement, X, make_filter
 from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import (
     ESTABLISHED_FRAMES,
@@ -160,6 +160,26 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     lock = Lock(track=track, pose=pose, in_world=True, frames=9, has_both_markers=True)
     if _is_clear(track, sight, constants):
         assert judge_pose(lock, rival, sight, constants).accepted
+
+
+@pytest.mark.parametrize(("x_m", "in_world"), [(-0.02, False), (-0.45, False), (-0.02, True)])
+def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
+    x_m: float, in_world: bool
+) -> None:
+    """If the last pose has led the track 1 m away. In flight no single pose does."""
+    before = MarkerTrack(t_s=-0.1, x=np.zeros(8), P=np.eye(8) * 1e-4)
+    track = MarkerTrack(t_s=0.0, x=np.eye(8)[X], P=np.eye(8) * 1e-4)
+    pose = MarkerPose(
+        "joint", 0.1, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, np.ones(3), 1.0, 0.0
+    )
+    measured = Measurement(np.array([0.0, x_m, 0.0, 0.0]), np.eye(4) * 1e-4)
+    sight = FramePose(0.1, pose, measured, in_world, True)
+    lock = Lock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
+    verdict = judge_pose(lock, None, sight, make_filter(KalmanConfig(), in_world))
+    assert verdict.accepted is (x_m == -0.02 and not in_world)
+    assert verdict.same_target is verdict.accepted
+    again = Lock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
+    assert not judge_pose(again, None, sight, make_filter(KalmanConfig(), in_world)).accepted
 
 
 def test_without_the_gate_all_of_them_steer(build: Build) -> None:
