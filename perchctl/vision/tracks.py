@@ -211,7 +211,7 @@ def judge_pose(
         return GateVerdict(accepted=True, restarts=True, same_target=True, text=_WENT_BACK)
     seen = _watched(rival if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
-        text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
+        text = f"target taken up anew, {fit.away_m:.2f} m from where it was expected"
         return GateVerdict(accepted=True, restarts=True, text=text)
     return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
