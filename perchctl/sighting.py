@@ -48,6 +48,7 @@ from perchctl.vision import (
 
 POLL_S, SILENT_S = 0.002, 2.0
 INTERLACED = "interlaced: each field of a frame is measured separately"
+_NO_POSE = "no pose fits the marker's corners"
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
 AttitudeAt = Callable[[float], Attitude | None]
 Named = tuple[Frame, str | None]
@@ -248,6 +249,8 @@ class Tracker:
             yield INTERLACED
         if output.lock_note:
             yield output.lock_note
+        if output.detections.markers and not output.poses:
+            yield _NO_POSE
         if output.detections.mirrored:
             yield mirrored_note(self._config)
         if output.disagreeing_frames >= self._disagreement_frames:

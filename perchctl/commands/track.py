@@ -41,7 +41,7 @@ from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
 from perchctl.display import live_page, make_sketch
-from perchctl.errors import Interrupted, NotFound
+from perchctl.errors import ConnectionFailed, Interrupted, NotFound
 from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.places import is_shipped_example
 from perchctl.profile import find_calibration, load_profile
@@ -78,11 +78,12 @@ def track(
 
     Poses are in the OpenCV camera frame with cv2.aruco's marker axes: X_cam = R(rvec) X_marker +
     tvec. A JSON line holds frame, t_s, stage (large, both, small, none), large and small (null,
-    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px) and target (null, or rvec_rad,
-    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad). With both markers in sight target is their joint
+    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px), target (null, or rvec_rad,
+    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad) and note (what is wrong with the picture, or why a
+    pose is not the target's; else empty). With both markers in sight target is their joint
     pose; but for stills it is filtered, and goes on for a few frames after stage none.
     yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
-    along the camera's x, y, z.
+    along the camera's x, y, z. A live source that is lost for good ends with exit code 10.
     """
     flown = load_profile(profile)
     source = parse_source(source).spec
@@ -129,18 +130,21 @@ def track(
                     page.set_state(partial(track_state, tracked))
             advance()
         took_s = time.monotonic() - start_s
-        if summary.frames == 0 and not stop.requested.is_set():
+        lost = opened.problem(-math.inf)
+        if summary.frames == 0 and lost is None and not stop.requested.is_set():
             raise NotFound(f"{opened.describe()} gave no frame at all")
     say(summary.text(took_s))
     if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was printed is complete")
+    if lost is not None:
+        raise ConnectionFailed(lost)
 
 
 def poll_until_stopped(
     source: FrameSource, now: Callable[[], float], stop: Stopper
 ) -> Iterator[Frame]:
-    """Yield every frame of a recording, or the newest frames of a live source, until the end or
-    Ctrl-C. A live source without frames is reported once per outage."""
+    """Yield every frame of a recording, or the newest frames of a live source, until the end, a
+    permanent failure or Ctrl-C. A live source without frames is reported once per outage."""
     is_silent = False
     while not stop.requested.is_set():
         now_s = now()
@@ -152,8 +156,7 @@ def poll_until_stopped(
         if source.finished:
             return
         # With no time passed nothing can be late: what is a problem even so is the end.
-        if (gone := source.problem(-math.inf)) is not None:
-            say(gone)
+        if source.problem(-math.inf) is not None:
             return
         problem = source.problem(now_s)
         if problem is not None and not is_silent:
@@ -238,6 +241,7 @@ def track_record(tracked: TrackResult) -> dict[str, Any]:
         "target": None
         if target is None
         else {key: _finite(value) for key, value in vars(target).items()},
+        "note": "; ".join(tracked.notes),
     }
 
 
@@ -263,12 +267,13 @@ def _finite(value: Any) -> Any:
 def text_line(tracked: TrackResult) -> str:
     """Return a result as one line for a terminal, at most 100 columns but for long file names."""
     head = f"{tracked.name!s:>6}  {tracked.picture.t_s:9.3f} s  {tracked.stage:<5}"
-    return f"{head}  {_target_text(tracked.target)}"
+    return f"{head}  {_target_text(tracked)}"
 
 
-def _target_text(target: TargetInCamera | None) -> str:
+def _target_text(tracked: TrackResult) -> str:
+    target = tracked.target
     if target is None:
-        return "target not seen"
+        return "target not seen" if tracked.stage == "none" else "target withheld"
     x, y, z = (f"{100.0 * v:+7.2f}" for v in target.tvec_m)
     return f"x {x}  y {y}  z {z} cm  yaw {math.degrees(target.yaw_rad):+7.2f} deg"
 
@@ -278,7 +283,7 @@ def track_state(tracked: TrackResult) -> dict[str, Any]:
     rows = [
         ["frame", f"{tracked.name}   {tracked.picture.t_s:.3f} s"],
         ["markers", tracked.stage],
-        ["target", _target_text(tracked.target)],
+        ["target", _target_text(tracked)],
     ]
     return {"rows": rows, "note": "; ".join(tracked.notes)}
 

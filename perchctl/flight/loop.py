@@ -38,6 +38,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
+    SentCommand,
     Tick,
     Transition,
     Watcher,

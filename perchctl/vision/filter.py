@@ -46,6 +46,9 @@ _PUSH_S = 0.1
 _WANDER = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Of yaw, x, y and z of the state estimate: in a second's random walk."""
 _HEADING_RADPS2 = 0.1  # of the state estimate's heading
+_RESTART_NIS = 25.0
+"""Normalized innovation squared, four degrees of freedom: by chance in 5 of 100 000. Larger: a lost
+frame teaches a camera's track a speed that nothing had. Smaller: noise restarts the track."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,11 @@ class FilterSetup:
     """R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2) in SI;
     P0 (8, 8) is the covariance after the first measurement; `alpha`, `n_max`: as in the profile.
     If `process` is not None, it replaces Q, and each pose's own covariance replaces R.
+
+    A measurement z with the innovation v = z - H x and its covariance S = H P H^T + R restarts the
+    track if v^T S^-1 v (NIS) exceeds `restart_nis`. The model does not explain it, for example
+    after lost frames, and an update would turn the jump into a speed that S does not cover. The
+    track restarts at z with R + v v^T: until the next measurement, z may be the wrong one.
     """
 
     R: Array
@@ -80,6 +88,7 @@ class FilterSetup:
     process: ProcessNoise | None = None
     tilt_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
     drift_mps: float = math.inf  # most that the target moves while nothing is measured
+    restart_nis: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +125,8 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
         process=process,
         tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         drift_mps=config.drift_mps if in_world else math.inf,
+        # In flight the gate recognises steps of the state estimate (`perchctl.vision.tracks`).
+        restart_nis=_RESTART_NIS if measured and not in_world else math.inf,
     )
 
 
@@ -186,7 +197,8 @@ def step_track(
 
     Returns None without a track: never measured, or unseen for more than `n_max` frames (equation
     3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap beyond
-    `MAX_TRACK_GAP_S` in either direction starts afresh.
+    `MAX_TRACK_GAP_S` in either direction starts afresh, and so does a measurement that the motion
+    model does not explain (`FilterSetup.restart_nis`).
     """
     if measured is not None and not is_finite(measured.z):
         measured = None
@@ -207,17 +219,31 @@ def step_track(
         return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
     F, Q = transition_matrix(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
-    x, P, gain = _updated(x, P, measured.z, setup.R if measured.R is None else measured.R)
+    R = setup.R if measured.R is None else measured.R
+    if setup.restart_nis < math.inf:
+        off, S = _innovation(x, measured.z), P[MEASURED, MEASURED] + R
+        regular, solved = cv2.solve(S, off[:, None], flags=cv2.DECOMP_CHOLESKY)
+        if regular and off.dot(solved)[0] > setup.restart_nis:
+            begun = start_track(measured, t_s, setup)
+            begun.P[MEASURED, MEASURED] += np.outer(off, off)
+            return begun
+    x, P, gain = _updated(x, P, measured.z, R)
     bias = F.dot(track.bias)
     if measured.bias is not None:
         bias += gain.dot(measured.bias - bias[MEASURED])
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
 
 
+def _innovation(x: Array, z: Array) -> Array:
+    """A measurement less the predicted one, (4,); the yaw is the nearest to the prediction."""
+    off = z - x[MEASURED]
+    off[0] = wrap_rad(float(off[0]))
+    return off
+
+
 def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
     """Return state and covariance after a measurement, in Joseph's form, and the gain (8, 4)."""
-    off = z - x[MEASURED]
-    off[0] = wrap_rad(float(off[0]))  # the yaw nearest to the prediction
+    off = _innovation(x, z)
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
     if not regular:  # no covariance: it tells nothing
         return x, P, np.zeros((8, 4))

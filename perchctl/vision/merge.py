@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perchctl.geometry import Array, circular_mean
+from perchctl.geometry import Array, circular_mean, wrap_rad
 from perchctl.profile import MergeConfig, WeightsConfig
 from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
 from perchctl.vision.pose import PoseCandidate, PoseSetup, estimate_pose, level_rotation
@@ -134,6 +134,18 @@ def merge_tracks(
         var_yaw_rad2=float(variance[3]),
         unseen=least,
         stage=Stage.BOTH if fed else Stage.NONE,
+    )
+
+
+def widen(merged: MergedTarget, rival: Array) -> MergedTarget:
+    """The target with a spread that covers another place where it may be as well: the state (8,) of
+    a `rival` that contradicts. Value and rival differ by d, and the covariance grows by d d^T."""
+    off = rival[_PLACE_YAW] - merged.vector
+    off_m, off_rad = off[:3], wrap_rad(float(off[3]))
+    return replace(
+        merged,
+        cov_m2=merged.cov_m2 + np.outer(off_m, off_m),
+        var_yaw_rad2=merged.var_yaw_rad2 + off_rad * off_rad,
     )
 
 

@@ -25,7 +25,7 @@ from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
-from perchctl.vision.merge import MergedTarget, detected_stage, measure_markers, merge_tracks
+from perchctl.vision.merge import MergedTarget, detected_stage, measure_markers, merge_tracks, widen
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
     OwnTargetPlace,
@@ -37,6 +37,7 @@ from perchctl.vision.target_selection import (
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
+    contradiction,
     expected_corners,
     update_last_pose,
     update_tracks,
@@ -294,6 +295,8 @@ def estimate(
         tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
         merged = merge_tracks(tracks, state.measured.fed, pipeline.merge.weights)
         assert merged is not None
+        rival = contradiction(state.lock, state.rival, True, t_s, world)
+        merged = merged if rival is None else widen(merged, rival)
         return replace(target, t_s=t_s, **_placed(merged, attitude, True, pipeline, spread))
     if not state.tracks:
         nothing = np.zeros(3)
@@ -326,6 +329,9 @@ def _at_frame(
     merged = merge_tracks(tracks, fed, pipeline.merge.weights)
     if merged is None:
         return None
+    constants = pipeline.tracks.constants(in_world)
+    rival = contradiction(followed.lock, followed.rival, in_world, t_s, constants)
+    merged = merged if rival is None else widen(merged, rival)
     measured = any(n in tracks and tracks[n].t_s == t_s for n in fed)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf

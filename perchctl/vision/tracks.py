@@ -85,7 +85,7 @@ def update_tracks(
     if fed and pose is not None:
         name = next(n for n, each in measured.fed.items() if each is pose)
         whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-        sight = FramePose(t_s, pose, fed[name], in_world, whole)
+        sight = FramePose(t_s, pose, fed[name], in_world, whole, camera_alone=attitude is None)
         if state.rival is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
@@ -121,16 +121,31 @@ def update_tracks(
 # it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
 # picture; and to any that was seen more often than a lock that is hardly begun.
 #
+# A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
+# lacks, so a rival is most likely the target, seen from elsewhere. There the lock goes over after
+# `RELOCK_S` in which only the rival was seen, if the rival rests on both markers or the lock never
+# did. A rival that was seen before the target was lost is a second target, and waits `REACQUIRE_S`.
+#
+# While a rival is seen and the target is not, the target's predicted place may be wrong, and its
+# spread covers the rival's place, too.
+#
+# A pose that passes the gate may be wrong even so. If the next one fits the track as it was before,
+# and not as it is, the track restarts there.
+#
 # While something is seen where the lock is, the search hands on that and no whole target beside it.
 # Where the state estimate jumps, the target seems to jump in the world, but not in the picture.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
+RELOCK_S = 0.3
+"""How long a camera alone has to see only the rival. Longer: a recording has no target for longer
+after lost frames. Shorter: fewer wrong frames in a row capture the lock."""
 FORGET_S = 10.0
 ESTABLISHED_FRAMES = 5
 """A lock of fewer frames gives way to a rival that was seen more often."""
 
 _JUMPED = "the state estimate jumped, the target did not"
+_WENT_BACK = "the target is where it was expected before the last pose, which may have been wrong"
 _GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
 _SAME_RANGE = 4.0  # standard deviations
 # What no covariance knows of: calibration, print, latency; beside it a share of the range.
@@ -140,13 +155,13 @@ _PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _TURNED_RAD = math.radians(15.0)  # worth a word
 # How a hovering vehicle moves relative to the target while its estimate jumps.
 _CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-_EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfits
+_EXPLAINED = 0.25  # most that the better of two explanations may leave, of squared misfits
 
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose as a measurement, whether it rests on both markers, and whether the locked
-    target's place is in the picture."""
+    """A frame's pose as a measurement, whether it rests on both markers, whether the locked
+    target's place is in the picture, and whether no vehicle's attitude is known."""
 
     t_s: float
     pose: MarkerPose
@@ -154,6 +169,7 @@ class FramePose:
     in_world: bool
     has_both_markers: bool
     lock_in_view: bool = True
+    camera_alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +207,11 @@ def judge_pose(
         return GateVerdict(accepted=True, rival=rival)
     if not theirs and _goes_on(lock, sight, fit.off):
         return GateVerdict(accepted=True, restarts=True, same_target=True, text=_JUMPED)
+    if not theirs and _goes_back(lock, sight, fit.off, constants):
+        return GateVerdict(accepted=True, restarts=True, same_target=True, text=_WENT_BACK)
     seen = _watched(rival if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
-        text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
+        text = f"target taken up anew, {fit.away_m:.2f} m from where it was expected"
         return GateVerdict(accepted=True, restarts=True, text=text)
     return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
@@ -215,6 +233,19 @@ def drop_expired(
     return lock, rival
 
 
+def contradiction(
+    lock: Lock | None, rival: RivalTrack | None, in_world: bool, t_s: float, constants: FilterSetup
+) -> Array | None:
+    """The rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
+
+    Until either is confirmed, the target may be at one place as well as at the other."""
+    if lock is None or rival is None or not lock.in_world == rival.in_world == in_world:
+        return None
+    if rival.track.t_s <= lock.track.t_s:
+        return None
+    return predict_track(rival.track, t_s, constants, with_cov=False).x
+
+
 def update_lock(
     lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
 ) -> Lock:
@@ -227,6 +258,7 @@ def update_lock(
         in_world=sight.in_world,
         frames=1 if before is None else before.frames + 1,
         has_both_markers=sight.has_both_markers or (before is not None and before.has_both_markers),
+        before=None if before is None else before.track,
     )
 
 
@@ -302,6 +334,17 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     return calm and seen < _EXPLAINED * jumped
 
 
+def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup) -> bool:
+    """True if the pose fits the track before the lock's last pose, much better than the track with
+    it, from which it is `off`: at few pictures a second, a single wrong pose is within the gate,
+    and teaches a camera's track a speed."""
+    if lock.before is None or sight.in_world:
+        return False
+    fit, unclaimed = _misfit(lock.before, sight, constants), _unclaimed(_range_m(sight))
+    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.off, off))
+    return fit.squared <= _GATE and before < _EXPLAINED * now
+
+
 # --- rivals ---
 
 
@@ -335,6 +378,8 @@ def _watched(
 def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
         return True
+    if sight.camera_alone and _has_jumped(lock, rival, sight):
+        return True
     if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both_markers:
         return False
     if not lock.has_both_markers:
@@ -347,6 +392,15 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
         and rival.whole_frames >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
     )
+
+
+def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
+    """True if the rival is most likely the target, seen by a camera that moved in lost frames."""
+    if rival.since_s < lock.track.t_s or sight.t_s - rival.since_s < RELOCK_S:
+        return False
+    if not lock.has_both_markers:
+        return rival.frames >= ESTABLISHED_FRAMES
+    return sight.has_both_markers and rival.whole_frames >= ESTABLISHED_FRAMES
 
 
 # --- Where the target should be in the next picture ---

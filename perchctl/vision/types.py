@@ -285,7 +285,8 @@ class TargetEstimate:
         tracked: the target was measured at most `kalman.n_max` frames ago. If False, the estimate
             is the target's last place.
         unseen: frames since the last detection.
-        e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,).
+        e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,), which covers the
+            place of a contradicting pose, too, while only that is seen.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: filter's velocity of `e_m` (`kalman.frame: level`) or of the
             target in the world (`kalman.frame: world`), in level axes, (3,).
@@ -327,13 +328,15 @@ class LastPose:
 @dataclass(frozen=True, eq=False)
 class Lock:
     """The target that the pipeline is locked on: its last track and pose, in the world or the level
-    frame, the number of `frames` with a pose, and whether any pose rested on both markers."""
+    frame, the number of `frames` with a pose, whether any pose rested on both markers, and the
+    track `before` the last pose, None for the first."""
 
     track: MarkerTrack
     pose: MarkerPose
     in_world: bool
     frames: int
     has_both_markers: bool
+    before: MarkerTrack | None = None
 
 
 @dataclass(frozen=True, eq=False)

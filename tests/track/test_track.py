@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import signal
+import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import cv2
@@ -16,8 +17,8 @@ import numpy as np
 import pytest
 
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.track import TrackSummary, poll_until_stopped
-from perchctl.errors import InvalidValue
+from perchctl.commands.track import TrackResult, TrackSummary, poll_until_stopped, text_line
+from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sighting import Tracker
@@ -100,7 +101,7 @@ SHAPES["small"] = SHAPES["large"]
 
 
 def check_schema(line: dict[str, Any]) -> None:
-    assert list(line) == ["frame", "t_s", "stage", "large", "small", "target"]
+    assert list(line) == ["frame", "t_s", "stage", "large", "small", "target", "note"]
     seen = {"large": (1, 0), "small": (0, 1), "both": (1, 1), "none": (0, 0)}[line["stage"]]
     assert (line["large"] is not None, line["small"] is not None) == seen
     for name, shapes in SHAPES.items():
@@ -150,6 +151,37 @@ def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
         assert line["target"]["yaw_rad"] == pytest.approx(yaw_of(R), abs=1e-9)
     assert lines(video) == tracked.lines
     assert "interlaced" not in tracked.stderr
+
+
+@pytest.mark.parametrize("jump_m", [0.12, 0.3])
+def test_a_video_that_lacks_frames_is_followed_on(jump_m: float, tmp_path: Path) -> None:
+    """At a constant rate nothing tells that the camera moved by `jump_m` between two frames."""
+    approach_m = [0.75 - 0.35 * PAL_S * i for i in range(12)]
+    below_m = approach_m + [approach_m[-1] - jump_m] * 18
+    views = [(z, 0.02, 0.01 * math.sin(i / 5.0), 0.0, 0.02, 0.3) for i, z in enumerate(below_m)]
+    images = [picture(view, i) for i, view in enumerate(views)]
+    found = lines(write_video(tmp_path / "gap.mp4", images, rate_hz=1 / PAL_S))
+    assert [line["stage"] for line in found] == ["both"] * len(views)
+    for line, view in zip(found, views, strict=True):
+        check_schema(line)
+        if line["target"] is None:
+            assert line["note"] != ""
+            continue
+        off_m = np.abs(np.array(line["target"]["tvec_m"]) - true_pose(view)[1])
+        assert (off_m < 0.003 + 3.0 * np.array(line["target"]["sigma_m"])).all()
+        assert off_m.max() < jump_m + 0.05
+    rejected = [line for line in found if line["note"].startswith("not the tracked target: 0.")]
+    assert bool(rejected) is (jump_m > 0.2)
+    back = found[len(approach_m) + int(0.5 / PAL_S) :]
+    assert all(line["target"] is not None and line["note"] == "" for line in back)
+    assert max(line["target"]["sigma_m"][2] for line in back) < 0.01
+
+
+def test_a_target_that_is_withheld_is_not_called_unseen() -> None:
+    seen = tracker(live=False)
+    [(frame, output, notes)] = seen.process(Frame(0, 0.0, picture(VIEWS["both"])))
+    assert text_line(TrackResult(0, frame, output, None, notes)).endswith("target withheld")
+    assert text_line(TrackResult(0, frame)).endswith("target not seen")
 
 
 def test_each_picture_file_is_measured_alone(pictures: Path) -> None:
@@ -291,7 +323,17 @@ def test_markers_that_contradict_are_named() -> None:
     assert [note.partition(":")[0] for note in notes] == ["the two markers contradict"]
 
 
-def test_a_live_source_is_waited_for_and_its_end_is_told(
+def test_corners_without_a_pose_are_named() -> None:
+    sim = load_profile("sim")
+    strict = sim.pose.model_copy(update={"max_reprojection_px": 1e-6})
+    seen = tracker(sim.model_copy(update={"pose": strict}), live=False)
+    [(_, output, notes)] = seen.process(Frame(0, 0.0, picture(VIEWS["both"])))
+    assert output.stage.value == "both"
+    assert output.target is None
+    assert notes == ["no pose fits the marker's corners"]
+
+
+def test_a_live_source_is_waited_for_until_it_has_ended(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     problems = [None, "silent for 2 s", "the stream has ended"]
@@ -301,8 +343,44 @@ def test_a_live_source_is_waited_for_and_its_end_is_told(
     )
     assert [frame.index for frame in poll_until_stopped(source, lambda: 5.0, Stopper())] == [0]
     said = capsys.readouterr().err
-    assert said.startswith("perchctl: silent for 2 s; waiting")
-    assert said.endswith("perchctl: the stream has ended\n")
+    assert said == "perchctl: silent for 2 s; waiting for it (Ctrl-C ends)\n"
+    assert problems == []
+
+
+class Lost:
+    """A camera of one's own that gives three pictures, and then fails."""
+
+    live, finished, size_px = True, False, None
+
+    def __init__(self, clock: Any, config: Any) -> None:
+        self._shown = 0
+
+    def poll(self, now_s: float) -> Frame:
+        self._shown += 1
+        if self._shown > 3:
+            raise OSError("unplugged")
+        return Frame(self._shown, float(self._shown), picture(VIEWS["both"], self._shown))
+
+    def problem(self, now_s: float) -> str | None:
+        return None
+
+    def describe(self) -> str:
+        return "my camera"
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_live_source_that_is_lost_for_good_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("my_camera")
+    module.Camera = Lost  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "my_camera", module)
+    tracked = track("my_camera:Camera")
+    assert tracked.code == ConnectionFailed.exit_code
+    *seen, failure = tracked.lines
+    assert [line["stage"] for line in seen] == ["both"] * 3
+    assert "unplugged" in failure["error"]
+    assert "3 frames in" in tracked.stderr
 
 
 @pytest.mark.parametrize("number", [0, 1])

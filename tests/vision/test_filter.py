@@ -143,6 +143,37 @@ def test_a_long_gap_starts_afresh(t_s: float) -> None:
     assert step_track(start, None, t_s, SETUP) is None
 
 
+@given(
+    jump_m=st.tuples(*[st.floats(-0.5, 0.5)] * 3).filter(lambda m: np.linalg.norm(m) > 0.1),
+    velocity_mps=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
+    jump_m: tuple[float, float, float], velocity_mps: tuple[float, float, float]
+) -> None:
+    """The track restarts at the jump, and covers where it was predicted until it is confirmed."""
+    setup, R = make_filter(KalmanConfig()), np.diag([1e-3, 1e-3, 1e-3, 1e-3]) ** 2
+    place, jump = np.array([0.1, 0.2, -0.1, 0.6]), np.array([0.0, *jump_m])
+    steps = np.array([0.0, *velocity_mps]) / 30.0
+    track: MarkerTrack | None = None
+    for k in range(20):
+        track = step_track(track, Measurement(place + k * steps, R), k / 30.0, setup)
+    jumped = place + 20 * steps + jump
+    track = step_track(track, Measurement(jumped, R), 20 / 30.0, setup)
+    assert np.allclose(track.x[MEASURED], jumped)
+    assert np.abs(track.x[RATES]).max() == 0.0
+    sigma_m = np.sqrt(track.P.diagonal()[POSITION])
+    assert (sigma_m > 0.9 * np.abs(jump_m) - 0.01).all()
+    confirmed = step_track(track, Measurement(jumped + steps, R), 21 / 30.0, setup)
+    assert np.sqrt(confirmed.P.diagonal()[POSITION]).max() < 0.002
+    # In the world of a state estimate a camera's motion is known.
+    world, there = make_filter(KalmanConfig(), in_world=True), None
+    for k in range(20):
+        there = step_track(there, Measurement(place, R), k / 30.0, world)
+    there = step_track(there, Measurement(place + jump, R), 20 / 30.0, world)
+    assert not np.allclose(there.x[MEASURED], place + jump)
+
+
 # --- What the filter claims is what it errs by, and it errs no more than each frame alone ------
 
 
