@@ -75,7 +75,7 @@ def no_cluster(why: str = "it is missing") -> UsageError:
 
 class ConnectionFailed(PerchError):
     exit_code = 10
-    meaning = "no connection to the vehicle, the camera, the motion capture or the cluster"
+    meaning = "no connection to the vehicle, camera, motion capture or cluster"
 
 
 class NotFound(PerchError):

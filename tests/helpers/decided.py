@@ -29,12 +29,15 @@ def decided_here(name: str) -> tuple[bytes, ...]:
     header, *lines = gzip.decompress(path.read_bytes()).splitlines(keepends=True)
     changed = json.loads(header) | computer_record()
     found, state = [json_line(changed)], None
-    profile = read_log(path).flown_profile
+    log = read_log(path)
+    profile, records = log.flown_profile, iter(log.turn_records)
+    if not log.has_position_variance:  # as the replay does
+        profile = profile.with_({"link.unreported": ["variance", *profile.link.unreported]})
     table = table_of(profile.planner.rows)
     names = _DECIDED + (_SINCE_4 if changed["version"] >= 4 else ())
     for line in lines:
         record = json.loads(line)
-        turn = parse_turn(record) if record["kind"] == "turn" else None
+        turn = parse_turn(next(records)) if record["kind"] == "turn" else None
         if turn is None or turn.observation is None or turn.role == "waiting":
             found.append(line)
             continue

@@ -48,10 +48,10 @@ def test_what_just_fits_is_taken(changes: Mapping[str, Any]) -> None:
 
 
 def test_a_measured_latency_counts_as_where_the_flight_begins() -> None:
-    measured = {"camera.latency_s": "measured", "safety.max_frame_age_s": 0.08}
+    measured = {"camera.latency_s": "measured", "safety.max_frame_age_s": 0.11}
     assert isinstance(short_profile(measured, base="sim"), Profile)
-    with pytest.raises(ValidationError, match=r"camera.latency_s \(0.07 s\) < "):
-        short_profile(measured | {"safety.max_frame_age_s": 0.06}, base="sim")
+    with pytest.raises(ValidationError, match=r"camera.latency_s \(0.1 s\) < "):
+        short_profile(measured | {"safety.max_frame_age_s": 0.09}, base="sim")
 
 
 @pytest.mark.parametrize(
