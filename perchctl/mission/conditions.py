@@ -281,9 +281,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
     Condition.CARRIED: _carried,
-    Condition.KNOCKED: lambda c: (
-        c.placed and math.hypot(*c.telemetry.velocity_mps[:2]) > KNOCKED_MPS
-    ),
+    Condition.KNOCKED: lambda c: c.placed and math.hypot(*c.velocity_mps[:2]) > KNOCKED_MPS,
     Condition.SATURATED: _saturated,
     Condition.UNSURE: lambda c: c.is_unsure,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,

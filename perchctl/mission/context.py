@@ -29,8 +29,8 @@ class Context:
     Attributes:
         state, obs, profile: `PlannerState`, `Observation` and `Profile`; `telemetry` is the newest
             sample, `t_s` the time on the loop's clock.
-        in_phase_s: time since the phase began; `speed_mps`: of the vehicle, in three dimensions;
-            `tilt_rad`: between its vertical axis and the world's.
+        in_phase_s: time since the phase began.
+        tilt_rad: between the vehicle's vertical axis and the world's.
         by_sight: the target itself is the positioning system.
         mismatch: error of latency or mounting that makes the target seem to move; else zero.
         height_m: above the ground that the flight started from.
@@ -51,6 +51,8 @@ class Context:
         is_corrected: positions come, and correct the estimated velocity.
         is_blown: after a blow or gust that only the accelerometer has measured, until a sight
             corrects the estimate: the firmware's estimator ignores sideways forces.
+        velocity_mps: of the estimate, world axes, (3,), while it is placed without the bias that a
+            wind gives it; `speed_mps`: its size.
         climb_mps: vertical speed, by the estimate where that is believed and fresh, else by the
             accelerometer.
         target_m, target_yaw_rad: the target in the world of the state estimate, (3,), and its
@@ -82,7 +84,6 @@ class Context:
         self.attitude_age_s = obs.t_s - tel.t_s
         self.imu_proves = self.attitude_age_s <= profile.safety.proof_age_s
         self.reads_one_g = abs(tel.acc_z_g - 1.0) <= profile.planner.perch.contact_acc_g
-        self.speed_mps = math.sqrt(sum(v * v for v in tel.velocity_mps))
         up = math.cos(tel.roll_rad) * math.cos(tel.pitch_rad)
         self.tilt_rad = math.acos(max(-1.0, min(1.0, up)))
         by_deck = profile.positioning.by == "deck"
@@ -109,6 +110,12 @@ class Context:
         just_again = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
         self.located = not (doubted or self.position_is_stale or just_again)
         self.placed = self.located and self.proves
+        vx_mps, vy_mps, vz_mps = tel.velocity_mps
+        if self.placed:
+            bias_x_mps, bias_y_mps = state.reckoning.velocity_bias_mps
+            vx_mps, vy_mps = vx_mps - bias_x_mps, vy_mps - bias_y_mps
+        self.velocity_mps = (vx_mps, vy_mps, vz_mps)
+        self.speed_mps = math.sqrt(sum(v * v for v in self.velocity_mps))
         reckoning, climb_mps = state.reckoning, tel.velocity_mps[2]
         is_reckoned = reckoning.imu is not None
         # On its arrival a frame is as old as the camera's latency.

@@ -31,6 +31,10 @@ FLOOR_M = 0.05  # above the ground, no lower
 PRESSING_PART, PRESSING_RATIO = 0.95, 1.05
 UNPRESSED_MPS, UNPRESSED_M, FALLING_MPS = 0.05, 0.08, -0.3
 UNWIND_M, UNWIND_AWAY_M, UNPRESS_LIMIT_S = 1.0, 0.25, 4.0
+SMALL_ERROR_M = 0.06  # an error of the position that counts in motion, too
+STANDS_MPS = 0.1
+"""Slower, a vehicle stands still in the air. Larger: an integral winds up on the way to its goal.
+Smaller: a wind that shakes the vehicle is never balanced."""
 LIFTED_M = 0.1  # below it a vehicle may still stand
 WARY_MPS = 0.25  # sideways, while nothing confirms the camera's mounting
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
@@ -88,19 +92,40 @@ def step_towards(
 
 
 def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """The integral (x, y) of the position's error to `goal_xy`, m, world axes: limited, and frozen
-    while the error is large. The integral removes the offset that a steady draught leaves."""
+    """The integral (x, y) of the position's error to `goal_xy`, m, world axes, which removes the
+    offset that a steady wind leaves. It is limited, and frozen while the vehicle is still on its
+    way: a large error counts only once the vehicle stands still in the air."""
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
     tx, ty = c.state.integral_m
-    if math.hypot(ex, ey) < 0.06:
+    if math.hypot(ex, ey) < SMALL_ERROR_M or c.speed_mps < STANDS_MPS:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
-    size = math.hypot(tx, ty)
-    if size > planner.integral_limit_m:
-        tx, ty = tx * planner.integral_limit_m / size, ty * planner.integral_limit_m / size
-    return tx, ty
+    return limited(tx, ty, planner.integral_limit_m)
+
+
+def anchor_in_wind(c: Context) -> Context:
+    """The context with a setpoint where the vehicle is, and with the integral that holds it there,
+    if it stands still in the air: the same command as before. A vehicle on its way keeps its
+    setpoint and integral. One without a setpoint, or whose positions lead astray, has no
+    integral."""
+    reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
+    if reference is None or c.state.astray:
+        return c.evolve(integral_m=(0.0, 0.0))
+    if not c.placed or c.speed_mps > STANDS_MPS:
+        return c
+    sent = correct_setpoint(c, reference)
+    return c.evolve(
+        setpoint=replace(reference, x_m=x_m, y_m=y_m),
+        integral_m=limited(sent.x_m - x_m, sent.y_m - y_m, c.planner.integral_limit_m),
+    )
+
+
+def limited(x: float, y: float, most: float) -> tuple[float, float]:
+    """The vector (x, y), shortened to a length of `most`."""
+    size = math.hypot(x, y)
+    return (x, y) if size <= most else (x * most / size, y * most / size)
 
 
 def correct_setpoint(
@@ -127,7 +152,7 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
         return 0.0, 0.0
-    (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.telemetry.velocity_mps
+    (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.velocity_mps
     dx = gain * (POSITION_GAIN * (reference.x_m - x) - VELOCITY_GAIN_S * vx)
     dy = gain * (POSITION_GAIN * (reference.y_m - y) - VELOCITY_GAIN_S * vy)
     size = math.hypot(dx, dy)
@@ -194,7 +219,8 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     below_m = UNWIND_M if away_m < UNPRESSED_M else UNWIND_AWAY_M
     if tel.velocity_mps[2] < FALLING_MPS:
         below_m = 0.0
-    setpoint = PositionSetpoint(x, y, tel.position_m[2] - below_m, state.entry_yaw_rad)
+    dx, dy = state.integral_m
+    setpoint = PositionSetpoint(x + dx, y + dy, tel.position_m[2] - below_m, state.entry_yaw_rad)
     return state, limit_setpoint(c, setpoint)
 
 

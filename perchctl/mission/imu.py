@@ -35,13 +35,19 @@ STEADY_MPS, STEADY_ASIDE_MPS, ASIDE_MEMORY_S = 0.06, 0.15, 0.15
 REST_MEMORY_S = 0.5  # at rest on the ground the offsets are learned in so long
 SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
 """In so long the reckoned speed is drawn to a believed estimate's, and the offsets are learned."""
-MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5  # more is a blow, or a correction of the estimate
+MOST_BIAS_MPS2 = 1.5
+"""A wind of 4 m/s, which the firmware takes for a tilt, makes 1.2 m/s2. Larger: wrong positions
+teach a bias that no attitude has."""
+MOST_WRONG_MPS2 = 2.0  # in one sample; more is a blow, or a correction of the estimate
 CLIMB_SPARE_MPS = 0.1  # it may climb faster than reckoned
 MOST_CLIMB_MPS = 1.0  # in a silence, by the position mode's own limit
 REACH_M = 0.04  # a gear so near below the target may have been caught by its magnet
 MISSED_MEMORY_S = 1.0
 """In so long positions correct a speed that the estimate has missed. Larger: what a wrong attitude
 adds in seconds looks like a blow. Smaller: a blow just before the last sight is forgotten."""
+VELOCITY_MEMORY_S = 2.0
+"""In so long the bias of the estimated velocity is learned. Larger: a wind that has turned makes
+the vehicle seem to move for longer. Smaller: noise of the position is taken for a bias."""
 BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.06, 1.5
 """A push from the side shows in the estimate a second or two later."""
 PUSH_MEMORY_S = 0.05  # turning motors shake single samples by as much as a push gives
@@ -359,6 +365,9 @@ class DeadReckoning:
     stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate since
     stepped_s: float = -math.inf  # the newest of them
     struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
+    velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # sideways, of the estimated velocity
+    mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # of the estimate, over the last seconds
+    mean_position_m: tuple[float, float] | None = None  # the same of its position
 
 
 def advance_reckoning(
@@ -463,6 +472,56 @@ def advance_reckoning(
         aside_m=(ex - vx * dt_s, ey - vy * dt_s),
         aside_sigma_m=old.aside_sigma_m + growth_m,
     )
+
+
+def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> DeadReckoning:
+    """The reckoning with the bias of the estimated velocity, from two samples of a flight in which
+    positions hold the vehicle in the open.
+
+    In a steady wind the firmware takes the air's drag for a tilt, and its estimate reads up to
+    0.4 m/s while the vehicle stands still in the air. The bias is the estimated velocity less what
+    the estimated position moves by, both through the same low pass. It is wrong for some
+    `VELOCITY_MEMORY_S` after the wind has changed.
+    """
+    dt_s = new.t_s - last.t_s
+    if not 0.0 < dt_s <= GAP_S:
+        return forget_means(old)
+    share = 1.0 - math.exp(-dt_s / VELOCITY_MEMORY_S)
+    before_m = old.mean_position_m or new.position_m[:2]
+    before_mps = old.velocity_bias_mps if old.mean_position_m is None else old.mean_velocity_mps
+    velocity, position, bias = [], [], []
+    for i in range(2):
+        velocity.append(before_mps[i] + share * (new.velocity_mps[i] - before_mps[i]))
+        position.append(before_m[i] + share * (new.position_m[i] - before_m[i]))
+        bias.append(velocity[i] - (new.position_m[i] - position[i]) / VELOCITY_MEMORY_S)
+    return replace(
+        old,
+        velocity_bias_mps=(bias[0], bias[1]),
+        mean_velocity_mps=(velocity[0], velocity[1]),
+        mean_position_m=(position[0], position[1]),
+    )
+
+
+def learn_bias_at_rest(
+    old: DeadReckoning, before: ImuMotion | None, now: ImuMotion
+) -> DeadReckoning:
+    """The reckoning of a vehicle that something holds still: all acceleration sideways between the
+    two motions is bias. The attitude's error, and the bias with it, changes within a second there,
+    since the wind that the estimate has taken for a tilt no longer moves the vehicle."""
+    if before is None or not 0.0 < now.t_s - before.t_s <= GAP_S or now.silent_s > before.t_s:
+        return old
+    dt_s = now.t_s - before.t_s
+    share = 1.0 - math.exp(-dt_s / REST_MEMORY_S)
+    x_mps2, y_mps2 = ((now.velocity_mps[i] - before.velocity_mps[i]) / dt_s for i in range(2))
+    bx, by, bz = old.bias_mps2
+    bias = bx + share * (x_mps2 - bx), by + share * (y_mps2 - by)
+    return replace(old, bias_mps2=(*bias, bz))
+
+
+def forget_means(old: DeadReckoning) -> DeadReckoning:
+    """The reckoning after a time in which the velocity's bias could not be learned: the bias stays,
+    and the means begin anew."""
+    return old if old.mean_position_m is None else replace(old, mean_position_m=None)
 
 
 def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:

@@ -25,9 +25,11 @@ from perchctl.mission.conditions import (
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
 from perchctl.mission.guidance import (
     CATCH_STILL_ABOVE_M,
+    LIFTED_M,
     STILL_THRUST,
     THRUST_MIN,
     Action,
+    anchor_in_wind,
     catch_goal_above_m,
     catch_slip,
     clear_contact_below,
@@ -46,8 +48,18 @@ from perchctl.mission.imu import (
     add_position_step,
     add_sighting,
     advance_reckoning,
+    forget_means,
+    learn_bias_at_rest,
+    learn_velocity_bias,
 )
-from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
+from perchctl.mission.state import (
+    IN_THE_OPEN,
+    Condition,
+    Observation,
+    Phase,
+    PlannerState,
+    Severity,
+)
 from perchctl.profile import PlannerConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import (
@@ -98,10 +110,11 @@ ON_THE_SPOT_S = 0.6  # by setpoints at one place; no speed is left then
 RAMP_PER_S, STILL_MPS = 0.25, 0.05  # what does not sink gets less and less thrust
 LEAST_PART, MOST_RAW = 0.4, 60000.0
 BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22  # takes 2.5 % of the thrust
+MOST_LEAN_RAD = 0.2
+"""Against a wind of 6 m/s. Larger: a blow, or a wrong bias, throws the vehicle aside."""
 BRAKED_AGE_S = 0.2  # an older speed is braked less, or it swings
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
 """An attitude error of 0.01 rad adds 0.1 m/s each second."""
-LEVEL_FELT_S = 6.0  # an attitude error of before is not the present one
 STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
 UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther
 CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
@@ -155,6 +168,8 @@ def enter_landing(c: Context, old: PlannerState) -> Context:
         # It may be in the magnet's reach, also below a sheet that hangs above an unseen ceiling:
         # it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
+    # Where it stands still in the air, what holds it there goes down with it.
+    c = anchor_in_wind(c)
     hover = _hover_thrust(old, c.obs)
     within = contact_z_m is not None or c.state.reckoning.below_m < REACH_M
     blind = _has_lost_its_position(c)
@@ -329,6 +344,8 @@ def give_up_position(c: Context) -> Context:
 def _reckon(c: Context) -> PlannerState:
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
+    # What pushes the vehicle while no sight corrects its estimate is no bias of the accelerometer.
+    believed = believed and (c.is_corrected or not c.by_sight)
     astray = state.astray and not c.by_sight
     new = advance_reckoning(
         state.reckoning,
@@ -338,6 +355,10 @@ def _reckon(c: Context) -> PlannerState:
         astray=astray,
         corrected=c.is_corrected,
     )
+    if believed and state.phase in IN_THE_OPEN and c.height_m > LIFTED_M and state.last:
+        new = learn_velocity_bias(new, state.last, obs.telemetry)
+    else:
+        new = forget_means(new)
     if c.located and not c.by_sight and state.last is not None:
         new = add_position_step(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
@@ -345,6 +366,8 @@ def _reckon(c: Context) -> PlannerState:
         blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
         x_mps, y_mps, _ = new.velocity_mps
         new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
+        if not blown:
+            new = learn_bias_at_rest(new, state.reckoning.imu, obs.imu)
     felt, late = obs.felt, c.mismatch.later_s != 0.0
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         # Late pictures have led the estimate's height astray, too.
@@ -430,6 +453,7 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
     return replace(
         state,
+        reckoning=forget_means(state.reckoning),
         setpoint=setpoint,
         ground_m=None if state.ground_m is None else _moved(state.ground_m, moved_m),
         entry_m=_moved(state.entry_m, moved_m),
@@ -557,7 +581,9 @@ def _by_setpoints(c: Context) -> Action:
     if c.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(clear_contact_below(c, PEELED_M).state, setpoint=setpoint, caught=True)
-    return state, limit_setpoint(c, setpoint)
+    dx, dy = state.integral_m
+    sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
+    return state, limit_setpoint(c, sent)
 
 
 def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
@@ -701,24 +727,45 @@ def _is_overdue(c: Context) -> bool:
 
 
 def _braking(c: Context) -> tuple[float, float]:
-    """Tilt against sideways speed and the attitude error of pictures; level without a heading."""
+    """Roll and pitch that stand against the wind and brake the sideways speed; level without a
+    heading.
+
+    The thrust acts along the body's z axis, so what the accelerometer reads across it is the air's
+    force w, m/s2. Level thrust g tan(tilt) has to give -w, and the estimated attitude is off by
+    b / g, where b is the excess of accelerometer and attitude that was learned while a position
+    was known: the estimated lean is (b - w) / g. An offset of the accelerometer is in both.
+    """
     if c.state.heading_lost or is_in_magnet_reach(c):
         return 0.0, 0.0
-    yaw_rad = c.telemetry.yaw_rad
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    x_mps, y_mps, _ = c.state.reckoning.velocity_mps
+    imu, reckoning, yaw_rad = c.obs.imu, c.state.reckoning, c.telemetry.yaw_rad
+    x_mps, y_mps, _ = reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if c.state.blind_s is None else c.t_s - c.state.blind_s
     felt_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
     unsure_mps = min(MOST_UNSURE_MPS, UNSURE_MPS + UNSURE_MPS2 * min(blind_s, felt_s))
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, c.attitude_age_s))
-    level_s = max(0.0, 1.0 - felt_s / LEVEL_FELT_S) / (GRAVITY_MPS2 * BRAKE_RAD_PER_MPS)
-    bx_mps2, by_mps2, _ = c.state.reckoning.bias_mps2
-    x_mps, y_mps = part * x_mps - level_s * bx_mps2, part * y_mps - level_s * by_mps2
-    ahead_mps, left_mps = x_mps * cos + y_mps * sin, y_mps * cos - x_mps * sin
-    roll_rad, pitch_rad = c.obs.imu.misled_rad
-    return _against(-left_mps) + roll_rad, _against(ahead_mps) + pitch_rad
+    ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
+    bias_x_mps2, bias_y_mps2, _ = reckoning.bias_mps2
+    ahead_mps2, left_mps2 = _in_heading(bias_x_mps2, bias_y_mps2, yaw_rad)
+    if c.imu_proves:
+        ahead_mps2 -= GRAVITY_MPS2 * imu.aside_g[0]
+        left_mps2 -= GRAVITY_MPS2 * imu.aside_g[1]
+    roll_rad, pitch_rad = imu.misled_rad
+    return (
+        _against(-left_mps) - _lean_rad(left_mps2) + roll_rad,
+        _against(ahead_mps) + _lean_rad(ahead_mps2) + pitch_rad,
+    )
+
+
+def _in_heading(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
+    """World x and y as ahead and left of a vehicle with this heading."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return x * cos + y * sin, y * cos - x * sin
+
+
+def _lean_rad(mps2: float) -> float:
+    return max(-MOST_LEAN_RAD, min(MOST_LEAN_RAD, math.atan(mps2 / GRAVITY_MPS2)))
 
 
 def _against(mps: float) -> float:

@@ -48,6 +48,7 @@ from perchctl.mission.guidance import (
 from perchctl.mission.imu import discount_wrong_positions
 from perchctl.mission.mounting import MountingMonitor, mount_sample, update_monitor
 from perchctl.mission.state import (
+    IN_THE_OPEN,
     Condition,
     ContactError,
     Observation,
@@ -57,7 +58,6 @@ from perchctl.mission.state import (
     Severity,
 )
 from perchctl.mission.table import (
-    IN_THE_OPEN,
     TABLE,
     Transition,
     first_transition,

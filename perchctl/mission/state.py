@@ -50,6 +50,8 @@ class Phase(Enum):
 SEVEN_PHASES = tuple(Phase)[:7]
 FLYING_PHASES = frozenset({*SEVEN_PHASES, Phase.RECOVER})
 BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
+BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
+IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
 TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 
 

@@ -35,7 +35,9 @@ from perchctl.mission.lander import (
 )
 from perchctl.mission.state import (
     BEFORE_CONTACT,
+    BY_CAMERA,
     FLYING_PHASES,
+    IN_THE_OPEN,
     Condition,
     Operator,
     Outcome,
@@ -78,8 +80,6 @@ P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of
 
 # Where a transition applies.
 AIR = FLYING_PHASES | {P.LANDING}
-BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
-IN_THE_OPEN = BY_CAMERA | {P.APPROACH}
 BEFORE_COMPLETION = BY_CAMERA | {P.PERCH}
 
 KNOCKED_S = 0.04  # more than one sample of telemetry
