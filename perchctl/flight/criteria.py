@@ -311,8 +311,8 @@ class GroundCriteria:
 
     @staticmethod
     def moving_estimate(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-        """Problem: in the last `REST_S` of `samples`, oldest first, the state estimate has moved or
-        had a speed.
+        """Problem: within `rest_window` of `samples`, oldest first, the state estimate has moved
+        or had a speed.
 
         A vehicle that stands still keeps its place, so something leads its estimate away: flow over
         a dark floor, a base station that was moved, positions of another body. Or the vehicle is
@@ -324,7 +324,7 @@ class GroundCriteria:
         newest, advice = samples[-1], "let it stand still; if it did, check its positioning"
         if profile.positioning.by == "deck":
             advice += " (light, floor, base stations)"
-        window = [s for s in samples if newest.t_s - s.t_s <= REST_S and s.start == newest.start]
+        window = rest_window(samples)
         lasts_s = newest.t_s - window[0].t_s
         moved_m = math.dist(window[0].position_m, newest.position_m)
         if not moved_m <= DRIFT_M:
@@ -388,6 +388,15 @@ class GroundCriteria:
             f"{y:.2f} m), and the fence is {fence_m:g} m",
             "correct target.expected_xy_m, or positioning.body if it names another vehicle's body",
         )
+
+
+def rest_window(samples: Sequence[Telemetry]) -> list[Telemetry]:
+    """The samples, oldest first, that show whether a vehicle has stood still for `REST_S`: those
+    of that time and the one before, without which a pause would show nothing. Only those of the
+    newest sample's start of the vehicle; all of them if they span less."""
+    same = [s for s in samples if s.start == samples[-1].start]
+    first = max((i for i, s in enumerate(same) if same[-1].t_s - s.t_s >= REST_S), default=0)
+    return same[first:]
 
 
 def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:

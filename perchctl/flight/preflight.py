@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from perchctl.flight.criteria import (
     RestCheck,
     estimate_problem,
     feed_name,
+    rest_window,
     unsent_problem,
 )
 from perchctl.geometry import Place, rot_z
@@ -158,11 +160,16 @@ def still_waiting_for(turn: GroundTurn) -> str:
 
 
 def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-    """The problem of an estimate that moves, or was not yet seen to stand still for long enough."""
-    since_s = [sample.t_s for sample in samples if sample.start == samples[-1].start]
-    seen_s = since_s[-1] - since_s[0] if since_s else 0.0
+    """The problem of an estimate that moves, or was not yet seen to stand still for long enough:
+    what happened in a pause of the telemetry was not seen."""
+    window = rest_window(samples)
+    seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
         return Problem(f"seen for {seen_s:.1f} of {REST_S:g} s", "let it stand")
+    positions_s = [sample.t_s - sample.behind_s for sample in window]
+    pause_s = max(after_s - before_s for before_s, after_s in pairwise(positions_s))
+    if not pause_s <= profile.safety.telemetry_hold_s:
+        return Problem(f"telemetry paused for {pause_s:.1f} s", "let it stand")
     return GroundCriteria.moving_estimate(samples, profile)
 
 

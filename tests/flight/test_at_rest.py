@@ -14,6 +14,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import TimedOut
 from perchctl.flight import GroundCriteria, lockstep_feed
 from perchctl.flight.criteria import DRIFT_M, REST_S, STANDING_MPS
+from perchctl.flight.preflight import GroundTurn, still_waiting_for
 from perchctl.link import MockLink
 from perchctl.mission import Operator, Outcome
 from perchctl.profile import Profile, load_profile
@@ -112,8 +113,8 @@ def test_a_vehicle_whose_estimate_runs_away_does_not_take_off(mps: float) -> Non
 
 
 def thinned(sample: Telemetry, every: int) -> Telemetry | None:
-    """The sample, up to the take-off only if its number is a multiple of `every`."""
-    return sample if sample.t_s > 1.0 or round(100 * sample.t_s) % every == 0 else None
+    """The sample, up to the take-off only one of `every`; the vehicle gives none at time zero."""
+    return sample if sample.t_s > 1.0 or round(100 * sample.t_s) % every == 3 else None
 
 
 def first_setpoint_s(vehicle: Vehicle) -> float:
@@ -137,3 +138,36 @@ def test_a_take_off_waits_until_the_vehicle_was_seen_at_rest() -> None:
     assert first_setpoint_s(started_again) < 0.1
     started_again = Vehicle(lambda s: replace(s, start=int(s.t_s > -1.0)))
     assert first_setpoint_s(started_again) == pytest.approx(REST_S - 1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 3.0])
+def test_a_time_in_which_nothing_was_heard_is_no_time_at_rest(way_m: float) -> None:
+    """The vehicle may have been carried in it; what it shows afterwards counts anew."""
+    before, after = stands(0.01), [stands(5.0 + 0.1 * k) for k in range(21)]
+    after = [replace(sample, position_m=(way_m, 0.0, 0.0)) for sample in after]
+    for heard in range(1, 20):
+        assert "stand still" in still_waiting_for(
+            GroundTurn(PROFILE, 0.0, [before, *after[:heard]])
+        )
+    assert still_waiting_for(GroundTurn(PROFILE, 0.0, [before, *after])) == ""
+
+
+def test_a_pause_of_the_positions_alone_is_no_time_at_rest() -> None:
+    """Attitude goes on in its own packets, beside a position that grows old."""
+    samples = [stands(0.1 * k) for k in range(31)]
+    paused = [replace(s, behind_s=s.t_s - 1.0) if 1.0 < s.t_s < 2.0 else s for s in samples]
+    assert still_waiting_for(GroundTurn(PROFILE, 0.0, samples)) == ""
+    assert "paused for 1.0 s" in still_waiting_for(GroundTurn(PROFILE, 0.0, paused))
+
+
+def test_a_silence_before_take_off_is_waited_out() -> None:
+    silent = Vehicle(lambda s: s if s.t_s < -1.9 or s.t_s > 1.0 else None)
+    assert first_setpoint_s(silent) == pytest.approx(1.0 + REST_S, abs=0.1)
+
+
+def test_a_move_over_a_pause_is_named_by_the_check_too() -> None:
+    """Its samples show that the estimate is elsewhere."""
+    carried = [stands(0.01), replace(stands(5.0), position_m=(3.0, 0.0, 0.0))]
+    found = GroundCriteria.moving_estimate(carried, PROFILE)
+    assert found is not None
+    assert "moved 3.00 m in 5.0 s" in found.sentence
