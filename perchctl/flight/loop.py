@@ -142,9 +142,7 @@ def _wait_until_ready(
     started_s, at_rest = parts.clock.now(), RestCheck()
     while True:
         now_s = parts.clock.now()
-        if parts.operator() is not Operator.NONE:
-            ending = "disarming" if arming.has_begun else "nothing was started"
-            raise Interrupted(f"interrupted before take-off: {ending}")
+        _end_on_word(parts.operator(), arming)
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_unfit_vehicle(newest, parts.profile)
@@ -174,6 +172,8 @@ def _wait_until_ready(
                 f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
                 f"go on, from a camera or a longer recording"
             )
+        _end_on_word(parts.operator(), arming)  # given in this turn, it counts before the request
+        arming.note_waiting(waiting, now_s, parts.clock.now())
         if not waiting and newest is not None:
             positioning = inputs.target_positioning
             if positioning is not None and positioning.feed.target:
@@ -187,6 +187,13 @@ def _wait_until_ready(
                 parts.link.send(request)
                 watchers.sent(SentCommand(now_s, "preflight", request))
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
+
+
+def _end_on_word(word: Operator, arming: Arming) -> None:
+    """Raises Interrupted on the operator's word; the link then disarms as it is closed."""
+    if word is not Operator.NONE:
+        ending = "disarming" if arming.has_begun else "nothing was started"
+        raise Interrupted(f"interrupted before take-off: {ending}")
 
 
 def _mission(

@@ -192,24 +192,42 @@ ARMS_WITHIN_S = 5.0
 do not start after 2 s. A longer time keeps propellers turning on a vehicle that does not fly."""
 REQUEST_PERIOD_S = 0.25
 PAUSE_S = 0.5
-"""Something else was waited for: what was seen of the arming before says nothing any more."""
+"""So long something else may be waited for once the vehicle is to be armed, such as a late packet.
+A longer time keeps propellers turning on a vehicle that is picked up, or of which nothing is known;
+a shorter one ends a flight for a moment's disturbance."""
 
 
 class Arming:
     """Arms a vehicle that does not arm itself, once nothing else is waited for.
 
     Its propellers turn from then on, so it comes last: after the operator's word, and whatever the
-    wait for it took. A vehicle that has disarmed itself meanwhile is armed again.
+    wait for it took. From the first request on nothing else is waited for beyond a moment, and a
+    vehicle that disarms itself is not armed again: someone may have reached for it.
     """
 
     def __init__(self) -> None:
-        self._began_s = self._asked_s = self._requested_s = -math.inf
+        self._ready_s = self._requested_s = -math.inf
+        self._began_s: float | None = None
         self._was_armed = False
 
     @property
     def has_begun(self) -> bool:
         """True once the vehicle was to be armed."""
         return self._requested_s > -math.inf
+
+    def note_waiting(self, waiting: str, began_s: float, now_s: float) -> None:
+        """Note what else a turn, begun at `began_s` and now over, has waited for; empty if nothing.
+
+        Raises SafetyAbort if that has lasted for longer than `PAUSE_S` since the vehicle was to be
+        armed. A turn that hangs counts: nothing was seen in it.
+        """
+        if not waiting:
+            self._ready_s = began_s
+        elif self.has_begun and now_s - self._ready_s > PAUSE_S:
+            raise SafetyAbort(
+                f"after arming, waited {now_s - self._ready_s:.1f} s for {waiting}: disarming, not "
+                f"flying"
+            )
 
     def next_request(self, telemetry: Telemetry, now_s: float) -> Arm | None:
         """The request to send now, if any. To be called in each turn in which the vehicle
@@ -218,9 +236,8 @@ class Arming:
         Raises TimedOut if it does not arm within `ARMS_WITHIN_S`, SafetyAbort if it disarms itself
         while its motors start.
         """
-        if now_s - self._asked_s > PAUSE_S:
-            self._began_s, self._was_armed = now_s, False
-        self._asked_s = now_s
+        if self._began_s is None:
+            self._began_s = now_s
         bits = f"supervisor 0x{telemetry.supervisor:04X}"
         if telemetry.has_bit(ARMED):
             self._was_armed = True

@@ -27,7 +27,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight import FlyOptions, OperatorSwitch, fly_lockstep, fly_session
-from perchctl.flight.preflight import ARMS_WITHIN_S
+from perchctl.flight.preflight import ARMS_WITHIN_S, PAUSE_S
 from perchctl.link.crtp import encode
 from perchctl.mission import Operator, Outcome, SentCommand, Turn
 from perchctl.profile import find_calibration, load_profile
@@ -100,22 +100,89 @@ def test_it_is_armed_once_nothing_else_is_waited_for() -> None:
     assert rig.link.said(PositionSetpoint)[0] >= asked_s + SPIN_UP_S
 
 
-def test_it_is_armed_again_if_it_disarmed_itself_while_something_was_waited_for() -> None:
-    """Armed, it is tilted for longer than it stays armed; then it takes off."""
-    link = Unarmed(lasts_s=3.0)
-
-    def tilted(sample: Telemetry) -> Telemetry:
-        sample = link._with_bits(sample)
-        return replace(sample, roll_rad=0.5) if 0.2 < sample.t_s < 4.0 else sample
-
-    link._changed = tilted
+def test_the_arming_of_an_earlier_question_does_not_matter() -> None:
+    """It had been armed, and had disarmed itself by the time of the answer, half a minute later."""
+    link = Unarmed()
+    link.armed_s = -2.0
+    link._lasts_s = 1.0
     rig = Rig(link)
-    rig.operator = land_after(rig, 6.0)
+    rig.operator = land_after(rig, 3.0)
     assert rig.fly().outcome is Outcome.OPERATOR
-    first_s, second_s = link.said(Arm)
-    assert first_s < 0.2
-    assert 4.0 < second_s < 4.1
-    assert link.said(PositionSetpoint)[0] > second_s
+    assert len(link.said(Arm)) == 1
+
+
+def disturbed(
+    link: Unarmed, change: Callable[[Telemetry], Telemetry], since_s: float, until_s: float
+) -> Unarmed:
+    """The vehicle, with its samples changed for a while."""
+
+    def changed(sample: Telemetry) -> Telemetry:
+        sample = link._with_bits(sample)
+        return change(sample) if since_s < sample.t_s < until_s else sample
+
+    link._changed = changed
+    return link
+
+
+def shaken(sample: Telemetry) -> Telemetry:
+    return replace(sample, acc_z_g=1.3)
+
+
+def tilted(sample: Telemetry) -> Telemetry:
+    return replace(sample, roll_rad=sample.roll_rad + 0.5)  # alive
+
+
+@pytest.mark.parametrize("lasts_s", [math.inf, 3.0], ids=["stays armed", "disarms itself"])
+@pytest.mark.parametrize(
+    ("change", "words"), [(tilted, "to stand level"), (shaken, "to stand still")]
+)
+def test_a_vehicle_that_is_reached_for_once_armed_does_not_fly(
+    change: Callable[[Telemetry], Telemetry], words: str, lasts_s: float
+) -> None:
+    """Even if it is put down again, and whether or not it has disarmed itself meanwhile."""
+    link = disturbed(Unarmed(lasts_s=lasts_s), change, 0.2, 4.0)
+    rig = Rig(link)
+    with pytest.raises(SafetyAbort, match=rf"after arming, waited 0\.5 s for .*{words}.*disarming"):
+        rig.fly()
+    assert {type(command) for _, command in link.sent} == {Arm}
+    assert link.said(Arm)[-1] < 0.2
+    assert link.now_s == pytest.approx(0.2 + PAUSE_S, abs=0.1)
+
+
+def test_a_camera_that_falls_silent_once_it_is_armed_ends_it() -> None:
+    link = Unarmed(spins_up=False)
+    rig = Rig(link, Camera(lambda frame: frame if frame.t_arrival_s < 0.2 else None))
+    with pytest.raises(SafetyAbort, match=r"after arming, waited .* for a good picture"):
+        rig.fly()
+    assert link.now_s < 1.5
+
+
+def test_a_loop_that_hangs_once_it_is_armed_ends_it() -> None:
+    """Nobody has watched the vehicle, whose propellers turn, for all that time."""
+    link, camera = Unarmed(), Camera()
+    hang_in_the_camera(link, camera, 0.1, 3.0)
+    with pytest.raises(SafetyAbort, match=r"for the flight loop to keep up .a turn took 3"):
+        Rig(link, camera).fly()
+    assert not link.said(PositionSetpoint)
+
+
+def test_a_moments_disturbance_once_it_is_armed_does_not_end_it() -> None:
+    link = disturbed(Unarmed(), shaken, 0.2, 0.5)
+    rig = Rig(link)
+    rig.operator = land_after(rig, 3.0)
+    assert rig.fly().outcome is Outcome.OPERATOR
+    assert len(link.said(Arm)) == 1
+    assert link.said(PositionSetpoint)[0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_word_given_in_a_slow_turn_comes_before_the_request() -> None:
+    """The turn began before it, and ends with a vehicle that is ready to be armed."""
+    link, camera = Unarmed(), Camera()
+    hang_in_the_camera(link, camera, -1.0, 0.2)
+    rig = Rig(link, camera, operator=lambda: Operator.LAND if link.now_s > 0.1 else Operator.NONE)
+    with pytest.raises(Interrupted, match="nothing was started"):
+        rig.fly()
+    assert link.sent == []
 
 
 @pytest.mark.parametrize(
