@@ -1,6 +1,7 @@
 """Who lands in the loop's place: the watchdog of a silent loop, and the rescue after an error.
 
 The watchdog decides what the link sends (`Link.set_guard`) where the loop's hanging does not reach.
+Before the loop's first tick nothing flies, and it only obeys the operator: it cuts or disarms.
 From `REPEAT_AFTER_S` of silence on the last position is held: never above the vehicle,
 so that it neither climbs nor presses. While it sinks, a setpoint above stays: it brakes. From
 `safety.loop_late_land_s` on, or on the operator's order, or where the loop was already on its way
@@ -17,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from perchctl.flight.clock import Clock
+from perchctl.flight.preflight import disarm_on_word
 from perchctl.link import Link
 from perchctl.mission import (
     Observation,
@@ -81,6 +83,7 @@ class Watchdog:
         self._profile = profile
         self._operator = operator
         self._position_age_s = position_age_s
+        self._on_ground = disarm_on_word(operator)
         # Written by the loop's thread:
         self._last: LastTick | None = None
         self._streamed: Command | None = None
@@ -129,9 +132,12 @@ class Watchdog:
         last = self._last
         if self._loop_has_cut or self._cut_ordered:
             return self._cut(now_s, newest)
-        if last is None or self._motors_off:
+        operator = self._operator()
+        if last is None:
+            return self._before_first_tick(operator, now_s, newest)
+        if self._motors_off:
             return None
-        operator, silent_s = self._operator(), now_s - last.obs.t_s
+        silent_s = now_s - last.obs.t_s
         if operator is Operator.STOP and (self._closing or silent_s > STOP_AFTER_S):
             self._cut_ordered = True
             return self._cut(now_s, newest)
@@ -148,6 +154,16 @@ class Watchdog:
         if overruled or self._way_down is not None or _is_on_its_way_down(last.state):
             return self._land(obs, last)
         return self._hold(now_s, last, newest)
+
+    def _before_first_tick(
+        self, operator: Operator, now_s: float, newest: Telemetry | None
+    ) -> Command | None:
+        """The operator's word, which a first turn that hangs or fails does not read. Its command
+        may have gone out even so: a stop cuts, and only on the ground a landing disarms."""
+        if operator is Operator.STOP:
+            self._cut_ordered = True
+            return self._cut(now_s, newest)
+        return self._on_ground(now_s, newest)
 
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
         """The emergency stop until the vehicle is seen to be locked. Bounded."""

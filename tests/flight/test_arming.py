@@ -41,6 +41,7 @@ from perchctl.vehicle import (
     CAN_FLY,
     Arm,
     Command,
+    EmergencyStop,
     PositionSetpoint,
     Telemetry,
 )
@@ -230,6 +231,32 @@ def test_ctrl_c_disarms_while_the_loop_hangs_on_the_ground(pressed: Operator) ->
     disarmed_s, order = link.own[0]
     assert (order, disarmed_s) == (Arm(False), pytest.approx(1.0, abs=0.06))
     assert link.armed_s is None
+
+
+@pytest.mark.parametrize(
+    ("pressed", "order"), [(Operator.LAND, Arm(False)), (Operator.STOP, EmergencyStop())]
+)
+def test_the_word_reaches_an_armed_vehicle_whose_first_turn_of_flight_hangs(
+    pressed: Operator, order: Command
+) -> None:
+    """Its propellers turn, and the loop has not decided anything yet."""
+    link, camera = UnarmedAndGuarded(), Camera()
+    poll, ready = camera.poll, list[float]()
+
+    def hang_once_ready(now_s: float) -> Frame | None:
+        frame = poll(now_s)
+        if not ready and link.watchdog.__qualname__ == "Watchdog.poll":
+            ready.append(now_s)
+            link.advance_to(now_s + 3.0)
+        return frame
+
+    camera.poll = hang_once_ready  # type: ignore[method-assign]
+    rig = Rig(link, camera)
+    rig.operator = lambda: pressed if ready and link.now_s > ready[0] + 1.0 else Operator.NONE
+    rig.fly()
+    assert not link.said(PositionSetpoint)
+    sent_s, sent = link.own[0]
+    assert (sent, sent_s) == (order, pytest.approx(ready[0] + 1.0, abs=0.06))
 
 
 def test_a_vehicle_that_arms_itself_is_asked_for_nothing() -> None:

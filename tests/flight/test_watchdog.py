@@ -15,8 +15,12 @@ from perchctl.mission.guidance import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
 from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
 from perchctl.profile import Profile
 from perchctl.vehicle import (
+    ARMED,
+    CAN_FLY,
+    FLYING,
     HL_ACTIVE,
     LOCKED,
+    Arm,
     Command,
     EmergencyStop,
     Idle,
@@ -79,7 +83,39 @@ class Rig:
 @pytest.mark.parametrize("silent_s", [0.0, 0.02, 0.1, 0.29])
 def test_a_loop_that_lives_or_has_not_begun_is_left_alone(silent_s: float) -> None:
     assert Rig().after(silent_s) is None
-    assert Watchdog(PROFILE, lambda: Operator.STOP).poll(1e6, telemetry(1e6)) is None
+    assert Watchdog(PROFILE, lambda: Operator.NONE).poll(1e6, telemetry(1e6)) is None
+
+
+ARMED_BITS = ARMED | CAN_FLY
+
+
+@pytest.mark.parametrize(("word", "bits", "sent"), [
+    (Operator.STOP, ARMED_BITS, EmergencyStop()),
+    (Operator.STOP, AIRBORNE, EmergencyStop()),  # the first command may have gone out
+    (Operator.LAND, ARMED_BITS, Arm(False)),
+    (Operator.LAND, ARMED_BITS | FLYING, None),  # in the air disarming would drop it
+    (Operator.LAND, READY, None),
+    (Operator.NONE, ARMED_BITS, None),
+])  # fmt: skip
+@pytest.mark.parametrize("has_failed", [False, True])
+def test_the_operators_word_counts_before_the_first_tick(
+    word: Operator, bits: int, sent: Command | None, has_failed: bool
+) -> None:
+    dog = Watchdog(PROFILE, lambda: word)
+    if has_failed:
+        dog.note_rescue()
+    assert dog.poll(T_S, telemetry(T_S, 0.0, supervisor=bits)) == sent
+
+
+def test_a_cut_before_the_first_tick_is_repeated_until_it_shows() -> None:
+    dog = Watchdog(PROFILE, lambda: Operator.STOP)
+    times_s = [T_S + CUT_PERIOD_S * k for k in range(4)]
+    bits = [ARMED_BITS, ARMED_BITS, ARMED_BITS, LOCKED]
+    sent = [
+        dog.poll(t_s, telemetry(t_s, 0.0, supervisor=each, thrust=0.0))
+        for t_s, each in zip(times_s, bits, strict=True)
+    ]
+    assert sent == [EmergencyStop()] * 3 + [None]
 
 
 # --- 0.3 s: the last safe setpoint ------------------------------------------------------------
