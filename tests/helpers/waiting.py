@@ -22,16 +22,35 @@ BEAT_S = 0.005
 
 
 class Stopwatch:
-    """How long something took, and for how long of it the processor was another's."""
+    """How long something took, and for how long of it the processor was another's.
 
-    def __init__(self) -> None:
-        self.began_s = time.monotonic()
+    Code under test that holds the interpreter's lock for longer than `BEAT_S`, in a call of C,
+    counts as another program: such a hang cannot be measured with it.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.began_s = clock()
         self.starved_s = 0.0
 
     @property
     def took_s(self) -> float:
         """Without the time in which this process could not run: what it waited or worked for."""
-        return time.monotonic() - self.began_s - self.starved_s
+        return self._clock() - self.began_s - self.starved_s
+
+    def longest_call_s(
+        self, call: Callable[[], object], pause: Callable[[], object], for_s: float
+    ) -> float:
+        """The longest of the calls that fit into `for_s`, with a pause behind each: from each only
+        its own starvation is taken off. That may be noticed in the pause, hence both together."""
+        end_s, longest_s = self._clock() + for_s, 0.0
+        while (began_s := self._clock()) < end_s:
+            starved_s = self.starved_s
+            call()
+            took_s = self._clock() - began_s
+            pause()
+            longest_s = max(longest_s, took_s - (self.starved_s - starved_s))
+        return longest_s
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from perchctl.profile import LinkConfig
 from perchctl.sim import Scenario
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint
 from tests.helpers.radio import FORGETS_LOGS_S, URI, Air, plug_in
-from tests.helpers.waiting import stopwatch
+from tests.helpers.waiting import Stopwatch, stopwatch
 
 OTHER_URI = "radio://0/81/2M/E7E7E7E7E7"
 FLOOR = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
@@ -74,15 +74,19 @@ class Flown:
     def stream(self, for_s: float) -> float:
         """As the flight loop does; the longest that one call of the link took, but for the time in
         which another program had the processor."""
+
+        def turn() -> None:
+            self.link.send(HOLD)
+            self.link.telemetry()
+            self.problem()
+
         with stopwatch() as watch:
-            end_s, longest_s = time.monotonic() + for_s, 0.0
-            while (began_s := time.monotonic()) < end_s:
-                self.link.send(HOLD)
-                self.link.telemetry()
-                self.problem()
-                longest_s = max(longest_s, time.monotonic() - began_s)
-                PAUSE.wait(STREAM_S)
-        return longest_s - watch.starved_s
+            return watch.longest_call_s(turn, lambda: PAUSE.wait(STREAM_S), for_s)
+
+    def after_streaming(self, true: Callable[[], Any]) -> Any:
+        """Stream for a moment, and then what `true` returns."""
+        self.stream(STREAM_S)
+        return true()
 
     def answers_again(self) -> float:
         """The radio does; when that was."""
@@ -153,6 +157,29 @@ class Operator:
         return EmergencyStop() if self.pressed else None
 
 
+# --- The measure itself -----------------------------------------------------------------------
+
+
+def test_a_call_that_hangs_is_measured_whatever_starves_the_others() -> None:
+    """Twenty calls that another program delays, and one that hangs by itself."""
+    now_s = 0.0
+    delayed = [(0.015, 0.015)] * 10
+    script = iter([*delayed, (0.3, 0.0), *delayed])
+
+    def call() -> None:
+        nonlocal now_s
+        took_s, starved_s = next(script)
+        now_s += took_s
+        watch.starved_s += starved_s
+
+    def pause() -> None:
+        nonlocal now_s
+        now_s += STREAM_S
+
+    watch = Stopwatch(lambda: now_s)
+    assert watch.longest_call_s(call, pause, 0.9) == pytest.approx(0.3)
+
+
 # --- Silence ----------------------------------------------------------------------------------
 
 
@@ -187,7 +214,7 @@ def test_the_operators_stop_goes_out_after_silence_though_the_loop_hangs(flown: 
 
 def test_half_a_second_without_room_is_a_problem_and_less_is_none(flown: Flown) -> None:
     flown.air.silent.set()
-    passed_s = flown.until(lambda: flown.stream(STREAM_S) and flown.problem())
+    passed_s = flown.until(lambda: flown.after_streaming(flown.problem))
     assert 0.5 <= passed_s < 1.0
 
 
@@ -296,7 +323,7 @@ def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flo
 def test_a_dongle_that_was_pulled_out_and_put_in_again_goes_on(flown: Flown) -> None:
     driver, opened = flown.cf.link, flown.air.opened
     flown.air.unplugged.set()
-    flown.until(lambda: flown.stream(STREAM_S) and flown.cf.link is not driver)
+    flown.until(lambda: flown.after_streaming(lambda: flown.cf.link is not driver))
     assert flown.problem() is not None
     began_s = time.monotonic()
     flown.link.send(EmergencyStop())
