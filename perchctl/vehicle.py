@@ -98,10 +98,10 @@ def is_disarmed(newest: Telemetry) -> bool:
     return newest.has_bit(CAN_ARM) and not newest.has_bit(ARMED | AUTO_ARM)
 
 
-def is_armed_by_request(newest: Telemetry) -> bool:
-    """True if a vehicle that does not arm itself is armed: its propellers turn, on the ground,
-    too."""
-    return newest.has_bit(ARMED) and not newest.has_bit(AUTO_ARM)
+def is_armed_by_request(supervisor: int) -> bool:
+    """True if by the supervisor's bits a vehicle that does not arm itself is armed: its propellers
+    turn, on the ground, too."""
+    return bool(supervisor & ARMED) and not supervisor & AUTO_ARM
 
 
 def is_emergency_stopped(newest: Telemetry | None, now_s: float) -> bool:

@@ -105,7 +105,7 @@ class VehicleStatus:
     @property
     def is_armed(self) -> bool:
         """True if the vehicle is armed and does not arm itself: its propellers may turn."""
-        return self.telemetry is not None and is_armed_by_request(self.telemetry)
+        return self.telemetry is not None and is_armed_by_request(self.telemetry.supervisor)
 
     def position_decks(self, profile: Profile) -> tuple[str, ...]:
         known = (*POSITION_DECKS, *profile.positioning.decks)

@@ -127,7 +127,7 @@ class GroundCriteria:
         telemetry = self.telemetry
         if telemetry.has_bit(CAN_FLY):
             return False
-        return is_disarmed(telemetry) or is_armed_by_request(telemetry)
+        return is_disarmed(telemetry) or is_armed_by_request(telemetry.supervisor)
 
     @property
     def supervisor_not_ready(self) -> Problem | None:

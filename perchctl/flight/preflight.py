@@ -265,7 +265,8 @@ def disarm_on_word(operator: Callable[[], Operator]) -> Callable[..., Arm | None
     ) -> Arm | None:
         if operator() is Operator.NONE or may_be_flying(newest, now_s):
             return None
-        return Arm(False) if newest is not None and is_armed_by_request(newest) else None
+        is_armed = newest is not None and is_armed_by_request(newest.supervisor)
+        return Arm(False) if is_armed else None
 
     return poll
 

@@ -250,7 +250,7 @@ class CflibLink:
     def _is_armed(self) -> bool:
         """True if the vehicle does not arm itself, and is armed."""
         newest = self._blocks.newest
-        return newest is not None and is_armed_by_request(newest)
+        return newest is not None and is_armed_by_request(newest.supervisor)
 
     def _may_say_farewell(self) -> bool:
         """True where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""

@@ -39,7 +39,7 @@ from perchctl.link.firmware import (
 from perchctl.link.protocol import FORMS, USUAL_ADDRESS
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S, Timebase, start_block
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import ARMED, AUTO_ARM, FLYING
+from perchctl.vehicle import FLYING, is_armed_by_request
 
 
 class ReadOnlyLink(CflibLink):
@@ -109,7 +109,7 @@ class AttitudeLink(ReadOnlyLink):
         now_s = self._blocks.last_arrival_s = self._clock()
         t_s = self._timebase.to_loop_s(stamp, now_s)
         bits = int(values["supervisor.info"])
-        self._motors_run = bool(bits & FLYING) or (bool(bits & ARMED) and not bits & AUTO_ARM)
+        self._motors_run = bool(bits & FLYING) or is_armed_by_request(bits)
         self._heard.set()
         if all(map(math.isfinite, values.values())):
             self._samples.append(
