@@ -21,6 +21,7 @@ from perchctl.flight.preflight import (
     GroundTurn,
     abort_on,
     disarm_on_word,
+    refuse_armed,
     refuse_unfit_vehicle,
     refuse_without_positions,
     refuse_wrong_positions,
@@ -146,6 +147,8 @@ def _wait_until_ready(
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_unfit_vehicle(newest, parts.profile)
+        if not arming.has_begun:
+            refuse_armed(newest)
         feed = _outside(parts, inputs, now_s)
         refuse_wrong_positions(feed, newest, parts.profile, now_s, at_rest)
         turns.report_waiting_turn(inputs, now_s, feed)

@@ -45,6 +45,16 @@ def refuse_unfit_vehicle(telemetry: Telemetry | None, profile: Profile) -> None:
         abort_on(criteria.supervisor_fault or battery)
 
 
+def refuse_armed(telemetry: Telemetry | None) -> None:
+    """Raises SafetyAbort if a vehicle that does not arm itself is armed before perchctl has armed
+    it: whoever has, also commands it."""
+    if telemetry is not None and is_armed_by_request(telemetry.supervisor):
+        raise SafetyAbort(
+            "the vehicle is armed, and perchctl has not armed it: keep away from its propellers, "
+            "and end whatever armed it; not flying"
+        )
+
+
 def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) -> None:
     """Raises SafetyAbort without any position source. `has_feed`: the positions of a motion
     capture are being sent."""

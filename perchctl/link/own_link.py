@@ -7,11 +7,21 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+from perchctl.errors import ConnectionFailed, TimedOut
 from perchctl.extensions import error_at
 from perchctl.link.arming import disarm, warn_of_armed
 from perchctl.link.protocol import LANDING_WAIT_S, Guard, SentCallback, VehicleLink, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
-from perchctl.vehicle import Arm, Command, ExternalPosition, Idle, Telemetry, may_be_flying
+from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S
+from perchctl.vehicle import (
+    Arm,
+    Command,
+    ExternalPosition,
+    Idle,
+    Telemetry,
+    is_armed_by_request,
+    may_be_flying,
+)
 
 READ_PERIOD_S = 0.005
 AHEAD_S = 0.1
@@ -35,15 +45,29 @@ class GuardedLink:
         self._trouble: str | None = None  # the link's own word, or its error, of the last round
         self._answered_s: float | None = None  # end of the reader's last round
         self._was_armed = False  # by an order of this session
-        self._closing = threading.Event()
+        self._first_sample, self._closing = threading.Event(), threading.Event()
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
         self._sender = Sender(self._hand_over, self._ask, clock, lambda sent: self._on_sent(sent))
 
     def connect(self) -> None:
+        """Connect, and see that the vehicle is not armed yet.
+
+        Raises TimedOut without telemetry, by which alone that can be known, and ConnectionFailed if
+        it is armed: its propellers would turn before the operator has said yes.
+        """
         self._inner.connect()
         self._answered_s = self._clock()
         threading.Thread(target=self._read, name="perchctl-own-link", daemon=True).start()
+        if not self._first_sample.wait(FIRST_SAMPLE_TIMEOUT_S) or self._newest is None:
+            cause = f": {self._trouble}" if self._trouble else ""
+            raise TimedOut(f"your own link is connected but gives no telemetry{cause}")
+        if is_armed_by_request(self._newest.supervisor):
+            raise ConnectionFailed(
+                "the vehicle of your own link is armed already: keep away from its propellers; "
+                "connect must not arm it, since perchctl sends Arm just before take-off; if it "
+                "arms itself, with its motors still, its telemetry must have the bit AUTO_ARM"
+            )
 
     def telemetry(self) -> list[Telemetry]:
         with self._lock:
@@ -110,6 +134,8 @@ class GuardedLink:
                 with self._lock:
                     self._waiting += samples
                     self._newest = samples[-1] if samples else self._newest
+                if samples:
+                    self._first_sample.set()
                 self._trouble = self._inner.problem(self._clock())
             except BaseException as error:
                 self._trouble = f"telemetry() or problem() raised {error_at(error)}"

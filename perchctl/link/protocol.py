@@ -80,7 +80,8 @@ class VehicleLink(Protocol):
 
     def connect(self) -> None:
         """Connect to a vehicle on the ground, and prepare it for a flight; bounded in time. Must
-        not turn a motor, and so not arm: nobody has been asked yet. Raises one of
+        not turn a motor, and so not arm: nobody has been asked yet, and perchctl refuses a vehicle
+        that is armed without `AUTO_ARM`, or gives no telemetry within 3 s. Raises one of
         `perchctl.errors`, such as ConnectionFailed."""
 
     def decks(self) -> tuple[str, ...]:

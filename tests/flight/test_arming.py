@@ -112,6 +112,14 @@ def test_the_arming_of_an_earlier_question_does_not_matter() -> None:
     assert len(link.said(Arm)) == 1
 
 
+def test_what_somebody_else_has_armed_meanwhile_is_not_flown() -> None:
+    link = Unarmed()
+    link.armed_s = -0.5
+    with pytest.raises(SafetyAbort, match="is armed, and perchctl has not armed it: keep away"):
+        Rig(link).fly()
+    assert link.sent == []
+
+
 def disturbed(
     link: Unarmed, change: Callable[[Telemetry], Telemetry], since_s: float, until_s: float
 ) -> Unarmed:

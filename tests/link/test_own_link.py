@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 
-from perchctl.errors import Note
+from perchctl.errors import ConnectionFailed, Note, TimedOut
 from perchctl.link import GuardedLink
 from perchctl.link.protocol import LANDING_WAIT_S
 from perchctl.vehicle import (
     ARMED,
+    AUTO_ARM,
     CAN_ARM,
     CAN_FLY,
     FLYING,
@@ -229,9 +230,47 @@ def test_what_was_armed_for_the_flight_is_disarmed_as_the_link_is_closed(bits: i
     assert {type(command) for command in vehicle.sent} == {Arm}
 
 
+@pytest.mark.parametrize("bits", [ARMED, ARMED | CAN_FLY], ids=["starting", "ready"])
+def test_a_link_that_arms_as_it_connects_is_refused_and_disarmed(bits: int) -> None:
+    """Its propellers would turn while the operator is asked."""
+    vehicle = Vehicle()
+    vehicle.bits = bits
+    with pytest.raises(ConnectionFailed, match=r"armed already: keep away .* must not arm it"):
+        vehicle.link.connect()
+    vehicle.act["send"] = lambda: setattr(vehicle, "bits", CAN_ARM)
+    vehicle.act["problem"] = lambda: setattr(vehicle, "now_s", vehicle.now_s + 0.01)
+    vehicle.link.close()
+    assert set(vehicle.sent) == {Arm(False)}
+    assert vehicle.closed
+
+
+@pytest.mark.parametrize("bits", [CAN_ARM, AUTO_ARM | ARMED | CAN_FLY], ids=["waits", "by itself"])
+def test_a_link_that_does_not_arm_is_connected(bits: int) -> None:
+    vehicle = Vehicle()
+    vehicle.bits = bits
+    vehicle.link.connect()
+    vehicle.link.close()
+    assert vehicle.sent == []
+
+
+@pytest.mark.parametrize(("gives", "words"), [
+    (lambda: [], "gives no telemetry$"), (raises(OSError("no port")), "no telemetry: .*no port"),
+], ids=["none", "an error"])  # fmt: skip
+def test_a_link_without_telemetry_is_refused_since_it_may_be_armed(
+    gives: Any, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("perchctl.link.own_link.FIRST_SAMPLE_TIMEOUT_S", 0.1)
+    vehicle = Vehicle()
+    vehicle.act["telemetry"] = gives
+    with pytest.raises(TimedOut, match=words):
+        vehicle.link.connect()
+    vehicle.act["telemetry"] = lambda: [sample(vehicle.now_s, CAN_ARM)]  # it stands: to be closed
+    vehicle.link.close()
+
+
 def test_a_vehicle_of_your_own_that_stays_armed_is_told_of() -> None:
     vehicle = Vehicle()
-    vehicle.bits = ARMED | CAN_FLY
+    vehicle.bits = CAN_ARM
 
     def advance() -> None:
         vehicle.now_s += 0.01
@@ -239,6 +278,7 @@ def test_a_vehicle_of_your_own_that_stays_armed_is_told_of() -> None:
     vehicle.act["problem"] = advance
     vehicle.link.connect()
     vehicle.link.send(Arm(True))
+    vehicle.bits = ARMED | CAN_FLY
     with pytest.warns(Note, match="may still be armed"):
         vehicle.link.close()
     assert vehicle.sent[-1] == Arm(False)
