@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Protocol, TypeGuard, TypeVar
 
 from perchctl.extensions import error_at
@@ -29,6 +30,9 @@ class TurnWatcher(Watcher, Protocol):
 
     def sent(self, sent: SentCommand) -> None:
         """Take a command sent in the loop's place; in another thread, so never wait."""
+
+    def note_detached(self, reason: str) -> None:
+        """Remember, as the `problem`, why nothing more comes: it raised, as `reason` says."""
 
 
 class Watchers:
@@ -131,6 +135,8 @@ class Watchers:
             self.detached.append(f"{sentence}: it was detached, and the flight went on")
             if takes_turns(watcher):  # the loop reports it, as any problem of a log
                 self._log_problem = self._log_problem or sentence
+                with suppress(Exception):  # it has raised before
+                    watcher.note_detached(sentence)
                 return
         self._report(f"{sentence}: it is detached, and the flight goes on")
 
