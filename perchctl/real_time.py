@@ -106,6 +106,8 @@ def fly(
             )
         except BaseException as error:
             log.abandon(str(error) or type(error).__name__)
+            for sentence in getattr(error, "__notes__", ()):
+                warnings.warn(sentence, Note, stacklevel=2)
             raise
         miss_m = miss_m if report.phase is Phase.PERCHED else None
         summary = log.close(report, miss_m)

@@ -47,6 +47,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.mission import Operator
+from perchctl.perception import perception
 from tests.helpers.flights import ordered
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -482,6 +483,28 @@ def test_a_callback_that_raises_is_left_out_and_the_flight_goes_on(
     assert f"{failing} raised ZeroDivisionError" in said
     assert "the flight goes on" in said
     assert events[-1].phase is Phase.LANDED if failing == "on_tick" else ticks[-1].state.phase
+
+
+@pytest.mark.usefixtures("pictures")
+def test_a_callback_that_raised_is_named_if_the_flight_fails(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ticks, real = list[Any](), perception.step
+
+    def fails(event: Any) -> None:
+        raise ZeroDivisionError("of a user's")
+
+    def step(*arguments: Any) -> Any:
+        if ticks and is_high(ticks[-1]):
+            raise RuntimeError("by the camera")
+        return real(*arguments)
+
+    monkeypatch.setattr(perception, "step", step)
+    with (
+        pytest.raises(RuntimeError, match="by the camera"),
+        pytest.warns(Note, match="on_event raised ZeroDivisionError: of a user's"),
+    ):
+        fly_toy(here, ticks.append, lambda: False, on_event=fails)
 
 
 @pytest.mark.usefixtures("pictures")

@@ -132,7 +132,7 @@ class Watchers:
             if all(other is not watcher for other in self._active):
                 return  # in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
-            self.detached.append(f"{sentence}: it was detached, and the flight went on")
+            self.detached.append(f"{sentence}: it was detached, and perchctl went on without it")
             if takes_turns(watcher):  # the loop reports it, as any problem of a log
                 self._log_problem = self._log_problem or sentence
                 with suppress(Exception):  # it has raised before

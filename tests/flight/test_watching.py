@@ -257,7 +257,9 @@ def test_what_was_left_out_hears_nothing_of_a_rescue_and_the_others_do(
         return real(*arguments)
 
     monkeypatch.setattr(perception, "step", step)
-    with pytest.raises(Broken, match="by the camera"):
+    with pytest.raises(Broken, match="by the camera") as failed:
         fly(replace(rig.parts(), watchers=(breaks, works)))
     assert breaks.calls == 1
+    (said,) = failed.value.__notes__
+    assert said.startswith("the display raised Broken: by the test")
     assert works.events[-1].rest is not None
