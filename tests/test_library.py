@@ -377,6 +377,18 @@ def test_a_watcher_that_raises_ends_no_simulated_flight() -> None:
     with pytest.warns(Note, match="Breaks raised ZeroDivisionError: of a user's"):
         flight = fly_lockstep(load_profile(SHORT), rows=[row], watchers=(Breaks(),))
     assert flight.report.reason == "high enough; motors off"
+    calls = itertools.count()
+
+    def fails(*arguments: Any) -> Any:
+        if next(calls) > 100:
+            raise RuntimeError("by the camera")
+        return perception.step(*arguments)
+
+    with (
+        pytest.raises(RuntimeError, match="by the camera"),
+        pytest.warns(Note, match="Breaks raised ZeroDivisionError: of a user's"),
+    ):
+        fly_lockstep(load_profile(SHORT), watchers=(Breaks(),), perception=fails)
 
 
 def fly_toy(here: Path, on_tick: Any, should_stop: Any, **more: Any) -> Any:
