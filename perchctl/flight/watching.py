@@ -1,4 +1,4 @@
-"""Those who look on at a flight, each until it raises: none of them ends it.
+"""Observers of a flight. An observer that raises is detached; the flight goes on.
 
 A panel, a page, a callback or a log may fail in any tick. It is then detached, which is reported to
 the others, and the flight goes on without it. Two things are raised, and the loop lands the vehicle
