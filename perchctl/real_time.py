@@ -53,8 +53,8 @@ def fly(
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
     **It arms without a question.** Ctrl-C works if you call it in the main thread. Press Ctrl-C to
-    land. Press it again to cut the motors. Warnings of the checks, and an incomplete log, are Python warnings
-    (`perchctl.errors.Note`).
+    land. Press it again to cut the motors. Warnings of the checks, and an incomplete log, are
+    Python warnings (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name or its file.
