@@ -1,7 +1,8 @@
 """Your own link: here to a toy that follows setpoints, so that no radio is needed.
 
 Fly it by `fly(profile, "own_link:Toy", "own_camera:UdpCamera")`. A real link hands each command to
-its radio in `send`, and `telemetry` returns what has come down."""
+its radio in `send`, and `telemetry` returns what has come down.
+"""
 
 from collections.abc import Callable
 
@@ -46,7 +47,8 @@ class Toy:
     def problem(self, now_s: float) -> str | None:
         return None
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        return None
 
     def _step(self, max_m: float) -> Telemetry:
         move_m = np.clip(self._goal - self._place, -max_m, max_m) * self._flies
@@ -55,6 +57,16 @@ class Toy:
         self._flies = self._flies and not (self._lands and z < 0.01)
         bits, thrust = READY | FLYING * self._flies, THRUST * self._flies
         return Telemetry(
-            self._sampled_s, (x, y, z), (vx, vy, vz), 0.0, 0.0, 0.0, 1.0, thrust, 4.0, bits,
-            height_variance_m2=1e-6, velocity_variance_m2ps2=1e-6,
-        )  # fmt: skip
+            t_s=self._sampled_s,
+            position_m=(x, y, z),
+            velocity_mps=(vx, vy, vz),
+            roll_rad=0.0,
+            pitch_rad=0.0,
+            yaw_rad=0.0,
+            acc_z_g=1.0,
+            thrust=thrust,
+            battery_v=4.0,
+            supervisor=bits,
+            height_variance_m2=1e-6,
+            velocity_variance_m2ps2=1e-6,
+        )

@@ -26,6 +26,18 @@ class _Loader(yaml.SafeLoader):
                 first[key.tag, key.value] = line
         return super().construct_mapping(node, deep)
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, LookupError, AttributeError):
+            # PyYAML converts a scalar unchecked: a date without a month, `!!bool 7`.
+            if not isinstance(node, yaml.ScalarNode):
+                raise
+            kind = node.tag.rpartition(":")[2]
+            raise ValueError(
+                f"line {node.start_mark.line + 1}: {clip_text(node.value)!r} is not a valid {kind}"
+            ) from None
+
 
 def parse_yaml(text: str) -> Any:
     """The value that the text holds; None for an empty text.

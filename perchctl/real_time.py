@@ -52,9 +52,9 @@ def fly(
     record: bool | None = None,
 ) -> Flight:
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
-    **It arms without a question.** In the main thread: Press Ctrl-C to land. Press it again to cut
-    the motors. Warnings of the checks, and an incomplete log, are Python warnings
-    (`perchctl.errors.Note`).
+    **It arms without a question.** Ctrl-C works if you call it in the main thread. Press Ctrl-C to
+    land. Press it again to cut the motors. Warnings of the checks, and an incomplete log, are
+    Python warnings (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name or its file.
@@ -106,6 +106,8 @@ def fly(
             )
         except BaseException as error:
             log.abandon(str(error) or type(error).__name__)
+            for sentence in getattr(error, "__notes__", ()):
+                warnings.warn(sentence, Note, stacklevel=2)
             raise
         miss_m = miss_m if report.phase is Phase.PERCHED else None
         summary = log.close(report, miss_m)

@@ -21,6 +21,11 @@ MOST_CELL_V = 4.4
 AIRFRAMES = ("Crazyflie 2.0", "Crazyflie 2.1", "Crazyflie 2.1+", "Crazyflie 2.1 Brushless")
 """Device types, by the firmware's names, for which perchctl's thrust and battery figures hold
 (docs/hardware.md, "Which vehicles")."""
+DISARM_IT = (
+    "keep away from its propellers, end the program that armed it, or wait 30 s until it disarms "
+    "itself"
+)
+"""What to do about a vehicle that somebody else has armed."""
 
 
 @dataclass(frozen=True)

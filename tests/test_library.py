@@ -47,6 +47,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.mission import Operator
+from perchctl.perception import perception
 from tests.helpers.flights import ordered
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -243,7 +244,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_an_example_is_short_and_has_its_line_on_the_page(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 60
+    assert len(path.read_text().splitlines()) <= 80
     page = (EXAMPLES.parent / "docs" / "python.md").read_text()
     assert f"(../examples/{path.name})" in page
 
@@ -376,6 +377,18 @@ def test_a_watcher_that_raises_ends_no_simulated_flight() -> None:
     with pytest.warns(Note, match="Breaks raised ZeroDivisionError: of a user's"):
         flight = fly_lockstep(load_profile(SHORT), rows=[row], watchers=(Breaks(),))
     assert flight.report.reason == "high enough; motors off"
+    calls = itertools.count()
+
+    def fails(*arguments: Any) -> Any:
+        if next(calls) > 100:
+            raise RuntimeError("by the camera")
+        return perception.step(*arguments)
+
+    with (
+        pytest.raises(RuntimeError, match="by the camera"),
+        pytest.warns(Note, match="Breaks raised ZeroDivisionError: of a user's"),
+    ):
+        fly_lockstep(load_profile(SHORT), watchers=(Breaks(),), perception=fails)
 
 
 def fly_toy(here: Path, on_tick: Any, should_stop: Any, **more: Any) -> Any:
@@ -482,6 +495,28 @@ def test_a_callback_that_raises_is_left_out_and_the_flight_goes_on(
     assert f"{failing} raised ZeroDivisionError" in said
     assert "the flight goes on" in said
     assert events[-1].phase is Phase.LANDED if failing == "on_tick" else ticks[-1].state.phase
+
+
+@pytest.mark.usefixtures("pictures")
+def test_a_callback_that_raised_is_named_if_the_flight_fails(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ticks, real = list[Any](), perception.step
+
+    def fails(event: Any) -> None:
+        raise ZeroDivisionError("of a user's")
+
+    def step(*arguments: Any) -> Any:
+        if ticks and is_high(ticks[-1]):
+            raise RuntimeError("by the camera")
+        return real(*arguments)
+
+    monkeypatch.setattr(perception, "step", step)
+    with (
+        pytest.raises(RuntimeError, match="by the camera"),
+        pytest.warns(Note, match="on_event raised ZeroDivisionError: of a user's"),
+    ):
+        fly_toy(here, ticks.append, lambda: False, on_event=fails)
 
 
 @pytest.mark.usefixtures("pictures")

@@ -42,8 +42,9 @@ class ReplayedDecision:
 
 
 def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
-    """The turns before the first turn missing from the log, and a sentence that names the
-    missing turn (empty if none is missing). Errors: InvalidValue."""
+    """The turns before the first turn missing from the log, and a sentence that names the missing
+    turn, or says that the last ones may be missing (empty for a whole log). Errors:
+    InvalidValue."""
     if not log.turn_records:
         made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
         raise InvalidValue(
@@ -56,6 +57,12 @@ def turns_and_gap_text(log: FlightLog) -> tuple[list[Turn], str]:
                 f"turn {number} is not in the log, which has lost records: what came after it "
                 f"cannot be replayed"
             )
+    problem = (log.summary or {}).get("problem")
+    if problem:
+        return log.turns, (
+            f"the log has lost records ({problem}): turns after its last one may be among them, "
+            f"and cannot be replayed"
+        )
     return log.turns, ""
 
 

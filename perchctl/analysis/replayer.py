@@ -95,7 +95,7 @@ class Replay:
         differences: the first difference of each decision that differs from the log.
         seen: replay of perception; None without pictures.
         changed_keys: profile keys that differ from the flown profile.
-        gap_text: sentence that names the first turn missing from the log, or empty.
+        gap_text: sentence on turns missing from the log, or empty (`turns_and_gap_text`).
     """
 
     log: FlightLog

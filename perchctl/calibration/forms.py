@@ -21,6 +21,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -223,8 +224,8 @@ def _values(text: str) -> dict[str, Any]:
     plain = re.sub(r"^%YAML.*$", "", text, count=1, flags=re.MULTILINE)
     plain = re.sub(r"!!opencv-(?:nd-)?matrix", "", plain)
     try:
-        documents = [json.loads(plain)]
-    except ValueError:
+        documents = [json.loads(plain, object_pairs_hook=_unique_keys)]
+    except (ValueError, RecursionError):
         try:
             documents = parse_documents(plain)
         except ValueError as error:
@@ -233,9 +234,23 @@ def _values(text: str) -> dict[str, Any]:
         raise InvalidValue(f"holds no keys: a calibration is a {READ_FORMS}")
     # Of a topic each message is a document, with a time of its own.
     first, *others = ({str(k): v for k, v in d.items() if k != "header"} for d in documents)
-    if any(other != first for other in others):
+    try:
+        differ = any(other != first for other in others)
+    except RecursionError:  # in YAML a value may hold itself
+        raise InvalidValue("values are nested too deeply to be read") from None
+    if differ:
         raise InvalidValue(f"holds {len(documents)} documents that differ: keep one")
     return first
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON. Raises InvalidValue for a key that is there twice, of which Python would
+    keep the last one silently."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        (key, _), *_ = Counter(key for key, _ in pairs).most_common(1)
+        raise InvalidValue(f"key {clip_text(key)} is there twice: keep one")
+    return values
 
 
 def _xml_values(text: str) -> dict[str, Any]:
@@ -283,11 +298,12 @@ def _camera_lens(values: Mapping[str, Any], form: Form) -> Lens:
 def _kalibr_lens(cam: str, camera: Any) -> Lens:
     if not isinstance(camera, dict):
         raise InvalidValue(f"{cam} must hold keys (intrinsics, resolution, ...)")
+    camera = {str(key): value for key, value in camera.items()}
     found = _by_meaning(camera, KALIBR_CAMERA, needed=tuple(KALIBR_CAMERA.read))
     projection, lens = str(found["projection"][0][1]), str(found["lens"][0][1])
     if projection != "pinhole" or (lens != "none" and lens not in _LENSES):
         raise InvalidValue(
-            f"Kalibr's model {lens if projection == 'pinhole' else projection!r} is not "
+            f"Kalibr's model {clip_text(lens if projection == 'pinhole' else projection)!r} is not "
             f"supported; calibrate as pinhole-radtan or pinhole-equi"
         )
     key, value = found["intrinsics"][0]
@@ -365,12 +381,13 @@ def _check_neutral(key: str, value: Any, allowed: tuple[float, ...]) -> None:
         return
     if _plain_key(key) == "xi":
         raise InvalidValue(
-            f"xi = {value} is an omnidirectional lens, which is not supported: calibrate as "
-            f"plumb_bob, rational_polynomial or fisheye"
+            f"xi = {clip_text(str(value))} is an omnidirectional lens, which is not supported: "
+            f"calibrate as plumb_bob, rational_polynomial or fisheye"
         )
+    neutral = " or ".join(f"{each:g}" for each in allowed)
     raise InvalidValue(
-        f"{key} = {value} changes the projection, and is not supported: calibrate with pictures "
-        f"as the camera gives them, and {key} {' or '.join(f'{a:g}' for a in allowed)}"
+        f"{key} = {clip_text(str(value))} changes the projection, and is not supported: calibrate "
+        f"with pictures as the camera gives them, and {key} {neutral}"
     )
 
 
@@ -379,9 +396,12 @@ def _check_region(found: _Found) -> None:
     for key, region in found.get("region", []):
         if not isinstance(region, dict):
             raise InvalidValue(f"{key} must hold x_offset, y_offset, height and width")
-        offset = region.get("x_offset", 0), region.get("y_offset", 0)
-        size = region.get("width", 0), region.get("height", 0)
-        whole = tuple(found[each][0][1] for each in ("width", "height") if each in found)
+        x, y, width, height = (
+            _pixels(f"{key}.{part}", region.get(part, 0), least=0)
+            for part in ("x_offset", "y_offset", "width", "height")
+        )
+        offset, size = (x, y), (width, height)
+        whole = tuple(_pixels(*found[each][0]) for each in ("width", "height") if each in found)
         if offset != (0, 0) or size not in ((0, 0), whole):
             raise InvalidValue(
                 f"{key} is a part of the picture, {size[0]}x{size[1]} px at {offset}: calibrate "
@@ -392,10 +412,11 @@ def _check_region(found: _Found) -> None:
 def _check_rms(found: _Found, width_px: int) -> None:
     """Raise InvalidValue if the file itself says that it fits nothing."""
     for key, value in found.get("rms", []):
-        if (_numbers(key, value) > _MAX_RMS_SHARE * width_px).any():
+        rms_px = _numbers(key, value)
+        if (rms_px > _MAX_RMS_SHARE * width_px).any():
             raise InvalidValue(
-                f"{key} = {value:g} px: the calibration misses its own pictures by more than "
-                f"{100 * _MAX_RMS_SHARE:g} % of their width, calibrate again"
+                f"{key} = {rms_px.max():g} px: the calibration misses its own pictures by more "
+                f"than {100 * _MAX_RMS_SHARE:g} % of their width, calibrate again"
             )
 
 
@@ -405,7 +426,8 @@ def _check_entries(found: _Found, K: NDArray[np.float64]) -> None:
         for key, value in found.get(entry, []):
             if not np.allclose(_numbers(key, value), K[i]):
                 raise InvalidValue(
-                    f"{key} is {value} but the camera matrix has {K[i]:g}: keep the true one"
+                    f"{key} is {clip_text(str(value))} but the camera matrix has {K[i]:g}: keep "
+                    f"the true one"
                 )
 
 
@@ -425,10 +447,13 @@ def _size(found: _Found, form: Form) -> tuple[int, int]:
     return width, height
 
 
-def _pixels(key: str, value: Any) -> int:
+def _pixels(key: str, value: Any, least: int = 1) -> int:
     number = _numbers(key, value)
-    if number.size != 1 or number[0] < 1 or number[0] != np.floor(number[0]):
-        raise InvalidValue(f"{key} must be a whole number of pixels, found {value}")
+    if number.size != 1 or number[0] < least or number[0] != np.floor(number[0]):
+        raise InvalidValue(
+            f"{key} must be a whole number of pixels, {least} or more, found "
+            f"{clip_text(str(value))}"
+        )
     return int(number[0])
 
 
@@ -442,7 +467,9 @@ def _named_lens(found: _Found) -> str | None:
         if name == "pinhole":
             continue  # the projection; the distortion has a key of its own, or stays unnamed
         if name not in _LENSES:
-            raise InvalidValue(f"{key} {value!r} is unknown; allowed are {', '.join(_LENSES)}")
+            raise InvalidValue(
+                f"{key} {clip_text(repr(value))} is unknown; allowed are {', '.join(_LENSES)}"
+            )
         named[key] = _LENSES[name]
     for key, value in found.get("fisheye", []):
         if _numbers(key, value).any():

@@ -129,9 +129,9 @@ class LiveSource:
     A subclass defines `_connection`, which opens and reads the camera. A connection that ended is
     made again after `reconnect_wait_s`, until `max_failures` in a row brought no picture.
 
-    A source that gives no picture says what it has seen, and no cause that it has not: whether
-    it connected (`_connected`), whether anything came (`_note`), and whether pictures came and were
-    dropped (`_drop`).
+    The message of a source that gives no picture names only causes that the source has observed:
+    whether it connected (`_connected`), whether anything came (`_note`), and whether pictures came
+    and were dropped (`_drop`).
     """
 
     live = True

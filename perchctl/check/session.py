@@ -19,6 +19,7 @@ from perchctl.flight import FlyOptions, WallClock, check_options, start_simulate
 from perchctl.link import ProbeLink, check_uri, find_uris_and_problem
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
+from perchctl.vehicle import DISARM_IT
 from perchctl.vision import Pipeline, make_pipeline
 
 
@@ -170,7 +171,7 @@ class VehicleChecks:
     def _lift_rows(self, *, is_armed: bool) -> Iterator[Row]:
         compared = self._compared_rows()
         if self.scope.with_lift and is_armed:
-            yield from skipped_rows([vehicle.LIFTED], "it is armed", vehicle.DISARM_IT)
+            yield from skipped_rows([vehicle.LIFTED], "it is armed", DISARM_IT)
         elif self.scope.with_lift:
             lifted = self._lift_finding()
             yield Row(vehicle.LIFTED, *lifted)

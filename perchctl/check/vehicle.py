@@ -26,6 +26,7 @@ from perchctl.link import ProbeLink
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     AIRFRAMES,
+    DISARM_IT,
     LOW_POWER,
     POSITION_DECKS,
     Telemetry,
@@ -41,7 +42,6 @@ SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 """By a motion capture, or by the target."""
 ARMED_BY_FLY = "armed by fly after your yes"
-DISARM_IT = "keep away, end the program that armed it, or wait 30 s until it disarms itself"
 UNREPORTED = "by link.unreported this vehicle reports none"
 
 Wait = Callable[[float], None]

@@ -203,12 +203,15 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
     panel = FlightPanel(sys.stderr)
     say(f"connecting to {options.uri}")
     switch, page = OperatorSwitch(), None
+    detached: tuple[str, ...] = ()
     # Once it has landed nothing is left to stop, but much to tell.
     with ignore_signals(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(flight_page(options, view, switch))
             report, miss_m = _session(options, log, panel, switch, page, confirm)
+            detached = report.detached
         except BaseException as error:
+            detached = tuple(getattr(error, "__notes__", ()))
             # The page first: a disk that hangs holds up the log's end, and Land would seem ready.
             if page is not None:
                 page.fail(error, log.path if log.has_begun else None)
@@ -218,8 +221,8 @@ def fly_and_report(options: FlyOptions, as_json: bool, view: bool, confirm: bool
             panel.close()
             if panel.failure is not None:
                 say(panel.failure)
-        for sentence in report.detached:
-            say(sentence)
+            for sentence in detached:
+                say(sentence)
         summary = log.close(report, miss_m if report.phase is Phase.PERCHED else None)
         assert summary is not None
         written = print_lines(summary.text(log.path), stdout=not as_json)

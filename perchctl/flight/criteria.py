@@ -82,8 +82,14 @@ class Problem:
 
 @dataclass(frozen=True)
 class Variance:
-    """A variance that the vehicle's estimator claims (None: it reports none) for `what`, in `unit`,
-    and the `most` with which it may take off."""
+    """A variance that the vehicle's estimator reports, and the limit for take-off.
+
+    Attributes:
+        what: the estimated quantity, as in messages.
+        value: the variance, in `unit`; None if the vehicle reports none.
+        most: the largest variance, in `unit`, with which the vehicle may take off.
+        unit: unit of `value` and `most`.
+    """
 
     what: str
     value: float | None

@@ -221,6 +221,8 @@ def fly_lockstep(
     except BaseException as error:
         if log is not None:
             log.abandon(str(error) or type(error).__name__)
+        for sentence in getattr(error, "__notes__", ()):
+            warnings.warn(sentence, Note, stacklevel=2)
         raise
     vehicle.watched = False
     link.close()

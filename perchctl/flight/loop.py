@@ -96,9 +96,20 @@ def fly(parts: FlightParts) -> FlightReport:
     """Wait until ready, fly the mission, and return how it ended; the link is connected.
 
     Whatever is raised on the way, the vehicle is landed first. Errors: `SafetyAbort`, `TimedOut`,
-    `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue.
+    `NotFound` and `Interrupted` before take-off, and anything unforeseen after the rescue. Watchers
+    that were detached are in the report, or in the error's `__notes__`, a sentence each.
     """
     watchers = Watchers(parts.watchers, parts.clock.now, parts.remarks, parts.judges)
+    try:
+        report = _fly(parts, watchers)
+    except BaseException as error:
+        for sentence in watchers.detached:
+            error.add_note(sentence)
+        raise
+    return replace(report, detached=tuple(watchers.detached))
+
+
+def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
     turns = TurnReporter(watchers.turn)
     inputs = FlightInputs(
         parts.link,
@@ -113,8 +124,7 @@ def fly(parts: FlightParts) -> FlightReport:
     watchdog = Watchdog(parts.profile, parts.operator, parts.position_age_s)
     parts.link.set_guard(watchdog.poll, watchers.sent)
     try:
-        report = _mission(parts, inputs, watchdog, turns, watchers)
-        return replace(report, detached=tuple(watchers.detached))
+        return _mission(parts, inputs, watchdog, turns, watchers)
     except BaseException as error:
         watchdog.note_rescue()
         rest = rescue(

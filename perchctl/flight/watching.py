@@ -1,4 +1,4 @@
-"""Those who look on at a flight, each until it raises: none of them ends it.
+"""Observers of a flight. An observer that raises is detached; the flight goes on.
 
 A panel, a page, a callback or a log may fail in any tick. It is then detached, which is reported to
 the others, and the flight goes on without it. Two things are raised, and the loop lands the vehicle
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Protocol, TypeGuard, TypeVar
 
 from perchctl.extensions import error_at
@@ -29,6 +30,9 @@ class TurnWatcher(Watcher, Protocol):
 
     def sent(self, sent: SentCommand) -> None:
         """Take a command sent in the loop's place; in another thread, so never wait."""
+
+    def note_detached(self, reason: str) -> None:
+        """Remember, as the `problem`, why nothing more comes: it raised, as `reason` says."""
 
 
 class Watchers:
@@ -128,9 +132,11 @@ class Watchers:
             if all(other is not watcher for other in self._active):
                 return  # in the other thread
             self._active = tuple(other for other in self._active if other is not watcher)
-            self.detached.append(f"{sentence}: it was detached, and the flight went on")
+            self.detached.append(f"{sentence}: it was detached, and perchctl went on without it")
             if takes_turns(watcher):  # the loop reports it, as any problem of a log
                 self._log_problem = self._log_problem or sentence
+                with suppress(Exception):  # it has raised before
+                    watcher.note_detached(sentence)
                 return
         self._report(f"{sentence}: it is detached, and the flight goes on")
 

@@ -38,9 +38,9 @@ def disarm(
 ) -> bool:
     """Disarm a vehicle on the ground until its telemetry says so; bounded by `DISARM_S`.
 
-    Nothing is sent to a vehicle that arms itself, or that nobody has armed. Nor is it without fresh
-    telemetry that says it does not fly: in the air the order would cut its motors, and the flying
-    bit outlives them by 2 s. Returns False if the vehicle may still be armed.
+    Nothing is sent to a vehicle that arms itself, or that nobody has armed. The order is sent only
+    while fresh telemetry says that the vehicle does not fly: in the air it would cut the motors,
+    and the flying bit outlives them by 2 s. Returns False if the vehicle may still be armed.
 
     Args:
         newest: the newest telemetry, None if there was none.

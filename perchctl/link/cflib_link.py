@@ -43,6 +43,7 @@ from perchctl.mission import SentCommand
 from perchctl.positioning import PositionFeed
 from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import (
+    DISARM_IT,
     FLYING,
     Arm,
     Command,
@@ -205,10 +206,7 @@ class CflibLink:
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
             )
         if self._is_armed:
-            raise ConnectionFailed(
-                f"the vehicle at {self._uri} is armed already: keep away from its propellers, end "
-                f"the program that armed it, or wait 30 s until it disarms itself"
-            )
+            raise ConnectionFailed(f"the vehicle at {self._uri} is armed already: {DISARM_IT}")
         for _ in range(UNLOCK_TIMES):
             send_packets(connection.cf, UNLOCK_THRUST)
             time.sleep(UNLOCK_PERIOD_S)

@@ -81,7 +81,7 @@ def update_energy(
     battery_v: float,
     thrust: float,
     battery_mah: float,
-    drive: Drive = BRUSHED,
+    drive: Drive,
 ) -> EnergyState:
     """The state `dt_s` later, under a commanded thrust 0..65535, for a battery of `battery_mah`.
 
@@ -196,9 +196,7 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
-def hover_left_s(
-    state: EnergyState, profile: Profile, load: float, drive: Drive = BRUSHED
-) -> float | None:
+def hover_left_s(state: EnergyState, profile: Profile, load: float, drive: Drive) -> float | None:
     """Seconds of hovering with `load`, a share of full thrust, until `battery-low` fires; None if
     unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:

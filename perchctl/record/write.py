@@ -51,7 +51,8 @@ class LogWatcher:
 
     Attributes:
         path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
-        problem: None, or one sentence about the first failure of the disk.
+        problem: None, or one sentence about the first failure of the disk, or about the error for
+            which the flight detached its log.
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight goes on.
         truth: returns the true state at a tick; set by a simulation.
@@ -174,12 +175,12 @@ class LogWatcher:
     def tick(self, tick: Tick) -> None:
         """Write a tick, with its turn and the simulation's truth. Never raises."""
         self._ticks += 1
-        battery_v = tick.telemetry.battery_v
-        if battery_v >= NO_BATTERY_READING_V:
-            self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
-        position_m, miss_m = (None, None) if self.truth is None else self.truth()
         record = None
         try:
+            battery_v = tick.telemetry.battery_v
+            if battery_v >= NO_BATTERY_READING_V:
+                self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
+            position_m, miss_m = (None, None) if self.truth is None else self.truth()
             record = tick_record(tick, position_m, miss_m)
             self.write(record)
         except Exception as error:  # whatever it is: only this record is lost
@@ -204,7 +205,16 @@ class LogWatcher:
 
     def event(self, event: Event) -> None:
         """Append an event (`perchctl.record.fields.event_record`). Never raises."""
-        self._put(partial(encode_line, {"kind": "event", **event_record(event)}), event.t_s)
+        try:
+            line = partial(encode_line, {"kind": "event", **event_record(event)})
+            self._put(line, event.t_s)
+        except Exception as error:  # whatever it is: only this record is lost
+            self._unmade += 1
+            self._remember_unencodable(error)
+
+    def note_detached(self, reason: str) -> None:
+        """Remember that the flight writes no more records, as writing one raised."""
+        self._remember(reason)
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False

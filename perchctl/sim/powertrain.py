@@ -35,8 +35,6 @@ FULL_COMMAND = 65535.0
 """Both of the thrust command and of the duty cycle (PWM)."""
 MOTOR_FORCE_N = CRAZYFLIE_21.thrust.most_n
 """Thrust of one motor at `FULL_COMMAND`, any battery that can still give it."""
-THRUST_MIN_N = CRAZYFLIE_21.thrust.least_n
-"""A command below this is no thrust at all: PWM 0 (a command of 7000)."""
 
 VoltageFunction = Callable[[float], float]
 

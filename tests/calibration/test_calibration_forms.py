@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -166,6 +169,90 @@ def test_a_file_is_read_as_the_lens_that_it_names(text: str, model: str, tmp_pat
     ],
 )
 def test_a_lens_that_is_not_understood_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidValue, match=said):
+        load(tmp_path, text)
+
+
+KALIBR = {
+    "camera_model": "pinhole",
+    "intrinsics": [K[0], K[4], K[2], K[5]],
+    "distortion_model": "radtan",
+    "distortion_coeffs": FIVE[:4],
+    "resolution": SIZE_PX,
+}
+PLAIN_FORMS: list[dict[str, Any]] = [
+    {
+        "image_width": SIZE_PX[0],
+        "image_height": SIZE_PX[1],
+        "camera_matrix": {"rows": 3, "cols": 3, "data": K},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"data": FIVE},
+        "rms": 0.3,
+        "fx": K[0],
+        "binning_x": 1,
+        "roi": {"x_offset": 0, "y_offset": 0, "width": 0, "height": 0},
+    },
+    {"width": SIZE_PX[0], "height": SIZE_PX[1], "K": K, "D": FISHEYE}
+    | {"distortion_model": "equidistant", "binning_y": 0, "roi": {"do_rectify": False}},
+    {"camera_resolution": SIZE_PX, "camera_matrix": K, "dist_coeffs": FIVE}
+    | {"fisheye_model": 0, "xi": 0},
+    KALIBR,
+]
+MALFORMED = (
+    *(None, True, "", "50", "abc", "a" * 999, -1, 10**400, math.nan, math.inf),
+    *([], {}, [50.0], [[1, 2], [3]], [None], [{}], {"data": {"data": 1}}, {"1": 2}),
+)
+
+
+@pytest.mark.parametrize("form", PLAIN_FORMS, ids=["ros", "message", "script", "kalibr"])
+def test_a_value_of_another_kind_is_read_or_refused_in_one_sentence(
+    form: dict[str, Any], tmp_path: Path
+) -> None:
+    """Never by an exception of Python."""
+    said = set()
+    for key, value in itertools.product(form, MALFORMED):
+        places = [form | {key: value}]
+        if isinstance(form[key], dict):
+            places += [form | {key: form[key] | {part: value}} for part in form[key]]
+        for values in places:
+            content = {"cam0": values} if form is KALIBR else values
+            try:
+                load(tmp_path, json.dumps(content), "camera.json")
+            except InvalidValue as error:
+                said.add(str(error))
+    assert len(said) > 20
+    assert max(map(len, said)) < 300 + len(str(tmp_path))
+    assert not any("\n" in sentence for sentence in said)
+
+
+RECURSIVE = f"{ros(FIVE)}note: &own [*own]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (opencv(FIVE, "rms: [50.0]\n").replace("avg_re", "re"), "rms = 50 px: the calibration"),
+        (opencv(FIVE, "rms: '50'\n").replace("avg_re", "re"), "rms = 50 px: the calibration"),
+        (
+            "cam0: {camera_model: pinhole, 1: 2}\n",
+            "key resolution is missing, found camera_model, 1:",
+        ),
+        ("cam0: {2026-02-02: 2}\n", "is missing, found 2026-02-02"),
+        ("[" * 2000, "values are nested too deeply to be read"),
+        ('{"K":' * 2000, "values are nested too deeply to be read"),
+        (f"{RECURSIVE}---\n{RECURSIVE}", "values are nested too deeply to be read"),
+        ('{"image_width": 400, "image_width": 401}', "key image_width is there twice: keep one"),
+        ('{"K": {"data": 1, "data": 2}}', "key data is there twice: keep one"),
+        ("image_width: 400\nimage_width: 401\n", "line 2: key image_width is there twice"),
+        ("a: 1\nb: !!timestamp x\n", "line 2: 'x' is not a valid timestamp"),
+        ("a: !!bool 7\n", "line 1: '7' is not a valid bool"),
+        ("a: !!int ''\n", "line 1: '' is not a valid int"),
+        ("a: 2026-99-99\n", "line 1: '2026-99-99' is not a valid timestamp"),
+        (ros(FIVE, "roi: {x_offset: left}\n"), "a value of roi.x_offset is not a number: left"),
+        (ros(FIVE, "roi: {width: [1, 2]}\n"), "roi.width must be a whole number of pixels, 0 or"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_one_sentence(text: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidValue, match=said):
         load(tmp_path, text)
 

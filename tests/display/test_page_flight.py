@@ -235,3 +235,17 @@ def test_the_page_of_a_flight_ends_with_its_card(
     rows = dict(card["rows"])
     assert (rows["log"], rows["report"]) == (str(log), f"perchctl log report '{log}'")
     assert last_state["phase"] == "ALIGN"  # what was shown last stays
+
+
+def test_a_flight_that_ends_in_an_error_says_what_was_detached(
+    options: FlyOptions, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def session(*parts: Any) -> Any:
+        error = RuntimeError("boom")
+        error.add_note("a callback was detached")
+        raise error
+
+    monkeypatch.setattr(fly, "_session", session)
+    with pytest.raises(RuntimeError, match="boom"):
+        fly.fly_and_report(options, as_json=False, view=False)
+    assert "perchctl: a callback was detached" in capsys.readouterr().err

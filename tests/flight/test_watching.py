@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from perchctl.analysis import replay
+from perchctl.commands.fly import exit_code
 from perchctl.display import FlightPage, FlightPanel
-from perchctl.errors import SafetyAbort
+from perchctl.errors import LogIncomplete, SafetyAbort
 from perchctl.flight import fly
 from perchctl.flight.watching import SLOW_S
-from perchctl.mission import Event, EventKind, FlightReport, Operator, SentCommand, Tick, Turn
+from perchctl.mission import (
+    Event,
+    EventKind,
+    FlightReport,
+    Operator,
+    Outcome,
+    SentCommand,
+    Tick,
+    Turn,
+)
 from perchctl.perception import perception
-from perchctl.record import LogWatcher
+from perchctl.record import LogWatcher, read_log
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.loop_rig import Broken, Rig, Vehicle, Watcher, hung_rig
 
@@ -124,6 +136,31 @@ def test_a_log_that_raises_is_the_profile_s_to_judge(lands: bool) -> None:
     assert breaks.calls == 1
 
 
+def test_the_file_of_a_log_that_raised_and_the_exit_code_say_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = ordered(Rig())
+    rig.profile = rig.profile.with_({"safety.land_on_log_error": False})
+    log = LogWatcher.open_lockstep(tmp_path / "flight.jsonl", rig.profile, seed=1)
+    real = LogWatcher.turn
+
+    def turn(self: LogWatcher, turn: Turn) -> None:
+        if turn.t_s > BREAKS_S:
+            raise Broken("by the test")
+        real(self, turn)
+
+    monkeypatch.setattr(LogWatcher, "turn", turn)
+    summary = log.close(fly(replace(rig.parts(), watchers=(log,))))
+    assert summary is not None
+    assert summary.log_problem is not None
+    assert summary.log_problem.startswith("the flight log raised Broken: by the test (")
+    assert exit_code(Outcome.PERCHED, summary) == LogIncomplete.exit_code
+    written = read_log(log.path)
+    assert written.summary is not None
+    assert written.summary["problem"] == summary.log_problem
+    assert [note for note in replay(written).notes if summary.log_problem in note]
+
+
 @pytest.mark.parametrize("refuses", [False, True])
 def test_a_log_that_raises_before_take_off_may_be_a_refusal(refuses: bool) -> None:
     rig = ordered(Rig())
@@ -220,7 +257,9 @@ def test_what_was_left_out_hears_nothing_of_a_rescue_and_the_others_do(
         return real(*arguments)
 
     monkeypatch.setattr(perception, "step", step)
-    with pytest.raises(Broken, match="by the camera"):
+    with pytest.raises(Broken, match="by the camera") as failed:
         fly(replace(rig.parts(), watchers=(breaks, works)))
     assert breaks.calls == 1
+    (said,) = failed.value.__notes__
+    assert said.startswith("the display raised Broken: by the test")
     assert works.events[-1].rest is not None

@@ -95,7 +95,7 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
         ahead_s = end_s - moment.t_s
         if moment.t_s < 6.0 or ahead_s <= 0.0:
             continue
-        told_s = hover_left_s(moment.energy, PROFILE, hover)
+        told_s = hover_left_s(moment.energy, PROFILE, hover, BRUSHED)
         assert told_s is not None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
             assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
@@ -121,14 +121,14 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
 def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
-        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH)
+        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
     return energy
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
-    assert hover_left_s(energy, PROFILE, HOVER) is None
+    assert hover_left_s(energy, PROFILE, HOVER, BRUSHED) is None
     assert energy.unknown_s == pytest.approx(10.0)
 
 
@@ -145,8 +145,8 @@ def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
 def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
-        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH)
-    seconds = hover_left_s(energy, PROFILE, HOVER)
+        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
+    seconds = hover_left_s(energy, PROFILE, HOVER, BRUSHED)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
 
@@ -226,8 +226,8 @@ def test_a_reading_that_stands_still_is_none() -> None:
 )
 def test_a_flight_ends_sooner_where_battery_low_fires_sooner(changes: dict[str, Any]) -> None:
     energy = replace(FINE_BATTERY, rest_v=3.95)
-    usual_s = hover_left_s(energy, PROFILE, 0.5)
-    sooner_s = hover_left_s(energy, changed(changes), 0.5)
+    usual_s = hover_left_s(energy, PROFILE, 0.5, BRUSHED)
+    sooner_s = hover_left_s(energy, changed(changes), 0.5, BRUSHED)
     assert usual_s is not None
     assert sooner_s is not None
     assert 0.0 < sooner_s < usual_s

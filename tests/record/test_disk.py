@@ -17,7 +17,15 @@ import pytest
 from perchctl.commands import fly
 from perchctl.errors import InvalidValue, LogIncomplete
 from perchctl.flight import FlyOptions
-from perchctl.mission import FlightReport, Outcome, Phase, PlannerState, SentCommand
+from perchctl.mission import (
+    Event,
+    EventKind,
+    FlightReport,
+    Outcome,
+    Phase,
+    PlannerState,
+    SentCommand,
+)
 from perchctl.profile import apply_settings, load_profile
 from perchctl.record import LogWatcher, exact, read_log, write
 from perchctl.vehicle import EmergencyStop, Idle
@@ -104,6 +112,24 @@ def test_a_tick_without_a_form_costs_itself_alone(tmp_path: Path) -> None:
     assert summary is not None
     assert summary.lost_records == 1
     assert "no form" in (summary.log_problem or "")
+
+
+def no_truth() -> Any:
+    raise ZeroDivisionError("by the test")
+
+
+def test_an_event_or_a_truth_without_a_form_costs_itself_alone(tmp_path: Path) -> None:
+    log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
+    good = Event(1.0, EventKind.NOTE, "by the test", Phase.SEARCH)
+    for event in (good, replace(good, kind="odd"), replace(good, t_s=1.04)):  # type: ignore[arg-type]
+        log.event(event)
+    log.truth = no_truth
+    log.tick(synthetic.tick(1.06, synthetic.telemetry(), Idle(), PlannerState()))
+    summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
+    assert [event["t_s"] for event in read_log(log.path).events] == [1.0, 1.04]
+    assert summary is not None
+    assert summary.lost_records == 2
+    assert log.problem is None
 
 
 @pytest.mark.parametrize("live", [False, True])
