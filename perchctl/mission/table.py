@@ -113,7 +113,7 @@ def is_astray(c: Context) -> bool:
     if phase is P.LANDING:
         touched = c.state.contact_z_m is not None or c.state.stopped_s is not None
         return not touched and _away_m(c) > ASTRAY_LANDING_M
-    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s
+    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if c.by_sight else 0.0
     if phase is P.APPROACH and c.height_m < LIFTED_M:
         return _away_m(c) > SIDEWAYS_M + spare_m
     ground = c.state.ground_m
