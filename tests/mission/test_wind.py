@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion, Observation, Operator, Phase
-from perchctl.mission.guidance import STANDS_MPS
+from perchctl.mission.guidance import MOST_TRIM_M, STANDS_MPS
 from perchctl.mission.imu import DeadReckoning, advance_reckoning
 from perchctl.mission.state import Condition
 from perchctl.vehicle import PositionSetpoint
@@ -76,7 +76,7 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
     x_m, y_m = flight.state.integral_m
     along_m = x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
     gain = MOCAP.planner.integral_per_s * 1.5
-    assert along_m == pytest.approx(-min(gain * aside_m, MOCAP.planner.integral_limit_m), rel=0.1)
+    assert along_m == pytest.approx(-min(gain * aside_m, MOST_TRIM_M), rel=0.1)
 
 
 @BRIEFLY
