@@ -375,6 +375,9 @@ def _reckon(c: Context) -> PlannerState:
         new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
         if not blown:
             new = learn_bias_at_rest(new, state.reckoning.imu, obs.imu)
+        if obs.telemetry.thrust < 1:  # it hangs, and what hangs stays where it is
+            old = state.reckoning
+            new = replace(new, aside_m=old.aside_m, aside_sigma_m=old.aside_sigma_m)
     felt, late = obs.felt, c.mismatch.later_s != 0.0
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         # Late pictures have led the estimate's height astray, too.
