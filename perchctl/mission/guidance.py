@@ -32,6 +32,9 @@ PRESSING_PART, PRESSING_RATIO = 0.95, 1.05
 UNPRESSED_MPS, UNPRESSED_M, FALLING_MPS = 0.05, 0.08, -0.3
 UNWIND_M, UNWIND_AWAY_M, UNPRESS_LIMIT_S = 1.0, 0.25, 4.0
 SMALL_ERROR_M = 0.06  # an error of the position that counts in motion, too
+MOST_TRIM_M = 0.4
+"""Against a wind of 5 m/s. Larger: a vehicle that something holds winds its setpoint up further.
+Smaller: a wind holds it aside of its target for good."""
 STANDS_MPS = 0.1
 """Slower, a vehicle stands still in the air. Larger: an integral winds up on the way to its goal.
 Smaller: a wind that shakes the vehicle is never balanced."""
@@ -93,16 +96,20 @@ def step_towards(
 
 def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
     """The integral (x, y) of the position's error to `goal_xy`, m, world axes, which removes the
-    offset that a steady wind leaves. It is limited, and frozen while the vehicle is still on its
-    way: a large error counts only once the vehicle stands still in the air."""
+    offset that a steady wind leaves.
+
+    It is limited, and frozen while the vehicle is still on its way: a large error counts, and a
+    large integral is learned, only once the vehicle stands still in the air."""
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
     tx, ty = c.state.integral_m
-    if math.hypot(ex, ey) < SMALL_ERROR_M or c.speed_mps < STANDS_MPS:
+    stands = c.speed_mps < STANDS_MPS
+    most_m = MOST_TRIM_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
+    if stands or math.hypot(ex, ey) < SMALL_ERROR_M:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
-    return limited(tx, ty, planner.integral_limit_m)
+    return limited(tx, ty, most_m)
 
 
 def anchor_in_wind(c: Context) -> Context:
@@ -118,7 +125,7 @@ def anchor_in_wind(c: Context) -> Context:
     sent = correct_setpoint(c, reference)
     return c.evolve(
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
-        integral_m=limited(sent.x_m - x_m, sent.y_m - y_m, c.planner.integral_limit_m),
+        integral_m=limited(sent.x_m - x_m, sent.y_m - y_m, MOST_TRIM_M),
     )
 
 

@@ -38,13 +38,22 @@ SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
 MOST_BIAS_MPS2 = 1.5
 """A wind of 4 m/s, which the firmware takes for a tilt, makes 1.2 m/s2. Larger: wrong positions
 teach a bias that no attitude has."""
-MOST_WRONG_MPS2 = 2.0  # in one sample; more is a blow, or a correction of the estimate
+MOST_WRONG_MPS2 = 2.0
+"""In one sample; more is a blow, or a correction of the estimate, and no bias. Larger: a kick of 40
+ms teaches one. Smaller: a gust is not learned."""
 CLIMB_SPARE_MPS = 0.1  # it may climb faster than reckoned
 MOST_CLIMB_MPS = 1.0  # in a silence, by the position mode's own limit
 REACH_M = 0.04  # a gear so near below the target may have been caught by its magnet
+BOUNCE_WITHIN_M = 0.1
+"""So near below the target the vertical speed follows the estimate: a bounce off the ceiling falls
+between two samples of telemetry, and the firmware integrates it at 1 kHz. Larger: what late
+pictures do to the estimate is taken over. Smaller: a bounce is missed by up to 0.3 m/s."""
 MISSED_MEMORY_S = 1.0
 """In so long positions correct a speed that the estimate has missed. Larger: what a wrong attitude
 adds in seconds looks like a blow. Smaller: a blow just before the last sight is forgotten."""
+MOST_VELOCITY_BIAS_MPS = 0.6
+"""A wind of 4 m/s makes 0.4 m/s. Larger: a vehicle that moves counts as still while its position
+creeps. Smaller: it is never steady in a wind."""
 VELOCITY_MEMORY_S = 2.0
 """In so long the bias of the estimated velocity is learned. Larger: a wind that has turned makes
 the vehicle seem to move for longer. Smaller: noise of the position is taken for a bias."""
@@ -353,6 +362,7 @@ class DeadReckoning:
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
     bias_mps2: Vector = ZERO  # excess of accelerometer and attitude
+    aside_mps2: tuple[float, float] = (0.0, 0.0)  # mean of what the accelerometer reads sideways
     estimated_mps: Vector = ZERO
     beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
     missed_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the accelerometer alone
@@ -378,12 +388,15 @@ def advance_reckoning(
     believed: bool,
     astray: bool = False,
     corrected: bool = False,
+    pushed: bool = False,
 ) -> DeadReckoning:
     """The reckoning one tick later.
 
     `corrected`: positions have come lately, and correct the estimated velocity;
-    `believed`: the sample's estimated velocity is true; `astray`: that velocity may be in other
-    axes, so the reckoned velocity is kept even after a silence.
+    `believed`: the sample's estimated velocity is true, with `pushed` its vertical part only: what
+    pushes a vehicle sideways, the firmware's estimator does not see until a position corrects it;
+    `astray`: that velocity may be in other axes, so the reckoned velocity is kept even after a
+    silence.
     """
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
@@ -436,21 +449,32 @@ def advance_reckoning(
     remembers = math.exp(-dt_s / MISSED_MEMORY_S) if corrected else 1.0
     keeps = math.exp(-dt_s / BESIDE_MEMORY_S)
     calm = believed and imu.t_s - imu.pushed_s > PUSHED_S
+    cos, sin = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
+    ahead_g, left_g = imu.aside_g
+    reads_mps2 = (
+        GRAVITY_MPS2 * (ahead_g * cos - left_g * sin),
+        GRAVITY_MPS2 * (ahead_g * sin + left_g * cos),
+    )
+    aside_mps2 = [*old.aside_mps2]
     for i in range(3):
         gained = imu.velocity_mps[i] - old.imu.velocity_mps[i]
+        if i == 2 and believed and old.below_m < BOUNCE_WITHIN_M:
+            gained = estimated[2] - old.estimated_mps[2] + old.bias_mps2[2] * dt_s
         v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
         if i < 2:
             alone = gained - b * dt_s - (estimated[i] - old.estimated_mps[i])
             missed[i] = remembers * old.missed_mps[i] + alone
-        if believed:
+        if believed and (i == 2 or not pushed):
             v += (estimated[i] - v) * min(1.0, dt_s / SPEED_MEMORY_S)
             wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
-            wrong = max(-MOST_WRONG_MPS2, min(MOST_WRONG_MPS2, wrong))
             if calm and i < 2:
                 more = estimated[i] - old.estimated_mps[i] - gained + b * dt_s
                 beside[i] = keeps * old.beside_mps[i] + more
-            b += (wrong - b) * min(1.0, dt_s / BIAS_MEMORY_S)
-            b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b))
+            if abs(wrong) <= MOST_WRONG_MPS2:
+                share = min(1.0, dt_s / BIAS_MEMORY_S)
+                b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b + share * (wrong - b)))
+                if i < 2:
+                    aside_mps2[i] += share * (reads_mps2[i] - aside_mps2[i])
         velocity.append(v)
         bias.append(b)
     vx, vy, vz = velocity
@@ -464,6 +488,7 @@ def advance_reckoning(
         imu=imu,
         velocity_mps=(vx, vy, vz),
         bias_mps2=(bias[0], bias[1], bias[2]),
+        aside_mps2=(aside_mps2[0], aside_mps2[1]),
         estimated_mps=estimated,
         beside_mps=(beside[0], beside[1]),
         missed_mps=(missed[0], missed[1]),
@@ -494,9 +519,11 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
         velocity.append(before_mps[i] + share * (new.velocity_mps[i] - before_mps[i]))
         position.append(before_m[i] + share * (new.position_m[i] - before_m[i]))
         bias.append(velocity[i] - (new.position_m[i] - position[i]) / VELOCITY_MEMORY_S)
+    size_mps = math.hypot(*bias)
+    part = 1.0 if size_mps <= MOST_VELOCITY_BIAS_MPS else MOST_VELOCITY_BIAS_MPS / size_mps
     return replace(
         old,
-        velocity_bias_mps=(bias[0], bias[1]),
+        velocity_bias_mps=(part * bias[0], part * bias[1]),
         mean_velocity_mps=(velocity[0], velocity[1]),
         mean_position_m=(position[0], position[1]),
     )

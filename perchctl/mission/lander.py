@@ -115,6 +115,7 @@ MOST_LEAN_RAD = 0.2
 BRAKED_AGE_S = 0.2  # an older speed is braked less, or it swings
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
 """An attitude error of 0.01 rad adds 0.1 m/s each second."""
+LEVEL_FELT_S = 6.0  # an attitude error of before is not the present one
 STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
 UNANSWERED_PART = 0.12  # of full thrust: no ramp leads farther
 CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
@@ -344,8 +345,6 @@ def give_up_position(c: Context) -> Context:
 def _reckon(c: Context) -> PlannerState:
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
-    # What pushes the vehicle while no sight corrects its estimate is no bias of the accelerometer.
-    believed = believed and (c.is_corrected or not c.by_sight)
     astray = state.astray and not c.by_sight
     new = advance_reckoning(
         state.reckoning,
@@ -354,8 +353,16 @@ def _reckon(c: Context) -> PlannerState:
         believed=believed,
         astray=astray,
         corrected=c.is_corrected,
+        # What moves it while no sight corrects its estimate is no bias of the accelerometer.
+        pushed=c.by_sight and not c.is_corrected,
     )
-    if believed and state.phase in IN_THE_OPEN and c.height_m > LIFTED_M and state.last:
+    if (
+        believed
+        and c.is_corrected
+        and state.phase in IN_THE_OPEN
+        and c.height_m > LIFTED_M
+        and state.last
+    ):
         new = learn_velocity_bias(new, state.last, obs.telemetry)
     else:
         new = forget_means(new)
@@ -368,6 +375,9 @@ def _reckon(c: Context) -> PlannerState:
         new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
         if not blown:
             new = learn_bias_at_rest(new, state.reckoning.imu, obs.imu)
+        if obs.telemetry.thrust < 1:  # it hangs, and what hangs stays where it is
+            old = state.reckoning
+            new = replace(new, aside_m=old.aside_m, aside_sigma_m=old.aside_sigma_m)
     felt, late = obs.felt, c.mismatch.later_s != 0.0
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         # Late pictures have led the estimate's height astray, too.
@@ -732,12 +742,15 @@ def _braking(c: Context) -> tuple[float, float]:
 
     The thrust acts along the body's z axis, so what the accelerometer reads across it is the air's
     force w, m/s2. Level thrust g tan(tilt) has to give -w, and the estimated attitude is off by
-    b / g, where b is the excess of accelerometer and attitude that was learned while a position
-    was known: the estimated lean is (b - w) / g. An offset of the accelerometer is in both.
+    b / g, where b is the excess of accelerometer and attitude: the estimated lean is (b - w) / g.
+    Both are the means of the time in which a position was known, and an offset of the
+    accelerometer is in both. What it reads now does not count: most of that is the drag of the
+    vehicle's own motion, which brakes it. Wrong positions have taught a wrong bias: with those only
+    the one that pictures have shown lately counts.
     """
     if c.state.heading_lost or is_in_magnet_reach(c):
         return 0.0, 0.0
-    imu, reckoning, yaw_rad = c.obs.imu, c.state.reckoning, c.telemetry.yaw_rad
+    reckoning, yaw_rad = c.state.reckoning, c.telemetry.yaw_rad
     x_mps, y_mps, _ = reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if c.state.blind_s is None else c.t_s - c.state.blind_s
@@ -746,12 +759,13 @@ def _braking(c: Context) -> tuple[float, float]:
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, c.attitude_age_s))
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
-    bias_x_mps2, bias_y_mps2, _ = reckoning.bias_mps2
-    ahead_mps2, left_mps2 = _in_heading(bias_x_mps2, bias_y_mps2, yaw_rad)
-    if c.imu_proves:
-        ahead_mps2 -= GRAVITY_MPS2 * imu.aside_g[0]
-        left_mps2 -= GRAVITY_MPS2 * imu.aside_g[1]
-    roll_rad, pitch_rad = imu.misled_rad
+    (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.aside_mps2
+    lean_mps2 = bias_x_mps2 - x_mps2, bias_y_mps2 - y_mps2
+    if c.state.astray:
+        shown = max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
+        lean_mps2 = shown * bias_x_mps2, shown * bias_y_mps2
+    ahead_mps2, left_mps2 = _in_heading(*lean_mps2, yaw_rad)
+    roll_rad, pitch_rad = c.obs.imu.misled_rad
     return (
         _against(-left_mps) - _lean_rad(left_mps2) + roll_rad,
         _against(ahead_mps) + _lean_rad(ahead_mps2) + pitch_rad,

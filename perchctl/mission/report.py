@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from perchctl.mission.conditions import contact_error
 from perchctl.mission.context import Context
 from perchctl.mission.lander import RestState, find_rest_state
 from perchctl.mission.records import Event
@@ -142,6 +143,8 @@ class FlightReport:
     ) -> FlightReport:
         """The report of a mission that is over, by its last tick; `simulated`: the vehicle was."""
         hangs, contact = state.phase is Phase.PERCHED, state.contact
+        if hangs and contact is None:  # it was caught on its way down
+            contact = contact_error(Context(state, obs, profile))
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,

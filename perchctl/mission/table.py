@@ -45,7 +45,15 @@ from perchctl.mission.state import (
     Severity,
 )
 from perchctl.profile import USED_LATENCY_S
-from perchctl.vehicle import CRASHED, FRESH_S, LOCKED, TUMBLED, EmergencyStop, StopMotors
+from perchctl.vehicle import (
+    CRASHED,
+    FLYING,
+    FRESH_S,
+    LOCKED,
+    TUMBLED,
+    EmergencyStop,
+    StopMotors,
+)
 
 Predicate = Callable[[Context], bool]
 Reason = str | Callable[[Context], str]
@@ -113,7 +121,7 @@ def is_astray(c: Context) -> bool:
     if phase is P.LANDING:
         touched = c.state.contact_z_m is not None or c.state.stopped_s is not None
         return not touched and _away_m(c) > ASTRAY_LANDING_M
-    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s
+    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if c.by_sight else 0.0
     if phase is P.APPROACH and c.height_m < LIFTED_M:
         return _away_m(c) > SIDEWAYS_M + spare_m
     ground = c.state.ground_m
@@ -185,6 +193,11 @@ def latency_reason(c: Context) -> str:
     camera = c.profile.camera
     assumed_s = camera.start_latency_s + c.obs.delay_s
     found = f"the pictures are {1e3 * (assumed_s + c.mismatch.later_s):.0f} ms old"
+    if not c.proves:  # by late telemetry, pictures that are in time seem late
+        return (
+            f"pictures and telemetry do not fit each other, by {1e3 * c.mismatch.later_s:.0f} ms; "
+            f"the telemetry is {c.telemetry_age_s:.1f} s old"
+        )
     if isinstance(camera.latency_s, str):
         least_s, most_s = USED_LATENCY_S
         return (
@@ -363,9 +376,15 @@ def no_picture_reason(c: Context) -> str:
 
 
 def unconfirmed_reason(c: Context) -> str:
-    cause = "by its telemetry the vehicle still flies"
-    if c.attitude_age_s > FRESH_S:
-        cause = f"nothing was heard from the vehicle for {c.attitude_age_s:.1f} s"
+    age_s, proof_age_s = c.attitude_age_s, c.safety.proof_age_s
+    if age_s > FRESH_S:
+        cause = f"the newest telemetry is {age_s:.1f} s old"
+    elif c.telemetry.has_bit(FLYING) or c.telemetry.thrust >= 1:
+        cause = "by its telemetry the vehicle still flies"
+    elif age_s > proof_age_s:
+        cause = f"the telemetry is {age_s:.2f} s old, and at most {proof_age_s:g} s old is proof"
+    else:
+        cause = "by its telemetry the vehicle does not rest yet"
     return f"the landing was not confirmed in time: {cause}"
 
 
@@ -446,7 +465,7 @@ TABLE: tuple[Transition, ...] = (
         "telemetry-stale",
         FLYING_PHASES,
         lambda c: c.telemetry_age_s > c.safety.telemetry_land_s,
-        lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s",
+        lambda c: f"the newest telemetry is {c.telemetry_age_s:.1f} s old",
     ),
     land_row(
         "heading-lost",

@@ -52,6 +52,14 @@ class OnlineCalibration:
     coarse_delay_s: float | None = None
     last_picture_s: float = -math.inf
 
+    @property
+    def delay_sigma_s(self) -> float:
+        """Standard deviation of a measured latency: that of `newest`, and at the most that of one
+        which is not known, however much the pictures scatter."""
+        if self.newest is None:
+            return UNKNOWN_SIGMA_S
+        return min(UNKNOWN_SIGMA_S, self.newest.delay_sigma_s)
+
 
 def update_calibration(
     old: OnlineCalibration,

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from perchctl.camera import FrameHealth
 from perchctl.perception.history import History, attitude_at
 from perchctl.perception.online_calibration import (
-    UNKNOWN_SIGMA_S,
     OnlineCalibration,
     apply_latency,
     solve_consistency,
@@ -109,10 +108,7 @@ class Perception:
     @property
     def latency_sigma_s(self) -> float:
         """Standard deviation of the latency in use; 0 for one that the profile gives."""
-        newest = self.calibration.newest
-        if self._measured_latency is None:
-            return 0.0
-        return UNKNOWN_SIGMA_S if newest is None else newest.delay_sigma_s
+        return 0.0 if self._measured_latency is None else self.calibration.delay_sigma_s
 
     def camera_errors(self) -> CameraErrors | None:
         """Errors of latency and mounting by all pictures so far; None after too few pictures."""

@@ -191,8 +191,8 @@ class PlannerConfig(Section):
     attempts: int = key(5, "perching attempts in all", ge=1, le=50)
     perching_time_s: float = key(120.0, "time for all attempts; then it lands", gt=0, le=1200)
     integral_per_s: float = key(0.4, "gain of the integral of the horizontal error", ge=0, le=5)
-    integral_limit_m: ClassVar[float] = 0.4
-    """Of that integral."""
+    integral_limit_m: ClassVar[float] = 0.08
+    """To which that integral grows while the vehicle moves."""
 
 
 class SafetyConfig(Section):

@@ -9,10 +9,13 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import PROFILE_ROWS, Findings
+from perchctl.mission import PROFILE_ROWS, Findings, FlightReport, ImuMotion, Observation, Phase
+from perchctl.mission.imu import DeadReckoning
 from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraErrors
+from tests.helpers.mission import BY_TARGET, observation, state_in, telemetry
+from tests.mission.rig import BEGIN_S, Look, fly
 
 
 def _seen(
@@ -62,3 +65,43 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
         and re.search(r"camera\.(mount|latency)|check --lift", inspect.getsource(row.reason))
     }
     assert blames == PROFILE_ROWS
+
+
+@pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED])
+def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase) -> None:
+    """A contact is proven only in PERCH; what hangs after a landing was carried there by the dead
+    reckoning."""
+    reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), aside_m=(0.03, 0.04), aside_sigma_m=0.01)
+    state = replace(state_in(phase), reckoning=reckoning, contact=None)
+    report = FlightReport.of(state, observation(BEGIN_S), BY_TARGET, (), None)
+    if phase is Phase.LANDED:
+        assert report.contact is None
+        return
+    assert report.contact is not None
+    assert report.contact.aside_m == pytest.approx(0.05)
+    assert 0.01 <= report.contact.sigma_m < 0.02
+
+
+def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
+    """Its distance does not become unsure while it hangs there."""
+    reckoning = DeadReckoning(
+        aside_m=(0.02, 0.0), aside_sigma_m=0.01, below_m=0.0, sight_s=BEGIN_S - 0.5
+    )
+    begun = replace(
+        state_in(Phase.LANDING, z_m=1.9),
+        reckoning=reckoning, contact_z_m=1.9, reach_s=BEGIN_S, stopped_s=BEGIN_S, blind_s=BEGIN_S,
+    )  # fmt: skip
+    flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)
+    rest = [tick.state.reckoning.aside_sigma_m for tick in flight.ticks if tick.t_s > BEGIN_S + 1.0]
+    assert rest[-1] == pytest.approx(rest[0], abs=1e-6)
+    assert rest[-1] < 0.1
+
+
+def hangs(z_m: float) -> Look:
+    """A vehicle on the magnet, its motors off and its target out of sight."""
+
+    def look(t_s: float) -> Observation:
+        sample = telemetry(t_s, z_m, thrust=0, acc_x_g=1e-4 * (round(100 * t_s) % 3))
+        return observation(t_s, telemetry=sample, target=None, position_age_s=t_s - BEGIN_S)
+
+    return look

@@ -286,8 +286,12 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     takes for a tilt, both cancel, and the level that it reads is what stands against the wind."""
     bias_mps2 = 9.81 * wrong_rad
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    imu = ImuMotion(t_s=NOW_S - 0.01, aside_g=(wind_g, 0.0))
-    reckoning = DeadReckoning(imu=imu, bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0))
+    imu, reads_mps2 = ImuMotion(t_s=NOW_S - 0.01), 9.81 * wind_g
+    reckoning = DeadReckoning(
+        imu=imu,
+        bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
+        aside_mps2=(reads_mps2 * cos, reads_mps2 * sin),
+    )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)
     c = Context(c.state, replace(c.obs, imu=imu, felt=felt), c.profile)

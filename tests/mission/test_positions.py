@@ -406,6 +406,16 @@ def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
     assert (state.row == "position-astray") is lands
 
 
+@pytest.mark.parametrize(("profile", "lands"), [(MOCAP, True), (BY_TARGET, False)])
+def test_the_camera_s_latency_excuses_only_positions_by_the_camera(
+    profile: Profile, lands: bool
+) -> None:
+    begin = state_in(Phase.APPROACH, z_m=0.02)
+    look = at(position_m=(0.2, 0.0, 0.02), obs={"delay_sigma_s": 0.05})
+    state = fly(begin, look, profile=profile).state
+    assert (state.row == "position-astray") is lands
+
+
 @pytest.mark.parametrize("profile", [MOCAP, PROFILE])
 @pytest.mark.parametrize(
     ("phase", "climb_mps", "lands"),

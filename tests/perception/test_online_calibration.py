@@ -54,6 +54,13 @@ def _frames(
     return state
 
 
+@given(sigma_s=st.floats(0.0, 0.5))
+def test_a_latency_is_never_less_known_than_before_it_was_measured(sigma_s: float) -> None:
+    unknown_s = OnlineCalibration().delay_sigma_s
+    found_s = OnlineCalibration(newest=_seen(0.0, sigma_s)).delay_sigma_s
+    assert found_s == min(sigma_s, unknown_s)
+
+
 def test_a_sure_latency_is_taken_over_slowly() -> None:
     """20 ms a second: what the target's place makes of that is what it makes of a drift."""
     start = OnlineCalibration(newest=_seen(0.04, 0.004))
