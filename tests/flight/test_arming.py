@@ -295,13 +295,14 @@ def test_a_brushless_vehicle_perches_and_ends_disarmed(tmp_path: Path) -> None:
 @dataclass
 class Session:
     """One session of `fly` with a vehicle in real time. `on_arming` is called in the turn after the
-    vehicle was sent its arming request, and may raise."""
+    vehicle was sent its arming request."""
 
     sim: SimProcess
     on_arming: Callable[[Session], None] = lambda session: None
     switch: OperatorSwitch = field(default_factory=OperatorSwitch)
     problem: str | None = None
     camera_ends: bool = False
+    camera_fails: bool = False
     sent_commands: list[SentCommand] = field(default_factory=list)
 
     def tick(self, tick: Any) -> None: ...
@@ -344,6 +345,8 @@ class EndsOnWord(WrappedSource):
         return self._session.camera_ends
 
     def poll(self, now_s: float) -> Frame | None:
+        if self._session.camera_fails:
+            raise ZeroDivisionError("the camera's")
         return super().poll(now_s)
 
 
@@ -395,8 +398,8 @@ def end_camera(session: Session) -> None:
     session.camera_ends = True
 
 
-def fail(session: Session) -> None:
-    raise ZeroDivisionError("a watcher's")
+def fail_in_the_camera(session: Session) -> None:
+    session.camera_fails = True
 
 
 def spill_the_battery(session: Session) -> None:
@@ -409,7 +412,7 @@ def spill_the_battery(session: Session) -> None:
     [
         (press, Interrupted),
         (end_camera, NotFound),
-        (fail, ZeroDivisionError),
+        (fail_in_the_camera, ZeroDivisionError),
         (spill_the_battery, SafetyAbort),
     ],
 )
