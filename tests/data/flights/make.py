@@ -1,10 +1,11 @@
 """Flies the flights of the regression corpus and keeps what a replay needs of their logs.
 
-    python tests/data/flights/make.py [NAME ...]
+    python tests/data/flights/make.py [--decide] [NAME ...]
 
 Each file holds a log's header, turns, what was sent in the loop's place, events and summary,
 packed; the ticks, which say the same rounded, are left out. `seen.mcap` holds the pictures of one
-of them. They were flown by the planner of their day: `tests/replay/test_corpus.py` demands that
+of them. With ``--decide`` the logs keep what was observed, and their format, and get what today's
+planner decides from it. They were flown by the planner of their day: `tests/replay/test_corpus.py` demands that
 today's decides the same from the same observations, and `test_seen.py` that today's pipeline sees
 the same in the pictures. Where it is meant to decide otherwise: CONTRIBUTING.md, "Change the
 planner".
@@ -46,6 +47,7 @@ from perchctl.record.recorded import recorded_frames  # noqa: E402
 from perchctl.record.recorder import Recorder  # noqa: E402
 from perchctl.record.write import recording_path  # noqa: E402
 from perchctl.vision import Frame  # noqa: E402
+from tests.helpers.decided import decided_here  # noqa: E402
 from tests.helpers.flights import ordered, short_profile  # noqa: E402
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 
@@ -163,12 +165,23 @@ def _keep_pictures(recording: Path, path: Path) -> None:
     kept.close()
 
 
+def decided(name: str) -> Path:
+    """The log as it was recorded, with today's decisions."""
+    path = HERE / f"{name}.jsonl.gz"
+    header = gzip.decompress(path.read_bytes()).splitlines(True)[0]
+    lines = (header, *decided_here(name)[1:])
+    path.write_bytes(gzip.compress(b"".join(lines), compresslevel=9, mtime=0))
+    return path
+
+
 def main() -> None:
     cv2.setNumThreads(1)
-    for name in sys.argv[1:] or FLIGHTS:
+    words = sys.argv[1:]
+    make = decided if "--decide" in words else made
+    for name in [word for word in words if word != "--decide"] or FLIGHTS:
         if name not in FLIGHTS:
             sys.exit(f"{name} is none of {', '.join(FLIGHTS)}")
-        path = made(name)
+        path = make(name)
         for file in (path, recording_path(path)):
             if file.is_file():
                 print(f"{file.name}: {file.stat().st_size / 1000:.0f} kB")
