@@ -29,13 +29,15 @@ class _Loader(yaml.SafeLoader):
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
             return super().construct_object(node, deep)
-        except (ValueError, LookupError, AttributeError):
+        except (ValueError, LookupError, AttributeError) as error:
             # PyYAML converts a scalar unchecked: a date without a month, `!!bool 7`.
             if not isinstance(node, yaml.ScalarNode):
                 raise
             kind = node.tag.rpartition(":")[2]
+            why = f": {error}" if kind == "timestamp" and isinstance(error, ValueError) else ""
+            line = node.start_mark.line + 1
             raise ValueError(
-                f"line {node.start_mark.line + 1}: {clip_text(node.value)!r} is not a valid {kind}"
+                f"line {line}: {clip_text(node.value)!r} is not a valid {kind}{why}"
             ) from None
 
 

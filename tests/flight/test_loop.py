@@ -71,7 +71,7 @@ def test_telemetry_that_is_no_number_is_left_out() -> None:
 
 def test_telemetry_that_stays_away_lands() -> None:
     rig = Rig(Vehicle(lambda s: None if 1.5 < s.t_s < 4.0 else s))
-    landed_for(rig, "no telemetry")
+    landed_for(rig, "the newest telemetry is 1.0 s old")
     assert rig.link.said(Land)[0] == pytest.approx(1.5 + 1.0, abs=0.06)
 
 

@@ -108,7 +108,7 @@ def _steps_up(sample: Telemetry) -> Telemetry:
     [
         (math.inf, lambda s: replace(s, yaw_rad=1.0), "heading jumped"),
         pytest.param(math.inf, _steps_up, "the state estimate jumped", marks=pytest.mark.long),
-        (4.0, lambda s: replace(s, velocity_mps=(math.nan, 0.0, 0.0)), "no telemetry"),
+        (4.0, lambda s: replace(s, velocity_mps=(math.nan, 0.0, 0.0)), "the newest telemetry is"),
     ],
     ids=["heading", "height", "no number for long"],
 )

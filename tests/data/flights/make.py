@@ -5,10 +5,10 @@
 Each file holds a log's header, turns, what was sent in the loop's place, events and summary,
 packed; the ticks, which say the same rounded, are left out. `seen.mcap` holds the pictures of one
 of them. With ``--decide`` the logs keep what was observed, and their format, and get what today's
-planner decides from it. They were flown by the planner of their day: `tests/replay/test_corpus.py` demands that
-today's decides the same from the same observations, and `test_seen.py` that today's pipeline sees
-the same in the pictures. Where it is meant to decide otherwise: CONTRIBUTING.md, "Change the
-planner".
+planner decides from it. They were flown by the planner of their day:
+`tests/replay/test_corpus.py` demands that today's decides the same from the same observations, and
+`test_seen.py` that today's pipeline sees the same in the pictures. Where it is meant to decide
+otherwise: CONTRIBUTING.md, "Change the planner".
 """
 
 from __future__ import annotations
