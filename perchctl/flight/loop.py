@@ -222,6 +222,7 @@ def _mission(
     state: PlannerState | None = None
     passed: list[Event] = []
     redone = log_noted = drops_sightings = False
+    told_change_s: tuple[float, float] | None = None
     logged = inputs.perception.calibration.newest
     while True:
         began_s = now_s = clock.now()
@@ -261,6 +262,10 @@ def _mission(
         if obs.log_problem is not None and not log_noted:
             log_noted = True
             notes.insert(0, f"the log of this flight is incomplete: {obs.log_problem}")
+        changed_s = inputs.perception.calibration.changed_s
+        if changed_s is not None and changed_s != told_change_s:
+            told_change_s = changed_s
+            notes.append(_latency_text(parts.profile, changed_s))
         events += [Event(now_s, EventKind.NOTE, text, state.phase) for text in notes]
         for event in events:
             if event.kind is EventKind.PHASE:
@@ -299,6 +304,11 @@ def _mission(
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
         clock.wait_until(due_s)
+
+
+def _latency_text(profile: Profile, changed_s: tuple[float, float]) -> str:
+    before_ms, after_ms = (1e3 * (profile.camera.start_latency_s + each) for each in changed_s)
+    return f"the camera's latency changed from {before_ms:.0f} to {after_ms:.0f} ms"
 
 
 def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:

@@ -42,7 +42,8 @@ class OnlineCalibration:
 
     `newest` is the solution of `sums` at `solved_s`; `applied_delay_s` is the latency beyond the
     profile's that is subtracted from the pictures' times, since the picture of `last_picture_s`;
-    `coarse_delay_s` is where a correction is taking it, None once it is there.
+    `coarse_delay_s` is where a correction is taking it, None once it is there. `changed_s`: the
+    newest change of a latency that had been sure, from and to seconds beyond the profile's.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
@@ -50,6 +51,7 @@ class OnlineCalibration:
     solved_s: float = -math.inf
     applied_delay_s: float = 0.0
     coarse_delay_s: float | None = None
+    changed_s: tuple[float, float] | None = None
     last_picture_s: float = -math.inf
 
     @property
@@ -107,7 +109,8 @@ def apply_latency(
     if correction_s is not None:
         coarse_s = correction_s
         if sure_s is not None and abs(sure_s - correction_s) > CHANGED_S:
-            new = replace(new, sums=ConsistencySums(), newest=None)
+            changed_s = (sure_s, correction_s)
+            new = replace(new, sums=ConsistencySums(), newest=None, changed_s=changed_s)
     delay_s, slew = (sure_s, SLEW) if coarse_s is None else (coarse_s, FAST_SLEW)
     used_s = old.applied_delay_s
     if delay_s is not None:

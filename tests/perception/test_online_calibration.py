@@ -104,6 +104,7 @@ def test_another_latency_is_taken_over_within_half_a_second(
     assert there.applied_delay_s == pytest.approx(later_s)
     assert there.coarse_delay_s is None
     contradicts = was_s is not None and abs(was_s - later_s) > CHANGED_S
+    assert there.changed_s == ((was_s, later_s) if contradicts else None)
     assert (there.newest is None) is (was_s is None or contradicts)
     again = replace(there, newest=_seen(later_s + 0.02, 0.004))
     drift_s = _frames(again, 1).applied_delay_s - later_s
