@@ -17,6 +17,7 @@ from tests.helpers.flights import ROOT
 
 ON_THE_WAY = (
     "perchctl: connecting", "perchctl: check: ", "perchctl: calibration: ", "perchctl: wrote ",
+    "Press Ctrl-C to land. ",
 )  # fmt: skip
 
 
