@@ -378,6 +378,7 @@ class DeadReckoning:
     velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # sideways, of the estimated velocity
     mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # of the estimate, over the last seconds
     mean_position_m: tuple[float, float] | None = None  # the same of its position
+    held_s: float = 0.0  # in the open and by positions, in all
 
 
 def advance_reckoning(
@@ -526,6 +527,7 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
         velocity_bias_mps=(part * bias[0], part * bias[1]),
         mean_velocity_mps=(velocity[0], velocity[1]),
         mean_position_m=(position[0], position[1]),
+        held_s=old.held_s + dt_s,
     )
 
 

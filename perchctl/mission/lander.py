@@ -42,6 +42,7 @@ from perchctl.mission.guidance import (
     stop_motors,
 )
 from perchctl.mission.imu import (
+    BIAS_MEMORY_S,
     REACH_M,
     UNSEEN_S,
     Vector,
@@ -745,8 +746,8 @@ def _braking(c: Context) -> tuple[float, float]:
     b / g, where b is the excess of accelerometer and attitude: the estimated lean is (b - w) / g.
     Both are the means of the time in which a position was known, and an offset of the
     accelerometer is in both. What it reads now does not count: most of that is the drag of the
-    vehicle's own motion, which brakes it. Wrong positions have taught a wrong bias: with those only
-    the one that pictures have shown lately counts.
+    vehicle's own motion, which brakes it. Means of a shorter time than `BIAS_MEMORY_S` count less,
+    and those by wrong positions not at all: there the bias counts that pictures have shown lately.
     """
     if c.state.heading_lost or is_in_magnet_reach(c):
         return 0.0, 0.0
@@ -760,11 +761,11 @@ def _braking(c: Context) -> tuple[float, float]:
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, c.attitude_age_s))
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.aside_mps2
-    lean_mps2 = bias_x_mps2 - x_mps2, bias_y_mps2 - y_mps2
-    if c.state.astray:
-        shown = max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
-        lean_mps2 = shown * bias_x_mps2, shown * bias_y_mps2
-    ahead_mps2, left_mps2 = _in_heading(*lean_mps2, yaw_rad)
+    known = 0.0 if c.state.astray else min(1.0, reckoning.held_s / BIAS_MEMORY_S)
+    counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
+    ahead_mps2, left_mps2 = _in_heading(
+        counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad
+    )
     roll_rad, pitch_rad = c.obs.imu.misled_rad
     return (
         _against(-left_mps) - _lean_rad(left_mps2) + roll_rad,

@@ -278,12 +278,14 @@ def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     wind_g=st.floats(-0.09, 0.09),
     heading_rad=st.floats(-3.1, 3.1),
     age_s=st.sampled_from([0.05, 2.0, 7.0]),
+    held_s=st.sampled_from([0.0, 1.0, 4.0, 30.0]),
 )
 def test_level_is_against_the_wind_and_the_error_of_the_attitude(
-    wrong_rad: float, wind_g: float, heading_rad: float, age_s: float
+    wrong_rad: float, wind_g: float, heading_rad: float, age_s: float, held_s: float
 ) -> None:
     """An attitude that is 0.02 rad wrong makes 0.2 m/s of speed a second. In a wind the estimate
-    takes for a tilt, both cancel, and the level that it reads is what stands against the wind."""
+    takes for a tilt, both cancel, and the level that it reads is what stands against the wind. A
+    position of less than 4 s has taught only a part of it; the rest is what pictures show."""
     bias_mps2 = 9.81 * wrong_rad
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     imu, reads_mps2 = ImuMotion(t_s=NOW_S - 0.01), 9.81 * wind_g
@@ -291,6 +293,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
         imu=imu,
         bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
         aside_mps2=(reads_mps2 * cos, reads_mps2 * sin),
+        held_s=held_s,
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)
@@ -298,7 +301,9 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     command = lander.act(c)[1]
     assert isinstance(command, RawThrust)
     assert command.roll_rad == pytest.approx(0.0, abs=1e-9)
-    against_rad = math.atan(wrong_rad - wind_g)
+    known = min(1.0, held_s / 4.0)
+    shown = max(0.0, 1.0 - age_s / 6.0)
+    against_rad = math.atan((known + (1.0 - known) * shown) * wrong_rad - known * wind_g)
     assert command.pitch_rad == pytest.approx(against_rad, abs=1e-9)
 
 
