@@ -120,16 +120,15 @@ def estimate_motion(
     if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
         return new
     hypotheses_s = delay_hypotheses(0.0 if measured is None else measured.in_use_s)
-    wanders_m, velocity_mps, bias_mps2 = fit_hypotheses(
-        new.sights,
-        samples,
-        offset_g,
-        hypotheses_s,
-        # An ascent hardly moves sideways. A turn of the camera would not show upwards.
-        vertical=measured is not None,
+    wanders_m, upwards_m, velocity_mps, bias_mps2 = fit_hypotheses(
+        new.sights, samples, offset_g, hypotheses_s
     )
     if old.mismatch is None or measured is not None:  # else it stays
         found, before = _found(wanders_m, hypotheses_s, measured), old.latest
+        if found is None and measured is not None:
+            # An ascent hardly moves sideways. No turn of the camera shows upwards.
+            found = _found(np.hypot(wanders_m, upwards_m), hypotheses_s, measured)
+            found = None if found is not None and found.turn_rad else found
         agreed = 0 if found is None else 1
         if found is not None and before is not None and found.turn_rad == before.turn_rad:
             agreed += old.agree_count if abs(found.later_s - before.later_s) <= ALIKE_S else 0
@@ -206,14 +205,12 @@ def fit_hypotheses(
     samples: tuple[Telemetry, ...],
     offset_g: Vector,
     later_s: Array,
-    *,
-    vertical: bool = False,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """The motion under each of n hypotheses: the delay `later_s[i]` and camera turn `TURNS_RAD[i]`.
 
     `sights`: times, and ways from body to target, m, body axes. Returns the target's apparent
-    motion, rms in m, (n,), sideways and, with `vertical`, upwards, too; the vehicle's velocity at
-    the newest sample, m/s, (3, n); and the offset of its acceleration, m/s2, (3, n).
+    motion, rms in m, sideways (n,) and upwards (n,); the vehicle's velocity at the newest sample,
+    m/s, (3, n); and the offset of its acceleration, m/s2, (3, n).
     """
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
@@ -238,11 +235,13 @@ def fit_hypotheses(
     known = np.diag([0.0, 0.0, (SIGMA_M / OFFSET_MPS2) ** 2])
     sums = np.stack([x, y, z])  # (3, n, sights)
     found = sums @ np.linalg.solve(unknown.T @ unknown + known, unknown.T).T
-    axes = 3 if vertical else 2
-    left = ((sums - found @ unknown.T) * sums)[:axes].sum(axis=(0, 2))
+    left = ((sums - found @ unknown.T) * sums).sum(axis=2)  # (3, n)
+    sideways_m, upwards_m = (
+        np.sqrt(np.maximum(each, 0.0) / len(u)) for each in (left[0] + left[1], left[2])
+    )
     newest_u = stamps_s[-1] + later_s - seen_s.mean()
     velocity = speeds[-1][:, None] - found[..., 1] - found[..., 2] * newest_u
-    return np.sqrt(np.maximum(left, 0.0) / len(u)), velocity, found[..., 2]
+    return sideways_m, upwards_m, velocity, found[..., 2]
 
 
 def _turned(a: Array, b: Array, by_rad: Array) -> tuple[Array, Array]:
