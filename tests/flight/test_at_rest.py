@@ -105,7 +105,9 @@ def test_a_healthy_vehicle_stands_still_whatever_places_it(
         assert math.hypot(*mean) < share * STANDING_MPS
 
 
-@pytest.mark.parametrize("mps", RATES_MPS)
+@pytest.mark.parametrize(
+    "mps", [RATES_MPS[0], *(pytest.param(mps, marks=pytest.mark.long) for mps in RATES_MPS[1:])]
+)
 def test_a_vehicle_whose_estimate_runs_away_does_not_take_off(mps: float) -> None:
     rig = Rig(Vehicle(lambda sample: runs_away(sample, mps)))
     rig.refused(TimedOut, r"estimate to stand still .the estimated position moved")
