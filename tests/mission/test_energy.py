@@ -84,7 +84,14 @@ WEAK = {
 
 @pytest.mark.parametrize(
     ("name", "hover"),
-    [*((name, HOVER) for name in WEAK), ("low", 0.5), ("low", 0.7), ("old", 0.5), ("old", 0.7)],
+    [
+        *((name, HOVER) for name in WEAK),
+        *(
+            pytest.param(name, hover, marks=pytest.mark.long)
+            for name in ("low", "old")
+            for hover in (0.5, 0.7)
+        ),
+    ],
 )
 def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None:
     """From a few seconds on, where it decides."""
