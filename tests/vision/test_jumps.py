@@ -215,7 +215,14 @@ def test_a_camera_that_skips_in_flight_has_the_target_at_once(
     assert not any(claim.is_false for claim in told)
 
 
-@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 0.03), (0.06, 0.0, 0.09), (0.1, 0.05, -0.2)])
+@pytest.mark.parametrize(
+    "jump_m",
+    [
+        pytest.param((0.0, 0.0, 0.03), marks=pytest.mark.long),
+        (0.06, 0.0, 0.09),
+        pytest.param((0.1, 0.05, -0.2), marks=pytest.mark.long),
+    ],
+)
 def test_the_spread_after_lost_frames_is_true(
     build: Build, jump_m: tuple[float, float, float]
 ) -> None:
