@@ -188,6 +188,7 @@ LONG = (
     "perchctl log report",
     "perchctl simulate",
     "perchctl calibrate aideck:",
+    "perchctl calibrate check",
     "perchctl calibrate images:board -b",
     "perchctl fit-weights collect",
     "perchctl make-target design",

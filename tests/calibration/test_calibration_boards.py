@@ -144,7 +144,14 @@ def test_what_is_unsure_is_not_named(picture: Grey, named: str, said: str, tmp_p
     assert seen.other_board.startswith(said) if said else not seen.other_board
 
 
-@pytest.mark.parametrize("rows", [slice(None), slice(64, 230), slice(56, 104)])
+@pytest.mark.parametrize(
+    "rows",
+    [
+        pytest.param(slice(None), marks=pytest.mark.long),
+        pytest.param(slice(64, 230), marks=pytest.mark.long),
+        slice(56, 104),
+    ],
+)
 def test_the_named_board_is_no_other_one(rows: slice) -> None:
     """Nor is a part of it, or the chessboard that its squares make."""
     board = Board.parse(EVEN)

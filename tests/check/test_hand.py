@@ -103,7 +103,10 @@ def test_a_true_capture_passes() -> None:
     assert "rose by 0.30 m" in row.found
 
 
-@pytest.mark.parametrize("number", range(len(TURNS)))
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(n, marks=[pytest.mark.long] * (n % 3 > 0)) for n in range(len(TURNS))],
+)
 def test_each_of_the_axes_is_found_and_named(number: int) -> None:
     """A world in other axes, in whatever heading, its body defined along them."""
     turn, yaw = TURNS[number], 0.7 * number
