@@ -440,7 +440,7 @@ def test_a_link_and_a_camera_of_your_own_fly_in_real_time(here: Path) -> None:
 
 
 @pytest.mark.usefixtures("pictures")
-@pytest.mark.parametrize("by", ["row", "Ctrl-C"])
+@pytest.mark.parametrize("by", [pytest.param("row", marks=pytest.mark.long), "Ctrl-C"])
 def test_a_row_of_your_own_and_ctrl_c_land_in_real_time(by: str, here: Path) -> None:
     def press(tick: Any) -> None:
         if by == "Ctrl-C" and tick.state.phase is Phase.APPROACH and is_high(tick):
@@ -460,6 +460,7 @@ def test_a_row_of_your_own_and_ctrl_c_land_in_real_time(by: str, here: Path) -> 
     assert ("high enough" in flight.report.reason) == (by == "row")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("pictures")
 def test_a_log_that_is_incomplete_is_told(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heights_m, lost = [0.0], property(lambda log: "the disk is full")
@@ -477,7 +478,7 @@ def is_high(tick: Any) -> bool:
 
 
 @pytest.mark.usefixtures("pictures")
-@pytest.mark.parametrize("failing", ["on_tick", "on_event"])
+@pytest.mark.parametrize("failing", ["on_tick", pytest.param("on_event", marks=pytest.mark.long)])
 def test_a_callback_that_raises_is_left_out_and_the_flight_goes_on(
     here: Path, failing: str
 ) -> None:

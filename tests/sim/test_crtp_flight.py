@@ -286,6 +286,7 @@ def test_notify_alone_cuts_the_motors(pilot: Pilot) -> None:
     assert not pilot.motors_off()
 
 
+@pytest.mark.long
 def test_the_order_of_land_and_notify_does_not_matter(pilot: Pilot) -> None:
     """Row "`land` then `notify` flies exactly as `notify` then `land` does (same curve)"."""
     curves = []
@@ -305,7 +306,7 @@ def test_the_order_of_land_and_notify_does_not_matter(pilot: Pilot) -> None:
     assert curves[0][-1] < 0.05
 
 
-@pytest.mark.parametrize("repeated", [True, False])
+@pytest.mark.parametrize("repeated", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_lost_notify_after_land_can_be_repeated(pilot: Pilot, repeated: bool) -> None:
     """Row "with its second packet lost the vehicle still has the 2 s of the setpoint watchdog"."""
     pilot.fly_to(0.8, 1.0)

@@ -233,7 +233,7 @@ def test_emergency_stop_and_its_watchdog(pilot: Pilot) -> None:
     assert pilot.info == LOCKED
 
 
-@pytest.mark.parametrize("notified", [False, True])
+@pytest.mark.parametrize("notified", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_hl_after_low_level_flies_only_with_notify(pilot: Pilot, notified: bool) -> None:
     """Rows "HL command after low-level without notify: HL active, not flown, locks after 2 s" and
     "With notify first it flies"."""
