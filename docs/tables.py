@@ -128,13 +128,13 @@ def _mermaid_type(annotation: str) -> str:
 
 def package_diagram() -> str:
     """Which package imports which, without what a longer path implies already."""
-    from tests.test_architecture import IMPORTS, LAYERS, room_of
+    from tests.test_architecture import LAYERS, all_imports, room_of
 
     packages = [
         room for rooms in LAYERS for room in rooms if (ROOT / room.replace(".", "/")).is_dir()
     ]
     needs: dict[str, set[str]] = {package: set() for package in packages}
-    for found in IMPORTS:
+    for found in all_imports():
         importer, imported = room_of(found.importer), room_of(found.imported)
         if importer in needs and imported in needs and importer != imported:
             needs[importer].add(imported)

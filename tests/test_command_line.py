@@ -253,6 +253,7 @@ def test_ctrl_c_while_loading_is_an_object_where_one_is_wanted() -> None:
     assert json.loads(done.stdout) == {"error": "Ctrl-C", "exit_code": 130}
 
 
+@pytest.mark.long
 def test_an_ignored_ctrl_c_stays_ignored() -> None:
     """As a shell starts what it puts into the background."""
     ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"

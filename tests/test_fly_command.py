@@ -149,8 +149,15 @@ def test_bad_input(words: str, code: int, named: list[str]) -> None:
         assert word in said.complaint
 
 
-@pytest.mark.parametrize("folder", ["afile", "/proc/none"])
-@pytest.mark.parametrize("command", ["simulate", "fly"])
+@pytest.mark.parametrize(
+    ("command", "folder"),
+    [
+        ("simulate", "afile"),
+        pytest.param("simulate", "/proc/none", marks=pytest.mark.long),
+        pytest.param("fly", "afile", marks=pytest.mark.long),
+        ("fly", "/proc/none"),
+    ],
+)
 def test_a_log_that_cannot_be_written(command: str, folder: str) -> None:
     Path("afile").touch()
     said = run(*command.split(), "--log-dir", folder)
@@ -182,7 +189,10 @@ def test_nobody_is_asked_before_the_camera_answers(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.usefixtures("terminal")
-@pytest.mark.parametrize(("answer", "flies"), [("n", False), ("", False), ("y", True)])
+@pytest.mark.parametrize(
+    ("answer", "flies"),
+    [("n", False), pytest.param("", False, marks=pytest.mark.long), ("y", True)],
+)
 def test_only_a_yes_is_consent(
     answer: str, flies: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -131,7 +131,7 @@ def april_grid() -> Grey:
 @pytest.mark.parametrize(
     ("picture", "named", "said"),
     [
-        (april_grid(), EVEN, "an AprilGrid"),
+        pytest.param(april_grid(), EVEN, "an AprilGrid", marks=pytest.mark.long),
         (np.full((300, 400), 120, np.uint8), EVEN, ""),
         # A part of the right board is no other board.
         (sheet(Board.parse(EVEN))[64:160, 64:160], EVEN, ""),
@@ -144,7 +144,14 @@ def test_what_is_unsure_is_not_named(picture: Grey, named: str, said: str, tmp_p
     assert seen.other_board.startswith(said) if said else not seen.other_board
 
 
-@pytest.mark.parametrize("rows", [slice(None), slice(64, 230), slice(56, 104)])
+@pytest.mark.parametrize(
+    "rows",
+    [
+        pytest.param(slice(None), marks=pytest.mark.long),
+        pytest.param(slice(64, 230), marks=pytest.mark.long),
+        slice(56, 104),
+    ],
+)
 def test_the_named_board_is_no_other_one(rows: slice) -> None:
     """Nor is a part of it, or the chessboard that its squares make."""
     board = Board.parse(EVEN)

@@ -42,8 +42,8 @@ def crossing(
     return np.rint(picture).astype(np.uint8), sides[None]
 
 
-@pytest.mark.parametrize("square_px", [7.0, 12.0, 30.0])
-@pytest.mark.parametrize("slant_deg", [0.0, 25.0])
+@pytest.mark.parametrize("square_px", [7.0, pytest.param(12.0, marks=pytest.mark.long), 30.0])
+@pytest.mark.parametrize("slant_deg", [pytest.param(0.0, marks=pytest.mark.long), 25.0])
 def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> None:
     errors = []
     for k in range(8):

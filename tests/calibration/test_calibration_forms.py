@@ -238,7 +238,7 @@ RECURSIVE = f"{ros(FIVE)}note: &own [*own]\n"
             "key resolution is missing, found camera_model, 1:",
         ),
         ("cam0: {2026-02-02: 2}\n", "is missing, found 2026-02-02"),
-        ("[" * 2000, "values are nested too deeply to be read"),
+        pytest.param("[" * 2000, "values are nested too deeply to be read", marks=pytest.mark.long),
         ('{"K":' * 2000, "values are nested too deeply to be read"),
         (f"{RECURSIVE}---\n{RECURSIVE}", "values are nested too deeply to be read"),
         ('{"image_width": 400, "image_width": 401}', "key image_width is there twice: keep one"),

@@ -154,9 +154,11 @@ HTML = b"<html>the camera's page</html>"
 @pytest.mark.parametrize(("script", "words"), [
     ([threading.Event()], "connected, but it sends nothing: does another program use it?"),
     ([HTML, threading.Event()], "it sends no type, and no whole JPEG: is it the stream's own addr"),
-    ([part(jpeg(60)[:300]), threading.Event()], "it sends no type, and no whole JPEG"),
-    ([part(resized(jpeg(60), 5000, 4000)), threading.Event()], "pictures come and are dropped (1 "
-     "so far): they have 5000x4000 px"),
+    pytest.param([part(jpeg(60)[:300]), threading.Event()], "it sends no type, and no whole JPEG",
+                 marks=pytest.mark.long),
+    pytest.param([part(resized(jpeg(60), 5000, 4000)), threading.Event()],
+                 "pictures come and are dropped (1 so far): they have 5000x4000 px",
+                 marks=pytest.mark.long),
     ([part(NO_PIXELS), threading.Event()], "pictures come and are dropped (1 so far): the "
      "JPEG cannot be decoded"),
 ])  # fmt: skip

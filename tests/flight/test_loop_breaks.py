@@ -107,7 +107,10 @@ def test_a_link_that_raises_when_it_is_asked_is_landed_all_the_same() -> None:
     landed_after_a_break(rig)
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize(
+    "after_s",
+    [0.0, pytest.param(0.02, marks=pytest.mark.long), pytest.param(0.1, marks=pytest.mark.long)],
+)
 def test_a_failure_right_after_the_take_off_order_lands(after_s: float) -> None:
     """The order does not show in the telemetry yet, and a vehicle in high-level flight would
     hover for ever (docs/firmware.md, "When setpoints stop")."""

@@ -411,8 +411,17 @@ def test_the_space_bar_cuts_the_motors_and_no_other_key_does() -> None:
         assert termios.tcgetattr(it.ours) == it.before
 
 
-@pytest.mark.parametrize("how", ["leaves", "raises"])
-@pytest.mark.parametrize("key", ["\x03", "\x1a", "SIGTERM"])
+@pytest.mark.parametrize(
+    ("key", "how"),
+    [
+        ("\x03", "leaves"),
+        pytest.param("\x03", "raises", marks=pytest.mark.long),
+        ("\x1a", "leaves"),
+        pytest.param("\x1a", "raises", marks=pytest.mark.long),
+        pytest.param("SIGTERM", "leaves", marks=pytest.mark.long),
+        ("SIGTERM", "raises"),
+    ],
+)
 def test_however_it_ends_the_terminal_is_as_before(how: str, key: str) -> None:
     """Ctrl-C and Ctrl-Z are signals as ever: they land, and do not suspend the program."""
     with KeyTerminal(how) as it:

@@ -62,7 +62,14 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
 
 
 @pytest.mark.parametrize("blind", [False, True])
-@pytest.mark.parametrize("share", [0.96, 0.85, 0.5])
+@pytest.mark.parametrize(
+    "share",
+    [
+        pytest.param(0.96, marks=pytest.mark.long),
+        0.85,
+        pytest.param(0.5, marks=pytest.mark.long),
+    ],
+)
 def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
     pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
     truth_mps, felt = dropped(3, share, blind)

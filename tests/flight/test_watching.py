@@ -94,7 +94,7 @@ def notes(watcher: Watcher) -> list[str]:
     return [event.reason for event in watcher.events if event.kind is EventKind.NOTE]
 
 
-@pytest.mark.parametrize("part", ["tick", "event", "problem"])
+@pytest.mark.parametrize("part", ["tick", "event", pytest.param("problem", marks=pytest.mark.long)])
 def test_a_watcher_that_raises_is_left_out_and_named(part: str) -> None:
     breaks = Breaks(part)
     report, works = flown(breaks)
@@ -113,7 +113,14 @@ def test_a_watcher_without_a_name_is_named_by_its_class() -> None:
     assert report.detached[0].startswith("Breaks raised Broken")
 
 
-@pytest.mark.parametrize("kind", [FlightPanel, FlightPage, LogWatcher])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(FlightPanel, marks=pytest.mark.long),
+        pytest.param(FlightPage, marks=pytest.mark.long),
+        LogWatcher,
+    ],
+)
 def test_the_flight_s_own_watchers_have_names_for_people(kind: Any) -> None:
     own = object.__new__(kind)  # raises whatever it is called for
     own.problem = None

@@ -347,7 +347,7 @@ class Falls(Motors):
 
 
 @pytest.mark.parametrize("felt_too_much_g", [0.0, 0.015, -0.015])
-@pytest.mark.parametrize("hover", [42000.0, 55000.0])
+@pytest.mark.parametrize("hover", [42000.0, pytest.param(55000.0, marks=pytest.mark.long)])
 def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
     hover: float, felt_too_much_g: float
 ) -> None:

@@ -219,7 +219,7 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     assert min(it.sent_m) >= FLOOR_M
 
 
-@pytest.mark.parametrize("handover_m", [0.1, 0.3])
+@pytest.mark.parametrize("handover_m", [0.1, pytest.param(0.3, marks=pytest.mark.long)])
 def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     """The lowest setpoint of a landing still leads below where it is handed over."""
     profile = changed({"planner.landing.handover_m": handover_m})

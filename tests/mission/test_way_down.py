@@ -255,7 +255,7 @@ class InAHand(Motors):
     "phase",
     [
         pytest.param(Phase.SEARCH, marks=pytest.mark.long),
-        Phase.ALIGN,
+        pytest.param(Phase.ALIGN, marks=pytest.mark.long),
         Phase.ASCEND,
         pytest.param(Phase.RECOVER, marks=pytest.mark.long),
     ],
@@ -319,9 +319,18 @@ class BacksOff(Motors):
     ("aside_m", "sigma_m", "row", "ends", "outcome"),
     [
         (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
-        (0.012, 0.075, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
         (0.04, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.012, math.inf, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        *(
+            pytest.param(
+                0.012,
+                sigma_m,
+                "hangs-at-contact",
+                Phase.PERCHED,
+                Outcome.SAFETY,
+                marks=pytest.mark.long,
+            )
+            for sigma_m in (0.075, math.inf)
+        ),
         (0.06, 0.01, "held", Phase.ABORTED, Outcome.SAFETY),
     ],
 )
@@ -392,7 +401,7 @@ def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
         assert isinstance(command, PositionSetpoint), i
 
 
-@pytest.mark.parametrize("positioning", ["deck", "target"])
+@pytest.mark.parametrize("positioning", ["deck", pytest.param("target", marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("frozen", "ends"),
     [

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
@@ -26,6 +26,7 @@ from perchctl.vehicle import Telemetry
 LEAST_S, MOST_S = -0.08, 0.1  # of a latency that the flight measures
 TARGET_M = np.array([0.3, -0.2, 1.9])
 RATE_HZ, FLOWN_S = 30.0, 1.5
+BRIEFLY = settings(max_examples=15)  # each watches for seconds
 LATENCY_S = 0.2  # so much newer is the telemetry than the exposure is taken to be
 
 
@@ -96,6 +97,7 @@ def watched(
     return watch
 
 
+@BRIEFLY
 @given(
     later_s=st.floats(LEAST_LATER_S + STEP_S, 0.4) | st.floats(-0.15, -LEAST_LATER_S - STEP_S),
     size_m=st.floats(0.02, 0.06),
@@ -118,6 +120,7 @@ def test_a_delay_is_found_and_the_speed_with_it(
     assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.07)
 
 
+@BRIEFLY
 @given(
     later_s=st.floats(LEAST_S, MOST_S),
     in_use_s=st.floats(LEAST_S, MOST_S),
@@ -140,6 +143,7 @@ def test_an_error_of_a_measured_latency_is_found_and_ends_when_it_is_corrected(
         assert watch.correction_s is None
 
 
+@BRIEFLY
 @given(later_s=st.floats(MOST_S + BEYOND_S + STEP_S, 0.4), in_use_s=st.floats(-0.08, 0.1))
 def test_a_latency_that_cannot_be_measured_is_the_planner_s_matter(
     later_s: float, in_use_s: float
@@ -168,6 +172,7 @@ def test_a_turned_camera_is_found(quarters: int) -> None:
     assert motion.velocity_mps == pytest.approx(swing.velocity_mps(motion.t_s)[:2], abs=0.03)
 
 
+@BRIEFLY
 @given(
     size_m=st.floats(0.0, 0.06),
     later_s=st.floats(-0.04, 0.04),

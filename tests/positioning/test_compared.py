@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
@@ -68,6 +68,7 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
 # --- The record --------------------------------------------------------------------------
 
 
+@settings(max_examples=20)  # each is written to the disk
 @given(st.text(), st.booleans(), st.datetimes(datetime(2001, 1, 1), datetime(2900, 1, 1)))
 def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None:
     at = at.replace(tzinfo=UTC)

@@ -104,8 +104,11 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("confirmed", "code"), [
-    ("\n", 0), ("y\n", 0), ("YES\n", 0), ("n\n", 2), ("No\n", 2), ("quit\n", 2), ("", 2),
-    ("nope\nn\n", 2), ("nope\n\n", 0), ("back\n\n\n", 0),
+    ("\n", 0), ("n\n", 2), ("", 2), ("nope\nn\n", 2),
+    *(pytest.param(*each, marks=pytest.mark.long) for each in (
+        ("y\n", 0), ("YES\n", 0), ("No\n", 2), ("quit\n", 2), ("nope\n\n", 0),
+        ("back\n\n\n", 0),
+    )),
 ])  # fmt: skip
 def test_nothing_is_written_after_a_no(confirmed: str, code: int, tmp_path: Path) -> None:
     output = tmp_path / "mine.yaml"

@@ -207,9 +207,11 @@ def older(log: FlightLog, path: str, known: dict[str, list[str]] | None) -> Flig
     ("path", "owner", "says_so"),
     [
         ("imu.steady_aside_s", "ImuMotion", True),
-        ("imu.steady_aside_s", "ImuMotion", False),  # it is always written, and is not there
+        # It is always written, and is not there.
+        pytest.param("imu.steady_aside_s", "ImuMotion", False, marks=pytest.mark.long),
         ("imu", "Observation", False),
-        ("camera_problem", "Observation", True),  # left out while there is none
+        # Left out while there is none.
+        pytest.param("camera_problem", "Observation", True, marks=pytest.mark.long),
     ],
 )
 def test_a_field_that_the_log_does_not_hold_is_not_compared_and_named(

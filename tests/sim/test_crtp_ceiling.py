@@ -116,7 +116,7 @@ def catch_a_slip(pilot: Pilot, share: float, answer: str) -> float:
         pytest.param("below", 0.73, 0.86, marks=pytest.mark.long),
         pytest.param("below", 0.92, 1.03, marks=pytest.mark.long),
         pytest.param("above", 0.24, 0.09, marks=pytest.mark.long),
-        ("above", 0.73, 0.53),
+        pytest.param("above", 0.73, 0.53, marks=pytest.mark.long),
         pytest.param("above", 0.92, 0.80, marks=pytest.mark.long),
     ],
 )
@@ -157,7 +157,7 @@ def test_thrust_command_to_duty_cycle(
     assert pilot.now("pm.vbat") == pytest.approx(battery_v, abs=0.06)
 
 
-@pytest.mark.parametrize("yaw_deg", [60, 90])
+@pytest.mark.parametrize("yaw_deg", [pytest.param(60, marks=pytest.mark.long), 90])
 def test_a_yaw_step_costs_no_height(pilot: Pilot, yaw_deg: float) -> None:
     """Row "Yaw step of 60 or 90 deg": m1 falls to 32,000 and no lower, 1.59 m within 5 s.
 

@@ -140,7 +140,9 @@ def test_hover_to_velocity_falls_to_the_floor(pilot: Pilot) -> None:
     assert height(pilot) < 0.05
 
 
-@pytest.mark.parametrize(("mass_kg", "lift_s"), [(0.042, 1.5), (0.030, 0.75)])
+@pytest.mark.parametrize(
+    ("mass_kg", "lift_s"), [(0.042, 1.5), pytest.param(0.030, 0.75, marks=pytest.mark.long)]
+)
 def test_take_off_lags_behind_its_plan(pilot: Pilot, mass_kg: float, lift_s: float) -> None:
     """Rows "HL take-off to 0.5 m in 2 s": first lift at +1.5 s (30 g: 0.75 s); "0.23 m at 2.0 s;
     finished is by the clock, not by height"."""
@@ -195,7 +197,10 @@ def test_raw_yaw_rate_is_clockwise(pilot: Pilot) -> None:
     assert pilot.now("stateEstimate.yaw") == pytest.approx(-48, abs=2)
 
 
-@pytest.mark.parametrize(("angle", "axis", "sign"), [("pitch", 0, 1), ("roll", 1, -1)])
+@pytest.mark.parametrize(
+    ("angle", "axis", "sign"),
+    [("pitch", 0, 1), pytest.param("roll", 1, -1, marks=pytest.mark.long)],
+)
 def test_raw_attitude_and_the_estimates_sign(
     pilot: Pilot, angle: str, axis: int, sign: int
 ) -> None:
@@ -234,7 +239,10 @@ def test_go_to_yaw_in_radians_and_relative_in_world_axes(pilot: Pilot) -> None:
 # --- Battery and the floor to beat ------------------------------------------------
 
 
-@pytest.mark.parametrize(("rest_v", "low"), [(3.30, False), (3.15, True), (2.95, True)])
+@pytest.mark.parametrize(
+    ("rest_v", "low"),
+    [(3.30, False), (3.15, True), pytest.param(2.95, True, marks=pytest.mark.long)],
+)
 def test_low_battery(pilot: Pilot, rest_v: float, low: bool) -> None:
     """Row "Battery: low 3.2 V, critical 3.0 V, 5 s delay; pm.state 3 = low power"."""
     pilot.sim.set_rest_v(rest_v)
@@ -278,6 +286,7 @@ def test_notify_alone_cuts_the_motors(pilot: Pilot) -> None:
     assert not pilot.motors_off()
 
 
+@pytest.mark.long
 def test_the_order_of_land_and_notify_does_not_matter(pilot: Pilot) -> None:
     """Row "`land` then `notify` flies exactly as `notify` then `land` does (same curve)"."""
     curves = []
@@ -297,7 +306,7 @@ def test_the_order_of_land_and_notify_does_not_matter(pilot: Pilot) -> None:
     assert curves[0][-1] < 0.05
 
 
-@pytest.mark.parametrize("repeated", [True, False])
+@pytest.mark.parametrize("repeated", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_lost_notify_after_land_can_be_repeated(pilot: Pilot, repeated: bool) -> None:
     """Row "with its second packet lost the vehicle still has the 2 s of the setpoint watchdog"."""
     pilot.fly_to(0.8, 1.0)
@@ -333,7 +342,10 @@ def test_notify_before_land_with_land_lost_is_a_crash(pilot: Pilot) -> None:
     assert min(v for _, v in pilot.log("stateEstimate.vz", since_s)) < -3.0
 
 
-@pytest.mark.parametrize(("yaw", "end_deg"), [(0.0, (0, -2)), (None, (90, 92))])
+@pytest.mark.parametrize(
+    ("yaw", "end_deg"),
+    [pytest.param(0.0, (0, -2), marks=pytest.mark.long), (None, (90, 92))],
+)
 def test_orders_turn_to_yaw_0_unless_it_is_to_be_kept(
     pilot: Pilot, yaw: float | None, end_deg: tuple[float, float]
 ) -> None:
@@ -355,6 +367,7 @@ def test_orders_turn_to_yaw_0_unless_it_is_to_be_kept(
 # --- Landing ----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_landing_is_hard(pilot: Pilot) -> None:
     """Row "HL land from 1.05 m in 3.1 s": peak descent 0.85 m/s, still 0.55 m/s at touchdown.
 
@@ -408,7 +421,10 @@ def climb(pilot: Pilot, seconds: float) -> float:
 
 @pytest.mark.parametrize(
     ("mass_kg", "lift_s", "heights_m", "peak_m"),
-    [(0.042, 1.4, {2.2: 0.38, 2.8: 0.50}, 0.58), (0.030, 0.6, {2.2: 0.50}, 0.55)],
+    [
+        (0.042, 1.4, {2.2: 0.38, 2.8: 0.50}, 0.58),
+        pytest.param(0.030, 0.6, {2.2: 0.50}, 0.55, marks=pytest.mark.long),
+    ],
 )
 def test_take_off_by_position_setpoints(
     pilot: Pilot, mass_kg: float, lift_s: float, heights_m: dict[float, float], peak_m: float
@@ -436,6 +452,7 @@ def test_a_take_off_whose_stream_falls_silent_stays_down(pilot: Pilot) -> None:
     assert max(z for _, z in heights(pilot, since_s)) < LIFTED_M
 
 
+@pytest.mark.long
 def test_an_ordered_take_off_needs_no_link(pilot: Pilot) -> None:
     """Rows "HL take-off with the link cut 0.25 s after the order": hovers at 0.5 m, for 35 s, and
     "HL hover never times out"."""
@@ -452,7 +469,11 @@ def test_an_ordered_take_off_needs_no_link(pilot: Pilot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mass_kg", "start_m", "dip_m", "end_m"), [(0.042, 0.58, 0.17, 0.30), (0.030, 0.53, 0.44, 0.45)]
+    ("mass_kg", "start_m", "dip_m", "end_m"),
+    [
+        (0.042, 0.58, 0.17, 0.30),
+        pytest.param(0.030, 0.53, 0.44, 0.45, marks=pytest.mark.long),
+    ],
 )
 def test_the_level_out_dips(
     pilot: Pilot, mass_kg: float, start_m: float, dip_m: float, end_m: float
@@ -472,7 +493,7 @@ def test_the_level_out_dips(
 # --- Losses -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("repeats", [0, 1])
+@pytest.mark.parametrize("repeats", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_lost_notify_after_the_stop_locks_unless_repeated(pilot: Pilot, repeats: int) -> None:
     """Row "one lost `notify` after the stop locked a vehicle that hung well (2 s after)"."""
     pilot.perch()

@@ -63,6 +63,7 @@ def test_a_child_that_ends_or_does_not_come_up_is_a_clear_error(
         SimProcess.start(pace="stepped")
 
 
+@pytest.mark.long
 def test_the_vehicles_picture_is_streamed_and_real_time_never_runs_ahead() -> None:
     path = data_file("calib", "example_640x480")
     assert path is not None

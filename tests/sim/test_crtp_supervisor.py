@@ -146,9 +146,22 @@ def test_silence_of_1200_ms_recovers(pilot: Pilot) -> None:
     assert height(pilot) == pytest.approx(0.8, abs=0.1)
 
 
-@pytest.mark.parametrize("perched", [False, True])
+def stop(pilot: Pilot) -> None:
+    pilot.cf.commander.send_stop_setpoint()
+
+
+def zero(pilot: Pilot) -> None:
+    raw(pilot, 0)
+
+
 @pytest.mark.parametrize(
-    "send", [lambda pilot: pilot.cf.commander.send_stop_setpoint(), lambda pilot: raw(pilot, 0)]
+    ("send", "perched"),
+    [
+        (stop, True),
+        pytest.param(stop, False, marks=pytest.mark.long),
+        pytest.param(zero, True, marks=pytest.mark.long),
+        (zero, False),
+    ],
 )
 def test_a_lone_last_packet_cuts_at_once_and_locks(
     pilot: Pilot, perched: bool, send: Callable[[Pilot], None]
@@ -187,7 +200,9 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
     assert height(pilot) > 0.4
 
 
-@pytest.mark.parametrize(("wait_s", "locks"), [(1.0, True), (4.0, False)])
+@pytest.mark.parametrize(
+    ("wait_s", "locks"), [(1.0, True), pytest.param(4.0, False, marks=pytest.mark.long)]
+)
 def test_the_farewell_packet_when_perched(pilot: Pilot, wait_s: float, locks: bool) -> None:
     """Row "perched, it locks when the flying bit is still set (1 s after), not 4 s after"."""
     pilot.perch()
@@ -218,7 +233,7 @@ def test_emergency_stop_and_its_watchdog(pilot: Pilot) -> None:
     assert pilot.info == LOCKED
 
 
-@pytest.mark.parametrize("notified", [False, True])
+@pytest.mark.parametrize("notified", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_hl_after_low_level_flies_only_with_notify(pilot: Pilot, notified: bool) -> None:
     """Rows "HL command after low-level without notify: HL active, not flown, locks after 2 s" and
     "With notify first it flies"."""

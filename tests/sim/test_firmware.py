@@ -183,7 +183,7 @@ def test_what_is_no_number_does_no_harm() -> None:
     assert np.linalg.norm(errors_m(rig)) < 0.01
 
 
-@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("axis", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_a_bias_of_the_accelerometer_hurts_little_in_flight(axis: int) -> None:
     """Row "the accelerometer along the thrust axis only, scaled to 1 g on the ground"."""
     rig = hovering(acc_bias_mps2=tuple(0.02 * GRAVITY_MPS2 * np.eye(3)[axis]))

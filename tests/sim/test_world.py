@@ -70,6 +70,7 @@ def test_draught_pushes_to_its_own_side_and_gusts_repeat_with_the_seed() -> None
     assert windy[1] != drifted(2, (1.0, 0.0, 0.0))[1]
 
 
+@pytest.mark.long
 def test_hangs_level_in_its_place_for_a_minute() -> None:
     world = make()
     hang(world, (0.004, 0.003))

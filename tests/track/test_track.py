@@ -153,7 +153,7 @@ def test_a_video_is_tracked_frame_by_frame(video: Path) -> None:
     assert "interlaced" not in tracked.stderr
 
 
-@pytest.mark.parametrize("jump_m", [0.12, 0.3])
+@pytest.mark.parametrize("jump_m", [pytest.param(0.12, marks=pytest.mark.long), 0.3])
 def test_a_video_that_lacks_frames_is_followed_on(jump_m: float, tmp_path: Path) -> None:
     """At a constant rate nothing tells that the camera moved by `jump_m` between two frames."""
     approach_m = [0.75 - 0.35 * PAL_S * i for i in range(12)]

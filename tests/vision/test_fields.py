@@ -57,8 +57,16 @@ def test_two_moments_in_one_picture_are_seen(below_m: float, first: str) -> None
     assert all(is_combed(frame.image) for frame in frames)
 
 
-@pytest.mark.parametrize("analogue", [0.0, 0.3, 0.6, 0.9])
-@pytest.mark.parametrize("below_m", [0.08, 0.4, 1.6])
+@pytest.mark.parametrize(
+    "analogue",
+    [
+        0.0,
+        pytest.param(0.3, marks=pytest.mark.long),
+        pytest.param(0.6, marks=pytest.mark.long),
+        0.9,
+    ],
+)
+@pytest.mark.parametrize("below_m", [0.08, pytest.param(0.4, marks=pytest.mark.long), 1.6])
 def test_a_whole_picture_is_never_taken_for_two(below_m: float, analogue: float) -> None:
     for noise in (0.0, 7.0):
         scene = Pass(below_m, camera_noise_sigma=noise, extra={"analogue": analogue})
@@ -87,7 +95,13 @@ def kinds(state: FieldState, frames: list[Frame]) -> list[Any]:
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
 @pytest.mark.parametrize(
-    "velocity_mps", [(0.2, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.05, 0.0), (0.1, 0.1, 0.2)]
+    "velocity_mps",
+    [
+        (0.2, 0.0, 0.0),
+        pytest.param((0.0, 0.15, 0.0), marks=pytest.mark.long),
+        (0.0, -0.05, 0.0),
+        pytest.param((0.1, 0.1, 0.2), marks=pytest.mark.long),
+    ],
 )
 def test_the_order_is_found_within_a_few_frames(
     first: PictureKind, velocity_mps: tuple[float, float, float]
@@ -159,7 +173,7 @@ def test_each_field_is_measured_at_its_own_time(build: Build, first: str) -> Non
     assert np.sqrt(np.mean(np.square(errors[6:]), axis=0)).max() < 0.1
 
 
-@pytest.mark.parametrize("kind", ["top", "bottom"])
+@pytest.mark.parametrize("kind", ["top", pytest.param("bottom", marks=pytest.mark.long)])
 def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
     build: Build, kind: PictureKind
 ) -> None:

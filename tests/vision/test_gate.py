@@ -114,7 +114,13 @@ DECOYS = {
 }
 
 
-@pytest.mark.parametrize("name", DECOYS)
+SHOWN = ("half the size, aside", "lone large, aside", "turned")
+"""One of each kind; the others with the long tests."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name not in SHOWN)) for name in DECOYS]
+)
 def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> None:
     """A camera alone takes both markers for the target's after a while: it may have jumped."""
     assert all(measured(watch.show(LOCKED)))

@@ -139,7 +139,7 @@ def wrong(hz: float, range_m: float, *jump_m: float) -> Scene:
     return Scene("frame", np.array(jump_m), hz, range_m, 0.4, ("large",), 0.1)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(scene=scenes("camera"))
 # Jumps that the gate just lets pass.
 @example(scene=lost(25.0, 0.6, 0.11, 0.0, 0.0))
@@ -159,7 +159,7 @@ def test_lost_frames_leave_no_false_claim_and_the_target_is_back_within_half_a_s
     assert all(np.linalg.norm(c.off_m) < most_m for c in told if c.off_m is not None)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(scene=scenes("frame"), in_flight=st.booleans())
 # At 10 Hz a wrong pose that the gate just lets pass looks like a movement.
 @example(scene=wrong(10.0, 1.0, -0.024, -0.07, -0.07), in_flight=False)
@@ -180,7 +180,7 @@ def test_no_vaguer_track_excuses_a_jump(build: Build, hz: float, away_m: float) 
     assert not any(claim.measured for claim in told if claim.after_s < RELOCK_S)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(scene=scenes("estimate", st.tuples(*[st.floats(-1.0, 1.0)] * 3)))
 def test_an_estimate_that_jumps_leaves_the_target_where_the_picture_has_it(
     build: Build, scene: Scene
@@ -191,7 +191,7 @@ def test_an_estimate_that_jumps_leaves_the_target_where_the_picture_has_it(
     assert longest_false_s(told, scene.hz) <= 0.1
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(scene=scenes("target"))
 def test_a_target_that_moves_in_flight_is_nowhere_with_confidence(
     build: Build, scene: Scene
@@ -202,7 +202,7 @@ def test_a_target_that_moves_in_flight_is_nowhere_with_confidence(
     assert longest_false_s(told, scene.hz) <= 0.1
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(scene=scenes("camera"), silent_s=st.floats(0.1, 0.9))
 def test_a_camera_that_skips_in_flight_has_the_target_at_once(
     build: Build, scene: Scene, silent_s: float
@@ -215,7 +215,14 @@ def test_a_camera_that_skips_in_flight_has_the_target_at_once(
     assert not any(claim.is_false for claim in told)
 
 
-@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 0.03), (0.06, 0.0, 0.09), (0.1, 0.05, -0.2)])
+@pytest.mark.parametrize(
+    "jump_m",
+    [
+        pytest.param((0.0, 0.0, 0.03), marks=pytest.mark.long),
+        (0.06, 0.0, 0.09),
+        pytest.param((0.1, 0.05, -0.2), marks=pytest.mark.long),
+    ],
+)
 def test_the_spread_after_lost_frames_is_true(
     build: Build, jump_m: tuple[float, float, float]
 ) -> None:

@@ -100,7 +100,7 @@ ALONG = {"velocity_mps": (0.2, 0.1, 0.05), "turn_radps": 0.5}
 ACROSS = {"velocity_mps": (0.0, 0.2, 0.0), "turn_radps": 0.0}
 
 
-@pytest.mark.parametrize("motion", [ALONG, ACROSS])
+@pytest.mark.parametrize("motion", [ALONG, pytest.param(ACROSS, marks=pytest.mark.long)])
 def test_a_known_shutter_does_no_harm(motion: dict[str, Any]) -> None:
     scene = Pass(0.3, **motion, camera_readout_s=READOUT_S)
     known, nees = measured(scene, READOUT_S)
@@ -111,7 +111,7 @@ def test_a_known_shutter_does_no_harm(motion: dict[str, Any]) -> None:
     assert taken_for_global[2] > 1.0 or taken_for_global[3] > 0.2
 
 
-@pytest.mark.parametrize("motion", [ALONG, ACROSS])
+@pytest.mark.parametrize("motion", [pytest.param(ALONG, marks=pytest.mark.long), ACROSS])
 def test_an_unknown_shutter_makes_modest(motion: dict[str, Any]) -> None:
     scene = Pass(0.3, **motion, camera_readout_s=READOUT_S)
     assert measured(scene, None)[1] < 1.5

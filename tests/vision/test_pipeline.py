@@ -93,8 +93,15 @@ def run(
     return outputs
 
 
-@pytest.mark.parametrize("method", ["joint", "weights"])
-@pytest.mark.parametrize("frame", ["world", "level"])
+@pytest.mark.parametrize(
+    ("frame", "method"),
+    [
+        ("world", "joint"),
+        pytest.param("world", "weights", marks=pytest.mark.long),
+        pytest.param("level", "joint", marks=pytest.mark.long),
+        ("level", "weights"),
+    ],
+)
 def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: str) -> None:
     setup = build(
         kalman=KalmanConfig(frame=frame),

@@ -112,8 +112,15 @@ def between_both(share: float) -> tuple[float, float]:
     return x, y
 
 
-@pytest.mark.parametrize("below_m", [BOTH_READ_M, LARGE_READ_M])
-@pytest.mark.parametrize(("share", "chosen_m"), [(0.3, OWN_M), (0.7, OTHER_M)])
+@pytest.mark.parametrize(
+    ("below_m", "share", "chosen_m"),
+    [
+        (BOTH_READ_M, 0.3, OWN_M),
+        pytest.param(BOTH_READ_M, 0.7, OTHER_M, marks=pytest.mark.long),
+        pytest.param(LARGE_READ_M, 0.3, OWN_M, marks=pytest.mark.long),
+        (LARGE_READ_M, 0.7, OTHER_M),
+    ],
+)
 def test_the_one_nearer_to_the_gear_s_axis_is_chosen_and_stays(
     below_m: float, share: float, chosen_m: tuple[float, float]
 ) -> None:

@@ -58,7 +58,10 @@ def errors(noise: float, blur_px: float, cells: int, side_m: float) -> Array:
 
 
 @pytest.mark.parametrize(("cells", "side_m"), [(6, 0.150), (7, 0.025)])
-@pytest.mark.parametrize(("noise", "blur_px"), [(0.0, 0.6), (0.0, 1.2), (10.0, 0.7)])
+@pytest.mark.parametrize(
+    ("noise", "blur_px"),
+    [pytest.param(0.0, 0.6, marks=pytest.mark.long), (0.0, 1.2), (10.0, 0.7)],
+)
 def test_lines_find_corners_without_bias(
     cells: int, side_m: float, noise: float, blur_px: float
 ) -> None:
@@ -68,7 +71,10 @@ def test_lines_find_corners_without_bias(
     assert np.sqrt((poses[:, 1:] ** 2).mean()) < (0.08 if noise else 0.03)
 
 
-@pytest.mark.parametrize("off_px", [4.0, 6.0, 6.5])
+@pytest.mark.parametrize(
+    "off_px",
+    [pytest.param(4.0, marks=pytest.mark.long), pytest.param(6.0, marks=pytest.mark.long), 6.5],
+)
 def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float) -> None:
     """As where a vehicle in motion has its target expected, in the last decimetres."""
     fitted = 0

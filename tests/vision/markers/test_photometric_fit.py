@@ -59,10 +59,10 @@ def off(corners: Array, seed: int) -> Array:
     ("name", "side_px", "blur_px", "allowed_px"),
     [
         ("large", 12.0, 1.0, 0.08),
-        ("large", 30.0, 1.0, 0.03),
-        ("large", 40.0, 4.0, 0.15),
-        ("small", 14.0, 1.0, 0.08),
-        ("small", 30.0, 1.0, 0.03),
+        pytest.param("large", 30.0, 1.0, 0.03, marks=pytest.mark.long),
+        pytest.param("large", 40.0, 4.0, 0.15, marks=pytest.mark.long),
+        pytest.param("small", 14.0, 1.0, 0.08, marks=pytest.mark.long),
+        pytest.param("small", 30.0, 1.0, 0.03, marks=pytest.mark.long),
         ("small", 34.0, 4.0, 0.15),
     ],
 )
