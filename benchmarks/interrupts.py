@@ -35,7 +35,7 @@ from urllib.parse import urlsplit
 
 from perchctl.calibration import profile_camera
 from perchctl.link import Packet, Port
-from perchctl.mission.state import SEVEN_PHASES
+from perchctl.mission.phase import SEVEN_PHASES
 from perchctl.profile import load_profile
 from perchctl.record import read_log
 from perchctl.sim import SimProcess, draw_scenario

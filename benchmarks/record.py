@@ -136,10 +136,11 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
         for ago_s in (0.02, 0.01)
     )  # fmt: skip
     target = None if output is None else output.target
-    state, command = PlannerState(), PositionSetpoint(0.1 + t_s / 97.0, 0.2, 1.1, 0.3)
+    command = PositionSetpoint(0.1 + t_s / 97.0, 0.2, 1.1, 0.3)
     seen = None if frame is None else FrameRecord(frame.index, frame.t_s, frame.t_arrival_s)
     found = {} if output is None else output.poses
     obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
+    state = PlannerState.on_ground(obs, Profile())
     turn = Turn(
         number, "flown", t_s, t_s, TurnInputs(samples, frame=seen),
         {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},

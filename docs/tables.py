@@ -26,7 +26,15 @@ from perchctl.errors import EXIT_CODES  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
-from perchctl.mission.state import BEFORE_CONTACT, FLYING_PHASES  # noqa: E402
+from perchctl.mission.phase import (  # noqa: E402
+    AIRBORNE,
+    BEFORE_COMPLETION,
+    BEFORE_CONTACT,
+    BY_CAMERA,
+    FLYING_PHASES,
+    IN_THE_OPEN,
+)
+from perchctl.mission.transition import Transition  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
 from perchctl.profile import Profile  # noqa: E402
 from perchctl.profile.keys import Key, keys  # noqa: E402
@@ -186,13 +194,13 @@ def expected_outcomes() -> str:
 
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
-    (table.AIR, "in the air"),
+    (AIRBORNE, "in the air"),
     (FLYING_PHASES, "before landing"),
     (BEFORE_CONTACT, "before contact"),
-    (table.BY_CAMERA, "by camera"),
-    (table.IN_THE_OPEN, "in the open"),
-    (table.BY_CAMERA | {Phase.PERCH}, "by camera, PERCH"),
-    (table.IN_THE_OPEN | {Phase.LANDING}, "in the open, LANDING"),
+    (BY_CAMERA, "by camera"),
+    (IN_THE_OPEN, "in the open"),
+    (BEFORE_COMPLETION, "by camera, PERCH"),
+    (IN_THE_OPEN | {Phase.LANDING}, "in the open, LANDING"),
 )
 
 
@@ -233,7 +241,7 @@ def mission_rows() -> str:
     return "\n".join([*head, *(f"| {', '.join(names)} | {rest}" for names, rest in lines)])
 
 
-def _group(row: table.Transition) -> str | None:
+def _group(row: Transition) -> str | None:
     return next((name for phases, name in _GROUPS if row.phases == phases), None)
 
 

@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import status_panel  # noqa: E402
 from perchctl.flight import KEY_HELP, STOP_HELP, FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
-from perchctl.mission import Phase, PlannerState, Tick  # noqa: E402
+from perchctl.mission import Observation, Phase, PlannerState, Tick  # noqa: E402
 from perchctl.mission.state import BatteryOutlook  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -142,9 +142,11 @@ class Flight:
         battery = BatteryOutlook(
             r["battery_left_s"], r["battery_attempts"], r["battery_used_mah"], r["battery_rest_v"]
         )
-        state = PlannerState(
+        on_ground = replace(telemetry, position_m=(0.0, 0.0, first["z_m"]))
+        state = replace(
+            PlannerState.on_ground(Observation(t_s, on_ground), self.profile),
             phase=Phase(r["phase"]), entered_s=t_s - (since_s - span.start_s), reason=r["reason"],
-            attempts=r["attempts"], ground_m=(0.0, 0.0, first["z_m"]), battery=battery,
+            attempts=r["attempts"], battery=battery,
         )  # fmt: skip
         ages = (r["late_s"], r["cam_age_s"], r["tel_age_s"])
         return Tick(t_s, telemetry, None, target, state, Idle(), *ages)

@@ -96,7 +96,7 @@ def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:
     off_m, below_m = (
         (None, None) if target is None else (math.hypot(*target.e_m[:2]), target.e_m[2])
     )
-    ground_m = state.ground_m[2] if state.ground_m else 0.0
+    ground_m = state.belief.ground_z_m
     return {
         "phase": state.phase.value,
         "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",

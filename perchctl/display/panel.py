@@ -32,7 +32,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
         error = f"x {x}  y {y}  z {z} cm   yaw {yaw} deg"
         error += "" if target.tracked else "   (not seen)"
     stage = "none" if target is None else target.stage.value
-    height_m = tick.telemetry.position_m[2] - (state.ground_m[2] if state.ground_m else 0.0)
+    height_m = tick.telemetry.position_m[2] - state.belief.ground_z_m
     ages = (
         f"link {_age(tick.telemetry_age_s)}   camera {_age(tick.camera_age_s)}"
         f"   loop late {_age(tick.loop_late_s)}"

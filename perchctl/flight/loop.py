@@ -231,7 +231,7 @@ def _mission(
             began_s,
             # Against the ceiling the picture shows no target and steers nothing.
             search=state is None or state.phase is not Phase.COMPLETE,
-            sends_sights=state is None or state.blind_s is None,
+            sends_sights=state is None or state.belief.dead_reckoned_s is None,
             drops_sightings=drops_sightings,
         )
         drops_sightings = False
@@ -254,7 +254,11 @@ def _mission(
         if not isinstance(command, Idle):
             parts.link.send(command)
         watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
-        if state.astray and parts.positions is not None and not (before and before.astray):
+        if (
+            state.belief.diverged
+            and parts.positions is not None
+            and not (before and before.belief.diverged)
+        ):
             parts.positions.stop()
             drops_sightings = True
         events = Event.of_tick(before, state, obs, parts.profile)

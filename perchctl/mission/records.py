@@ -10,10 +10,11 @@ from enum import Enum
 from typing import Literal, Protocol
 
 from perchctl.geometry import Array
-from perchctl.mission.context import Context
-from perchctl.mission.lander import RestState
-from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
-from perchctl.mission.table import position_loss_text
+from perchctl.mission.belief.quality import position_loss_text
+from perchctl.mission.observation import Observation
+from perchctl.mission.phase import Claim, Outcome, Phase, Severity
+from perchctl.mission.rest import RestState
+from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, ExternalPosition, Telemetry, is_battery_reading
 from perchctl.vision import CameraErrors, PictureKind, PipelineOutput, TargetEstimate
@@ -41,6 +42,7 @@ class Event:
     severity: Severity = Severity.CONTINUE
     simulated: str = ""  # what the simulated scenario did that led to it
     rest: RestState | None = None  # where a rescue found the vehicle; None in all other events
+    claims: Claim = Claim.NONE  # the transition's
 
     @classmethod
     def of_rescue(cls, t_s: float, error: BaseException, rest: RestState, text: str) -> Event:
@@ -55,7 +57,7 @@ class Event:
         """The events of one tick; `before`: the state before it, None in the first tick."""
         events: list[Event] = []
         if before is None:
-            before = PlannerState.on_ground(obs)
+            before = PlannerState.on_ground(obs, profile)
             events.append(cls(obs.t_s, EventKind.PHASE, before.reason, before.phase))
             if not is_battery_reading(obs.telemetry.battery_v):
                 grace_s = profile.safety.battery_stale_s
@@ -63,12 +65,16 @@ class Event:
                 events.append(cls(obs.t_s, EventKind.NOTE, text, before.phase))
         if state.phase is not before.phase:
             entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
-            events.append(cls(obs.t_s, *entered))
+            events.append(cls(obs.t_s, *entered, claims=state.claims))
         elif state.pause and not before.pause:
             held = EventKind.HOLD, state.pause, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
-        elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
-            text = position_loss_text(Context(state, obs, profile))
+        elif (
+            state.belief.stale_s == obs.t_s
+            and before.belief.stale_s != before.t_s
+            and not state.hold
+        ):
+            text = position_loss_text(state.belief.seen(obs, profile))
             events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))
         return events
 

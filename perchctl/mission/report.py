@@ -7,33 +7,38 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perchctl.mission.conditions import contact_error
+from perchctl.mission.belief.belief import ContactError
+from perchctl.mission.belief.contact import DOWN, contact_error
 from perchctl.mission.context import Context
-from perchctl.mission.lander import RestState, find_rest_state
+from perchctl.mission.observation import Observation
+from perchctl.mission.phase import Claim, Outcome, Phase
 from perchctl.mission.records import Event
-from perchctl.mission.state import (
-    Condition,
-    ContactError,
-    Observation,
-    Outcome,
-    Phase,
-    PlannerState,
-)
+from perchctl.mission.rest import RestState, find_rest_state
+from perchctl.mission.state import PlannerState
+from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraErrors
 
-HARD_MPS = 0.6  # no way down that goes as it should ends faster
-LATEST_S = 5.0  # from the touchdown to the motors' stop: an earlier blow was no floor
-SAME_HEIGHT_M = 0.3  # a blow higher above the present place was none by the floor
-SURE = 1.96  # standard deviations on both sides of a 95 % interval
-LATENCY_GATE_S = 0.02  # 30 ms make an alignment swing by centimetres
-TURN_GATE_DEG = 2.0  # 35 mm at 1 m, more than the cone of an ascent forgives
+HARD_MPS = 0.6
+"""No descent that goes as it should meets the floor faster."""
+TOUCHDOWN_WITHIN_S = 5.0
+"""Time from a touchdown to the motors' stop: an earlier blow was no floor."""
+SAME_HEIGHT_M = 0.3
+"""A blow higher above the present place was none by the floor."""
+SURE = 1.96
+"""Standard deviations on both sides of a 95 % interval."""
+LATENCY_GATE_S = 0.02
+"""Error of the latency that advice is given on: 30 ms make an alignment swing by centimetres."""
+TURN_GATE_DEG = 2.0
+"""The same of a turn: 35 mm at 1 m, more than the cone of an ascent forgives."""
 
 
-PROFILE_ROWS = frozenset({"position-astray", "latency", "mounting"})
-"""The rows of the table whose reason asks to look at the profile's camera or positioning."""
+def suspects_profile(row_name: str) -> bool:
+    """True if the row of that name, as a log holds it, claims that the profile's camera or
+    positioning may be wrong."""
+    return any(row.name == row_name and Claim.PROFILE_SUSPECT in row.claims for row in TABLE)
 
 
 @dataclass(frozen=True)
@@ -127,8 +132,8 @@ class FlightReport:
 
     @property
     def blames_profile(self) -> bool:
-        """True if a row of `PROFILE_ROWS` decided in the flight."""
-        return any(event.row in PROFILE_ROWS for event in self.history)
+        """True if a row decided in the flight that claims the profile may be wrong."""
+        return any(Claim.PROFILE_SUSPECT in event.claims for event in self.history)
 
     @classmethod
     def of(
@@ -142,9 +147,10 @@ class FlightReport:
         simulated: bool = False,
     ) -> FlightReport:
         """The report of a mission that is over, by its last tick; `simulated`: the vehicle was."""
-        hangs, contact = state.phase is Phase.PERCHED, state.contact
+        b = state.belief.seen(obs, profile)
+        hangs, contact = state.phase is Phase.PERCHED, b.contact
         if hangs and contact is None:  # it was caught on its way down
-            contact = contact_error(Context(state, obs, profile))
+            contact = contact_error(b)
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,
@@ -160,7 +166,7 @@ class FlightReport:
             if consistency is None
             else Findings.of(consistency, profile.camera, simulated=simulated),
             contact=contact if placed else None,
-            touchdown=find_touchdown(Context(state, obs, profile)),
+            touchdown=find_touchdown(Context(replace(state, belief=b))),
         )
 
 
@@ -181,8 +187,8 @@ class Rest:
 
 def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
     """Return where the vehicle is; None until its motors have been seen off for `off_s`."""
-    c = Context(state, obs, profile)
-    if c.held_s(Condition.DOWN) < off_s:
+    c = Context(replace(state, belief=state.belief.seen(obs, profile)))
+    if c.held_s(DOWN) < off_s:
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
@@ -193,18 +199,20 @@ def find_touchdown(c: Context) -> Touchdown | None:
     """The newest blow from below, if it may be a touchdown; None if there is no such blow.
 
     The speed is the state estimate's where that is believed, else the dead reckoning's."""
-    tel, imu, reckoning = c.telemetry, c.obs.imu, c.state.reckoning
+    b = c.belief
+    tel, imu, reckoning = c.telemetry, b.imu, b.reckoning
     blow = imu.blow
-    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > LATEST_S:
+    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > TOUCHDOWN_WITHIN_S:
         return None
-    if c.placed and c.state.blind_s is None and blow.z_m - tel.position_m[2] > SAME_HEIGHT_M:
+    higher = blow.z_m - tel.position_m[2] > SAME_HEIGHT_M
+    if b.position_valid and b.dead_reckoned_s is None and higher:
         return None
-    reckoned = c.state.blind_s is not None or c.state.astray
+    reckoned = b.dead_reckoned_s is not None or b.diverged
     speed_mps = -(reckoning.struck_mps if reckoned else blow.estimated_mps)
     return Touchdown(max(0.0, speed_mps), blow.peak_g)
 
 
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
-    told = why and (state.phase is not Phase.ABORTED or state.row == "landing-timeout")
+    told = why and (state.phase is not Phase.ABORTED or Claim.UNCONFIRMED in state.claims)
     return f"{why}; {state.reason}" if told else state.reason

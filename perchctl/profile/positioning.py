@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, WithJsonSchema, model_validator
@@ -34,6 +35,29 @@ System = Annotated[
 ]
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
 """Other defaults, for places that come by pictures, late and with gaps."""
+
+
+class PositionSource(Enum):
+    """What measures the position, and what follows from it for whoever relies on it."""
+
+    DECK = "deck"
+    MOCAP = "mocap"
+    TARGET = "target"
+
+    @property
+    def is_deck(self) -> bool:
+        """The vehicle measures its own motion: there is nothing to send, and the place drifts."""
+        return self is PositionSource.DECK
+
+    @property
+    def is_mocap(self) -> bool:
+        """Cameras in the room measure it, in axes of their own, whatever the vehicle sees."""
+        return self is PositionSource.MOCAP
+
+    @property
+    def is_target(self) -> bool:
+        """The vehicle's camera measures it from the target: late, and only while that is seen."""
+        return self is PositionSource.TARGET
 
 
 class PositioningConfig(Section):
@@ -77,9 +101,14 @@ class PositioningConfig(Section):
     )
 
     @property
+    def source(self) -> PositionSource:
+        """The method as a value to decide by."""
+        return PositionSource(self.by)
+
+    @property
     def label(self) -> str:
         """Name of the position source in messages."""
-        if self.by == "target":
+        if self.source.is_target:
             return "the sight of the target"
         return f"motion capture at {self.system}:{self.host}".rstrip(":")
 

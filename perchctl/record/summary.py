@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.mission import PROFILE_ROWS, ContactError, Findings, Touchdown
+from perchctl.mission import ContactError, Findings, Touchdown, suspects_profile
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -45,7 +45,7 @@ class FlightSummary:
         lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
         recording: its summary; None without a recording, and in a log that is read back.
         simulated: the vehicle was; then nothing here is advice for the profile of a real one.
-        blames_profile: a row of `PROFILE_ROWS` decided, whose reason asks to look at the profile.
+        blames_profile: a row decided that claims the profile may be wrong.
     """
 
     outcome: str
@@ -96,7 +96,7 @@ class FlightSummary:
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
             simulated=simulated,
-            blames_profile=any(event.get("row") in PROFILE_ROWS for event in log.events),
+            blames_profile=any(suspects_profile(str(event.get("row"))) for event in log.events),
         )
 
     def as_record(self) -> dict[str, Any]:

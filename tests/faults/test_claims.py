@@ -20,7 +20,7 @@ from perchctl.faults.oracle import (
     rescue_claims,
 )
 from perchctl.mission import Event, EventKind, FlightReport, Outcome, Phase, RestState
-from perchctl.mission.state import TERMINALS
+from perchctl.mission.phase import TERMINALS
 from perchctl.mission.table import TABLE
 
 LAST_ROWS = {row.name: row for row in TABLE if row.to in TERMINALS}

@@ -31,12 +31,13 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link.crtp import encode
 from perchctl.link.mock import TELEMETRY_DELAY_S
 from perchctl.link.telemetry import BLOCKS_DELETED_AFTER_S
-from perchctl.mission import Phase, PlannerState
+from perchctl.mission import Phase
 from perchctl.profile import TargetConfig
 from perchctl.sim import CaptureSettings, Scenario
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
 from perchctl.vision import Frame
 from tests.helpers.firmware_rig import raw_thrust
+from tests.helpers.mission import state_with
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))
@@ -116,7 +117,7 @@ class Rig:
         self.injector.begin(self.now_s)
 
     def tick(self, phase: Phase) -> None:
-        tick: Any = SimpleNamespace(t_s=self.now_s, state=PlannerState(phase=phase))
+        tick: Any = SimpleNamespace(t_s=self.now_s, state=state_with(phase=phase))
         self.injector.tick(tick)
 
 

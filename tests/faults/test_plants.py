@@ -17,9 +17,19 @@ from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_in_folder
 from perchctl.faults.oracle import Flag
 from perchctl.flight import OperatorSwitch, loop
-from perchctl.mission import Observation, Operator, Phase, PlannerState, lander, planner
+from perchctl.mission import (
+    Observation,
+    Operator,
+    Phase,
+    PlannerState,
+    descent,
+    level_descent,
+    planner,
+)
 from perchctl.mission.context import Context
-from perchctl.mission.guidance import Action, stop_motors
+from perchctl.mission.release import stop_motors
+from perchctl.mission.setpoints import Action
+from perchctl.mission.table import PHASES
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.flights import SHORT
@@ -30,12 +40,12 @@ Patch = pytest.MonkeyPatch
 
 def stops_after_contact(patch: Patch) -> None:
     """The motors stop 0.3 s after the contact, whatever the magnet carries."""
-    complete = planner.ACTIONS[Phase.COMPLETE]
+    complete = PHASES[Phase.COMPLETE]
 
     def stopping(c: Context) -> Action:
-        return stop_motors(c) if c.in_phase_s >= 0.3 else complete(c)
+        return stop_motors(c) if c.in_phase_s >= 0.3 else complete.act(c)
 
-    patch.setitem(planner.ACTIONS, Phase.COMPLETE, stopping)
+    patch.setitem(PHASES, Phase.COMPLETE, replace(complete, act=stopping))
 
 
 def ignores_the_second_press(patch: Patch) -> None:
@@ -45,20 +55,20 @@ def ignores_the_second_press(patch: Patch) -> None:
 
 def lands_fast(patch: Patch) -> None:
     """At 1.5 m/s, by itself and by thrust."""
-    order, by_setpoints = lander.onboard_landing, lander._by_setpoints
+    order, by_setpoints = descent.onboard_landing, descent._by_setpoints
 
     def fast(*known: Any) -> Land:
         land = order(*known)
         return Land(land.height_m, max(0.1, (known[-1] - land.height_m) / 1.5))
 
     def by_itself(c: Context) -> Action:
-        slow = c.by_sight or lander.is_in_magnet_reach(c)
-        return by_setpoints(c) if slow else lander._own_landing(c)
+        slow = c.belief.by_target or c.belief.is_in_magnet_reach
+        return by_setpoints(c) if slow else descent._own_landing(c)
 
-    patch.setattr(lander, "onboard_landing", fast)
-    patch.setattr(lander, "_by_setpoints", by_itself)
+    patch.setattr(descent, "onboard_landing", fast)
+    patch.setattr(descent, "_by_setpoints", by_itself)
     for name in ("SINK_MPS", "LOW_SINK_MPS"):
-        patch.setattr(lander, name, 1.5)
+        patch.setattr(level_descent, name, 1.5)
 
 
 def says_landed(patch: Patch) -> None:

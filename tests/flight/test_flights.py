@@ -20,7 +20,7 @@ from perchctl.flight import FlyOptions, fly_lockstep, lockstep_source
 from perchctl.link import MockLink
 from perchctl.mission import EventKind, Operator, Outcome, Phase, planner
 from perchctl.mission.context import Context
-from perchctl.mission.state import SEVEN_PHASES
+from perchctl.mission.phase import SEVEN_PHASES
 from perchctl.profile import Profile, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.record.fields import tick_record
@@ -249,9 +249,9 @@ def test_the_log_holds_the_planner_s_error_and_an_unlogged_flight_is_the_same(
         record, target = tick_record(tick), context.obs.target
         assert target is not None
         assert [record[f"e{axis}_m"] for axis in "xyz"] == target.e_m.tolist()
-        assert record["eyaw_rad"] == context.error_yaw_rad
-        assert math.hypot(record["ex_m"], record["ey_m"]) == context.error_xy_m
-        assert record["ez_m"] == context.error_z_m
+        assert record["eyaw_rad"] == context.belief.target.error_yaw_rad
+        assert math.hypot(record["ex_m"], record["ey_m"]) == context.belief.target.error_xy_m
+        assert record["ez_m"] == context.belief.target.error_z_m
         assert target.t_s == tick.t_s  # at the present, not at the frame's time
 
 

@@ -13,7 +13,7 @@ import pytest
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
 from perchctl.mission import EventKind, Operator, Outcome, Phase, RestState, Tick
-from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS
+from perchctl.mission.descent import LEAST_ORDERS, MAX_ORDERS
 from perchctl.perception import perception
 from perchctl.profile import Profile
 from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors

@@ -243,10 +243,12 @@ from perchctl.commands.output import say
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link.sender import Sender
-from perchctl.mission.state import Observation, Phase, PlannerState
+from perchctl.mission.observation import Observation
+from perchctl.mission.phase import Phase
+from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import PositionSetpoint
-from tests.helpers.mission import telemetry
+from tests.helpers.mission import state_with, telemetry
 
 switch = OperatorSwitch(listening=True)
 dog = Watchdog(Profile(), switch.read)
@@ -257,7 +259,7 @@ def send(command):
 with operator_signals(switch, say):
     sender = Sender(send, lambda: dog.poll(time.monotonic(), telemetry(time.monotonic())))
     now = time.monotonic()
-    state = PlannerState(phase=Phase.ALIGN, t_s=now, hover_thrust=50000.0)
+    state = state_with(phase=Phase.ALIGN, t_s=now, hover_thrust=50000.0)
     obs = Observation(now, telemetry(now))
     dog.tick(now + float(sys.argv[1]), state, PositionSetpoint(0, 0, 1, 0), obs)
     # A call into a library that no signal interrupts; it lets the other threads run.

@@ -27,7 +27,7 @@ from tests.helpers.waiting import until
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.mission.state import SEVEN_PHASES
+from perchctl.mission.phase import SEVEN_PHASES
 from perchctl.profile import find_calibration, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.sim import SimProcess, draw_scenario

@@ -9,14 +9,14 @@ from dataclasses import replace
 import pytest
 
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, Touchdown
-from perchctl.mission.context import Context
-from perchctl.mission.imu import DeadReckoning, Impact, advance_reckoning
+from perchctl.mission.belief.motion import Impact
+from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
 from perchctl.mission.report import HARD_MPS, find_touchdown
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.helpers.hangs import hang_in_the_camera
 from tests.helpers.loop_rig import HANG_AT_S, PROFILE, Guarded, Rig
-from tests.helpers.mission import observation, state_in
+from tests.helpers.mission import context_at, observation, remembering, state_in
 
 HARD = Touchdown(0.9, 3.1)
 # --- True of the vehicle ---------------------------------------------------------------------
@@ -57,8 +57,8 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
     assert last is not None
     obs = Observation(last.t_s, last, imu=motion)
     blind_s = dropped_s if blind else None
-    state = replace(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, blind_s=blind_s)
-    return speed_mps, find_touchdown(Context(state, obs, profile))
+    state = remembering(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, dead_reckoned_s=blind_s)
+    return speed_mps, find_touchdown(context_at(state, obs, profile))
 
 
 @pytest.mark.parametrize("blind", [False, True])
@@ -94,9 +94,9 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
     ],
 )
 def test_only_the_floor_is_a_touchdown(state: dict[str, object], blow: Impact, told: bool) -> None:
-    ended = replace(state_in(Phase.LANDED, z_m=0.0), **state)  # type: ignore[arg-type]
+    ended = remembering(state_in(Phase.LANDED, z_m=0.0), **state)  # type: ignore[arg-type]
     obs = observation(10.0, 0.0, imu=ImuMotion(t_s=10.0, blow=blow))
-    assert find_touchdown(Context(ended, obs, PROFILE)) == (HARD if told else None)
+    assert find_touchdown(context_at(ended, obs, PROFILE)) == (HARD if told else None)
 
 
 # --- Whoever flew the way down -------------------------------------------------------------------

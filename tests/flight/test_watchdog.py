@@ -11,8 +11,9 @@ import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
 from perchctl.mission import Observation, Operator, Phase, PlannerState
-from perchctl.mission.guidance import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
-from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
+from perchctl.mission.belief.update import STILL_THRUST
+from perchctl.mission.descent import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, STOPS
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -30,7 +31,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
+from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, remembering, state_with, telemetry
 
 PROFILE = Profile()
 LAND_S = PROFILE.safety.loop_late_land_s
@@ -39,7 +40,7 @@ T_S = 100.0
 HOVER = PositionSetpoint(0.1, 0.2, 0.9, 0.5)
 RELEASED = RawThrust(STILL_THRUST)
 CEILING_M = 2.0
-AT_CEILING = PlannerState(
+AT_CEILING = state_with(
     phase=Phase.COMPLETE,
     t_s=T_S,
     ground_m=(0.0, 0.0, 0.0),
@@ -47,9 +48,7 @@ AT_CEILING = PlannerState(
     released_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
-IN_AIR = PlannerState(
-    phase=Phase.ALIGN, t_s=T_S, ground_m=(0.0, 0.0, 0.0), hover_thrust=HOVER_THRUST
-)
+IN_AIR = state_with(phase=Phase.ALIGN, t_s=T_S, ground_m=(0.0, 0.0, 0.0), hover_thrust=HOVER_THRUST)
 SILENT_S = (0.31, 0.5, 0.9)
 
 
@@ -66,7 +65,7 @@ class Rig:
 
     def turn(self, t_s: float, command: Command = HOVER, state: PlannerState = IN_AIR) -> None:
         obs = Observation(t_s, telemetry(t_s, self.z_m))
-        self.dog.tick(t_s + PERIOD_S, replace(state, last=obs.telemetry), command, obs)
+        self.dog.tick(t_s + PERIOD_S, remembering(state, last=obs.telemetry), command, obs)
 
     def after(self, silent_s: float, **changes: object) -> Command | None:
         """What is sent so long after the turn; telemetry 20 ms old, altered."""
@@ -123,7 +122,7 @@ def test_a_cut_before_the_first_tick_is_repeated_until_it_shows() -> None:
 HIGH = replace(HOVER, z_m=1.8)
 HELD = replace(HOVER, z_m=1.0)
 """At the vehicle's height: neither a climb nor a press goes on."""
-PRESSING = replace(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
+PRESSING = remembering(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
 FALLS = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0, "acc_z_g": 0.1}
 
 
@@ -232,14 +231,14 @@ def test_what_hangs_released_is_not_landed(known: bool) -> None:
 
 
 def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
-    landing = replace(IN_AIR, phase=Phase.LANDING, orders=LEAST_ORDERS, ordered_s=T_S)
+    landing = remembering(IN_AIR, phase=Phase.LANDING, orders=LEAST_ORDERS, ordered_s=T_S)
     rig = Rig(Idle(), landing)
     assert rig.after(0.5, supervisor=READY | HL_ACTIVE) is None
     assert rig.after(5.0, supervisor=READY | HL_ACTIVE) is None
 
 
 def test_only_stops_after_the_motors_were_stopped_for_good() -> None:
-    rig = Rig(StopMotors(), replace(AT_CEILING, stopped_s=T_S), CEILING_M)
+    rig = Rig(StopMotors(), remembering(AT_CEILING, stopped_s=T_S), CEILING_M)
     sent = [rig.after(s, thrust=0.0) for s in (0.5, 1.1, 9.0)]
     assert all(command in (None, StopMotors()) for command in sent)
 
@@ -275,7 +274,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     """A loop that fell silent as it peeled off in vain, and hangs for ever, would else leave it
     there with turning motors. It stays where it is, and its thrust follows the orders."""
     below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
-    rig = Rig(below, replace(AT_CEILING, released_s=None), CEILING_M)
+    rig = Rig(below, remembering(AT_CEILING, released_s=None), CEILING_M)
     sent: list[Command] = []
     thrust = 20000.0
     for i in range(395):
@@ -380,7 +379,7 @@ def test_without_positions_a_silent_loop_is_followed_by_a_level_descent(
     profile = Profile.model_validate({"positioning": by})
     dog = Watchdog(profile, lambda: Operator.NONE, lambda now_s: now_s - T_S + age_s)
     obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=age_s)
-    dog.tick(T_S + PERIOD_S, replace(IN_AIR, last=obs.telemetry), HOVER, obs)
+    dog.tick(T_S + PERIOD_S, remembering(IN_AIR, last=obs.telemetry), HOVER, obs)
     for i in range(60):
         now_s = T_S + LAND_S + 0.1 + 0.05 * i
         command = dog.poll(now_s, telemetry(now_s - 0.02, 1.0, supervisor=AIRBORNE))
@@ -394,7 +393,7 @@ def test_what_has_waited_for_the_loop_is_felt_too() -> None:
     for waits in (True, False):
         dog = Watchdog(profile, lambda: Operator.NONE)
         obs = Observation(T_S, telemetry(T_S, 0.1), position_age_s=0.05)
-        low = replace(IN_AIR, phase=Phase.LANDING, last=obs.telemetry)
+        low = remembering(IN_AIR, phase=Phase.LANDING, last=obs.telemetry)
         dog.tick(T_S + PERIOD_S, low, RawThrust(HOVER_THRUST), obs)
         samples: list[Telemetry] = []
         for i in range(1, 121):

@@ -11,10 +11,11 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from perchctl.display.live import TOKEN_HEADER
-from perchctl.mission import Phase, PlannerState, Tick
+from perchctl.mission import Phase, Tick
 from perchctl.mission.state import BatteryOutlook
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
+from tests.helpers.mission import state_with
 
 CORNERS = np.array([[200.0, 150.0], [400.0, 150.0], [400.0, 350.0], [200.0, 350.0]])
 
@@ -31,7 +32,7 @@ def tick(
         seen = replace(
             synthetic.target(t_s, 1.0), e_m=np.array(e_m), e_yaw_rad=e_yaw_rad, tracked=tracked
         )
-    state = PlannerState(
+    state = state_with(
         phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
         ground_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
     )  # fmt: skip

@@ -19,6 +19,7 @@ from perchctl.vehicle import Command, Idle, PositionSetpoint, StopMotors, Teleme
 from perchctl.vision import MarkerPose, PipelineOutput, TargetEstimate
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers import mission
+from tests.helpers.mission import state_with
 
 PERIOD_S = 0.02
 PLAN: tuple[tuple[str, float, str], ...] = (
@@ -102,7 +103,7 @@ def ticks(seed: int = 7) -> Iterator[dict[str, Any]]:
                     t_s,
                     telemetry(t_s - 0.012, z_m),
                     _command(phase, z_m),
-                    PlannerState(Phase(phase), reason=reason),
+                    state_with(phase=Phase(phase), reason=reason),
                     output=frame,
                     target=pose,
                 )

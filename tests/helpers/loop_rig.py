@@ -40,7 +40,7 @@ from perchctl.vehicle import (
 )
 from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
 from tests.helpers.hangs import hang_in_the_camera
-from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
+from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, remembering, telemetry
 
 SIZE_PX = (64, 48)
 CAMERA = CameraModel(
@@ -296,7 +296,8 @@ class Rig:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state
-        before = replace(PlannerState.on_ground(Observation(known.t_s, ground)), **told)
+        before = PlannerState.on_ground(Observation(known.t_s, ground), self.profile)
+        before = remembering(before, **told)
         began_s = self.link.now_s
         return rescue(
             self.link,

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from perchctl.mission import Event, EventKind, ImuMotion, Observation, Phase, PlannerState
-from perchctl.mission.state import EnergyState, Severity
+from perchctl.mission.belief.battery import EnergyState
+from perchctl.mission.belief.belief import Belief
+from perchctl.mission.context import Context
+from perchctl.mission.observe import observe
+from perchctl.mission.phase import Severity
+from perchctl.mission.state import LevelDescent
+from perchctl.mission.table import CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
 from perchctl.vision import TargetEstimate
@@ -143,18 +149,57 @@ def note(t_s: float, text: str) -> Event:
     return Event(t_s, EventKind.NOTE, text)
 
 
-def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
-    """A planner that has just come into `phase` in an undisturbed flight."""
-    state = PlannerState.on_ground(observation(0.0, 0.0))
+_BELIEF = {each.name for each in fields(Belief)} - {"t_s"}
+_DESCENT = {each.name for each in fields(LevelDescent)} - {"hover_thrust"}
+
+
+def remembering(state: PlannerState, **changes: Any) -> PlannerState:
+    """The state with changes of its own fields, of its belief's and of its descent's, each by the
+    field's name. Conditions, as `since`, go where they are counted."""
+    since = changes.pop("since", None)
+    if since is not None:
+        changes["since"] = {each: s for each, s in since.items() if each in CONDITIONS}
+        held = {each: s for each, s in since.items() if each not in CONDITIONS}
+        state = replace(state, belief=replace(state.belief, since=held))
+    belief = {name: value for name, value in changes.items() if name in _BELIEF - {"since"}}
+    descent = {name: value for name, value in changes.items() if name in _DESCENT}
+    rest = {name: changes[name] for name in changes.keys() - belief.keys() - descent.keys()}
+    if "t_s" in rest:
+        belief["t_s"] = rest["t_s"]
     return replace(
         state,
+        belief=replace(state.belief, **belief),
+        descent=replace(state.descent, **descent),
+        **rest,
+    )
+
+
+def state_with(**changes: Any) -> PlannerState:
+    """A planner's state with nothing but these fields of it and of its belief."""
+    return remembering(PlannerState.on_ground(observation(0.0, 0.0), PROFILE), **changes)
+
+
+def context_at(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> Context:
+    """The tick in which this state meets this observation, before it has taken it in."""
+    sent = state.sent(PHASES[state.phase].maneuver)
+    return Context(replace(state, belief=replace(state.belief.seen(obs, profile), sent=sent)))
+
+
+def observing(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> PlannerState:
+    """The state with the observation taken in, and nothing decided."""
+    return observe(state, obs, profile, PHASES[state.phase].maneuver)
+
+
+def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
+    """A planner that has just come into `phase` in an undisturbed flight."""
+    return state_with(
         phase=phase,
         entered_s=t_s,
         t_s=t_s,
         search_step_s=t_s,
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
         entry_m=(0.0, 0.0, z_m),
-        target_m=np.array([0.0, 0.0, CEILING_M]),
+        last_target_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
         energy=FINE_BATTERY,
         contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,

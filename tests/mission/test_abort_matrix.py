@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
-from perchctl.mission.state import FLYING_PHASES, Severity
+from perchctl.mission.phase import FLYING_PHASES, Severity
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -32,6 +32,7 @@ from tests.helpers.mission import (
     READY,
     changed,
     observation,
+    remembering,
     state_in,
 )
 from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, at, fly, is_setpoint, times
@@ -124,7 +125,7 @@ def down(command: object, z_m: float, *, by_itself: bool = False, level: bool = 
 def _begin(phase: Phase, event: str) -> PlannerState:
     z = CEILING_M - 0.03 if phase is Phase.COMPLETE else 1.0
     state = state_in(phase, z_m=z)
-    return replace(state, started_s=-1000.0) if event == "time-over" else state
+    return remembering(state, started_s=-1000.0) if event == "time-over" else state
 
 
 def _run(state: PlannerState, event: Event, lasts_s: float) -> tuple[PlannerState, list[object]]:
@@ -237,7 +238,7 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
 def hanging(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
     held = {"contact_z_m": HANG_Z_M, "released_s": 10.0, **changes}
-    return replace(state_in(phase, z_m=HANG_Z_M), **held)
+    return remembering(state_in(phase, z_m=HANG_Z_M), **held)
 
 
 class Hangs(Motors):

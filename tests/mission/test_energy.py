@@ -12,17 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import Outcome, Phase, PlannerState
-from perchctl.mission.battery import (
+from perchctl.mission.belief.battery import (
     BRUSHED,
     BRUSHLESS,
     Drive,
-    battery_outlook,
-    hover_left_s,
-    read_battery,
+    EnergyState,
     update_energy,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.state import EnergyState
+from perchctl.mission.endurance import battery_outlook, hover_left_s
 from perchctl.profile import Profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell
@@ -33,7 +31,10 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     PROFILE,
     changed,
+    context_at,
     observation,
+    observing,
+    remembering,
     state_in,
 )
 from tests.mission.rig import at, fly
@@ -119,8 +120,8 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
-        state = replace(state_in(Phase.ALIGN), energy=moment.energy, hover_thrust=0.0)
-        left_s = battery_outlook(Context(state, obs, profile)).left_s
+        state = remembering(state_in(Phase.ALIGN), energy=moment.energy, hover_thrust=0.0)
+        left_s = battery_outlook(context_at(state, obs, profile)).left_s
         assert left_s is not None
         assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
 
@@ -164,7 +165,7 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
 def flown(
     phase: Phase, energy: EnergyState, seconds: float, profile: Profile = PROFILE, **tel: Any
 ) -> PlannerState:
-    begin = replace(state_in(phase), energy=energy)
+    begin = remembering(state_in(phase), energy=energy)
     return fly(begin, at(**tel), seconds, profile, one_phase=True).state
 
 
@@ -216,9 +217,8 @@ def test_a_reading_that_stands_still_is_none() -> None:
     state = state_in(Phase.ALIGN)
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
-        state = replace(state, energy=read_battery(Context(state, later, PROFILE)), t_s=later.t_s)
-        c = Context(state, later, PROFILE)
-        assert (battery_outlook(c).left_s is not None) is known
+        state = replace(observing(state, later), t_s=later.t_s)
+        assert (battery_outlook(Context(state)).left_s is not None) is known
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import PROFILE_ROWS, Findings, FlightReport, ImuMotion, Observation, Phase
-from perchctl.mission.imu import DeadReckoning
+from perchctl.mission import Findings, FlightReport, ImuMotion, Observation, Phase
+from perchctl.mission.belief.reckoning import DeadReckoning
+from perchctl.mission.phase import Claim
 from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraErrors
-from tests.helpers.mission import BY_TARGET, observation, state_in, telemetry
+from tests.helpers.mission import BY_TARGET, observation, remembering, state_in, telemetry
 from tests.mission.rig import BEGIN_S, Look, fly
 
 
@@ -64,7 +65,7 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
         if callable(row.reason)
         and re.search(r"camera\.(mount|latency)|check --lift", inspect.getsource(row.reason))
     }
-    assert blames == PROFILE_ROWS
+    assert blames == {row.name for row in TABLE if Claim.PROFILE_SUSPECT in row.claims}
 
 
 @pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED])
@@ -72,7 +73,7 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
     """A contact is proven only in PERCH; what hangs after a landing was carried there by the dead
     reckoning."""
     reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), aside_m=(0.03, 0.04), aside_sigma_m=0.01)
-    state = replace(state_in(phase), reckoning=reckoning, contact=None)
+    state = remembering(state_in(phase), reckoning=reckoning, contact=None)
     report = FlightReport.of(state, observation(BEGIN_S), BY_TARGET, (), None)
     if phase is Phase.LANDED:
         assert report.contact is None
@@ -87,12 +88,17 @@ def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     reckoning = DeadReckoning(
         aside_m=(0.02, 0.0), aside_sigma_m=0.01, below_m=0.0, sight_s=BEGIN_S - 0.5
     )
-    begun = replace(
+    begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
-        reckoning=reckoning, contact_z_m=1.9, reach_s=BEGIN_S, stopped_s=BEGIN_S, blind_s=BEGIN_S,
+        reckoning=reckoning, contact_z_m=1.9, reach_s=BEGIN_S, stopped_s=BEGIN_S,
+        dead_reckoned_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)
-    rest = [tick.state.reckoning.aside_sigma_m for tick in flight.ticks if tick.t_s > BEGIN_S + 1.0]
+    rest = [
+        tick.state.belief.reckoning.aside_sigma_m
+        for tick in flight.ticks
+        if tick.t_s > BEGIN_S + 1.0
+    ]
     assert rest[-1] == pytest.approx(rest[0], abs=1e-6)
     assert rest[-1] < 0.1
 

@@ -11,13 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion
-from perchctl.mission.imu import (
-    FROZEN_S,
-    GAP_S,
+from perchctl.mission.belief.motion import FROZEN_S, GAP_S, PUSHED_G, UNCORRECTED_S
+from perchctl.mission.belief.reckoning import (
     MOST_CLIMB_MPS,
-    PUSHED_G,
     REACH_M,
-    UNCORRECTED_S,
     DeadReckoning,
     add_sighting,
     advance_reckoning,
@@ -87,7 +84,7 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     new = advance_reckoning(old, heard, after, believed=False)
     assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
     assert advance_reckoning(old, heard, after, believed=True).velocity_mps == after.velocity_mps
-    assert advance_reckoning(old, heard, after, believed=False, astray=True).velocity_mps == (
+    assert advance_reckoning(old, heard, after, believed=False, diverged=True).velocity_mps == (
         old.velocity_mps
     )
 

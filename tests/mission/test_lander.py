@@ -20,16 +20,30 @@ from perchctl.mission import (
     PlannerState,
     RestState,
     VisualInertialMotion,
-    lander,
+    descent,
     planner,
+    rest,
 )
+from perchctl.mission.belief.contact import CARRIED, DOWN
+from perchctl.mission.belief.motion import FusionAge
+from perchctl.mission.belief.mounting import SIGHTS_IN_A_ROW, MountingMonitor
+from perchctl.mission.belief.quality import BATTERY_LOW
+from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
-from perchctl.mission.imu import Corrections, DeadReckoning
-from perchctl.mission.lander import PEEL_S
-from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountingMonitor
-from perchctl.mission.state import FLYING_PHASES
+from perchctl.mission.descent import PEEL_S
+from perchctl.mission.phase import FLYING_PHASES, Claim
+from perchctl.mission.table import PHASES
 from perchctl.profile import Profile
-from perchctl.vehicle import HL_ACTIVE, Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
+from perchctl.vehicle import (
+    HL_ACTIVE,
+    LOW_POWER,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+)
 from tests.helpers.mission import (
     AIRBORNE,
     BY_TARGET,
@@ -40,7 +54,10 @@ from tests.helpers.mission import (
     PROFILES,
     READY,
     Felt,
+    context_at,
     observation,
+    observing,
+    remembering,
     state_in,
     target_at,
     telemetry,
@@ -59,9 +76,10 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
     "sight": (BY_TARGET, {"position_age_s": 0.05}, {}, PositionSetpoint),
     "onboard": (DECKS, {"link_problem": "gone"}, {}, Land),
     "height": (DECKS, {}, {"heading_lost": True}, RawThrust),
-    "imu": (BY_TARGET, {"position_age_s": 3.0}, {"blind_s": NOW_S - 1.0}, RawThrust),
+    "imu": (BY_TARGET, {"position_age_s": 3.0}, {"dead_reckoned_s": NOW_S - 1.0}, RawThrust),
     "nothing": (
-        BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"blind_s": NOW_S - 1.0}, RawThrust,
+        BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"dead_reckoned_s": NOW_S - 1.0},
+        RawThrust,
     ),
 }  # fmt: skip
 # What goes on whatever is known: what is remembered of it, and what may be sent.
@@ -85,19 +103,19 @@ def context(
     profile, observed, remembered, _ = KNOWN[known]
     if changes.get("ordered_s") and profile is BY_TARGET:
         # What once had positions from outside, and was found astray, knows as little.
-        profile, remembered = MOCAP, {"astray": True}
+        profile, remembered = MOCAP, {"diverged": True}
     z_m = z_m if z_m is not None else HANG_Z_M if held else HIGH_M
     observed = dict(observed)
     sample = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
-    state = replace(
+    state = remembering(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
-        t_s=NOW_S - TICK_S, last=sample, blind_height_m=z_m,
+        t_s=NOW_S - TICK_S, last=sample, reckoned_height_m=z_m,
         contact_z_m=z_m if held else None, reach_s=NOW_S - 2.0 if held else None,
         reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
-    state = replace(state, **{**remembered, **changes})
+    state = remembering(state, **{**remembered, **changes})
     obs = observation(NOW_S, telemetry=replace(sample, **(tel or {})), target=None, **observed)
-    return Context(state, obs, profile)
+    return context_at(state, obs, profile)
 
 
 @pytest.mark.parametrize("held", [False, True])
@@ -105,7 +123,7 @@ def context(
 def test_what_is_known_decides_how_it_comes_down(known: str, held: bool) -> None:
     free = KNOWN[known][-1]
     c = context(known, held)
-    state, command = lander.act(c)
+    state, command = descent.act(c)
     assert isinstance(command, PositionSetpoint if held and free is Land else free)
     assert state.severity >= c.state.severity
     if isinstance(command, PositionSetpoint):
@@ -121,7 +139,7 @@ def test_what_has_begun_goes_on_whatever_is_known(known: str, name: str) -> None
     if (known, name) == ("sight", "ordered"):
         return
     remembered, sent = BEGUN[name]
-    _, command = lander.act(context(known, name != "ordered", **remembered))
+    _, command = descent.act(context(known, name != "ordered", **remembered))
     assert isinstance(command, sent)
     assert not isinstance(command, RawThrust) or command.thrust <= 20000
 
@@ -129,7 +147,7 @@ def test_what_has_begun_goes_on_whatever_is_known(known: str, name: str) -> None
 @pytest.mark.parametrize("known", KNOWN)
 def test_below_the_hand_over_it_lands_by_itself_or_level(known: str) -> None:
     assert DECKS.planner.landing.handover_m > LOW_M
-    command = lander.act(context(known, z_m=LOW_M))[1]
+    command = descent.act(context(known, z_m=LOW_M))[1]
     assert isinstance(command, Land if known in ("position", "onboard") else RawThrust)
 
 
@@ -137,12 +155,12 @@ def test_below_the_hand_over_it_lands_by_itself_or_level(known: str) -> None:
 def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     """By no landing of its own, whose trajectory ends while the magnet still holds. Deaf, nobody
     can watch what the weight does: it goes on by setpoints."""
-    assert is_setpoint(lander.act(context(known, True, since_s=PEEL_S - 0.1))[1])
-    state, command = lander.act(context(known, True, since_s=PEEL_S + 0.1))
+    assert is_setpoint(descent.act(context(known, True, since_s=PEEL_S - 0.1))[1])
+    state, command = descent.act(context(known, True, since_s=PEEL_S + 0.1))
     assert isinstance(command, RawThrust)
     assert state.released_s == NOW_S
     if known == "onboard":
-        deaf, command = lander.act(context(known, True, since_s=PEEL_S + 0.1, tel={"t_s": 8.0}))
+        deaf, command = descent.act(context(known, True, since_s=PEEL_S + 0.1, tel={"t_s": 8.0}))
         assert is_setpoint(command, below_m=HANG_Z_M)
         assert deaf.released_s is None
 
@@ -153,10 +171,10 @@ def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
 def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Command]:
     """The kind of command that a way down gives a vehicle high up: setpoints by a position, its own
     landing where telemetry, link or loop are doubtful, else raw thrust."""
-    began = replace(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TICK_S, **state)
+    began = remembering(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TICK_S, **state)
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
     obs = at(HIGH_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
-    return type(lander.act(lander.remember_observation(Context(began, obs, profile)))[1])
+    return type(descent.act(Context(observing(began, obs, profile)))[1])
 
 
 @pytest.mark.parametrize(
@@ -189,7 +207,7 @@ def test_each_part_of_what_is_known_has_its_own_age(
 
 def uncorrected(for_s: float) -> dict[str, Any]:
     """A deck that has given no positions for so long."""
-    return {"imu": ImuMotion(t_s=NOW_S, corrections=Corrections(1e-3, NOW_S, NOW_S - for_s))}
+    return {"imu": ImuMotion(t_s=NOW_S, corrections=FusionAge(1e-3, NOW_S, NOW_S - for_s))}
 
 
 @pytest.mark.parametrize(
@@ -200,10 +218,10 @@ def uncorrected(for_s: float) -> dict[str, Any]:
         (DECKS, {}, uncorrected(0.6), False),
         (DECKS, {}, uncorrected(0.3), True),
         # What once came down blindly, or went astray, believes no sight and no position again.
-        (MOCAP, {"blind_s": NOW_S - 1.0}, {}, False),
-        (BY_TARGET, {"blind_s": NOW_S - 1.0}, {}, False),
-        (MOCAP, {"astray": True}, {}, False),
-        (MOCAP, {"astray": True}, {"age_s": 0.6}, False),
+        (MOCAP, {"dead_reckoned_s": NOW_S - 1.0}, {}, False),
+        (BY_TARGET, {"dead_reckoned_s": NOW_S - 1.0}, {}, False),
+        (MOCAP, {"diverged": True}, {}, False),
+        (MOCAP, {"diverged": True}, {"age_s": 0.6}, False),
     ],
 )
 def test_positions_that_end_or_lead_astray_leave_what_is_felt(
@@ -217,10 +235,12 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     positioning: str, astray: bool
 ) -> None:
     """By such positions a landing would speed up until it tilts over."""
-    begin = replace(state_in(Phase.ALIGN, NOW_S), mount=MountingMonitor(doubts=SIGHTS_IN_A_ROW))
+    begin = remembering(
+        state_in(Phase.ALIGN, NOW_S), mounting=MountingMonitor(doubts=SIGHTS_IN_A_ROW)
+    )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
-    assert (state.phase, state.row, state.astray) == (Phase.LANDING, "mounting", astray)
+    assert (state.phase, state.row, state.belief.diverged) == (Phase.LANDING, "mounting", astray)
     assert ("swapped axes in the motion capture" in state.reason) is astray
     assert isinstance(command, RawThrust if astray else PositionSetpoint)
 
@@ -229,8 +249,8 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     ("known", "changes", "spent"),
     [
         # Nothing flies for long on the least thrust; on more it may, and motors stop on proof only.
-        ("nothing", {"level_thrust": 0.4 * HOVER_THRUST}, True),
-        ("nothing", {"level_thrust": 0.9 * HOVER_THRUST}, False),
+        ("nothing", {"thrust": 0.4 * HOVER_THRUST}, True),
+        ("nothing", {"thrust": 0.9 * HOVER_THRUST}, False),
         # What only ended the stream to a setpoint on the floor would be cut and locked.
         ("onboard", {"setpoint": PositionSetpoint(0.0, 0.0, 0.1, 0.0)}, True),
         ("onboard", {"setpoint": PositionSetpoint(0.0, 0.0, 1.0, 0.0)}, False),
@@ -240,8 +260,8 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
 def test_a_way_down_that_is_spent_ends_without_a_lock(
     known: str, changes: dict[str, Any], spent: bool
 ) -> None:
-    c = context(known, known == "onboard", phase=Phase.ABORTED, row="landing-timeout", **changes)
-    _, command = planner.ACTIONS[Phase.ABORTED](c)
+    c = context(known, known == "onboard", phase=Phase.ABORTED, claims=Claim.UNCONFIRMED, **changes)
+    _, command = PHASES[Phase.ABORTED].act(c)
     assert isinstance(command, StopMotors if spent else Idle)
 
 
@@ -254,10 +274,10 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
-        touch_s=NOW_S - 0.5, level_thrust=half, reckoning=aside,
+        floor_felt_s=NOW_S - 0.5, thrust=half, reckoning=aside,
     )  # fmt: skip
-    state, command = lander.act(c)
-    assert (state.touch_s is not None) is stands
+    state, command = descent.act(c)
+    assert (state.descent.floor_felt_s is not None) is stands
     assert isinstance(command, RawThrust)
     assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
 
@@ -266,8 +286,8 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     """The height may be wrong by as much: what sinks still is not on the floor."""
     sinks = {"velocity_mps": (0.0, 0.0, vz_mps)}
-    c = context("sight", z_m=0.0, tel=sinks, level_thrust=0.9 * HOVER_THRUST)
-    assert isinstance(lander.act(c)[1], StopMotors if stops else RawThrust)
+    c = context("sight", z_m=0.0, tel=sinks, thrust=0.9 * HOVER_THRUST)
+    assert isinstance(descent.act(c)[1], StopMotors if stops else RawThrust)
 
 
 # --- What pictures and accelerometer agree on ---------------------------------------------------
@@ -297,8 +317,8 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})
     felt = VisualInertialMotion(NOW_S - age_s, (0.0, 0.0), reckoning.bias_mps2[:2], 0.0)
-    c = Context(c.state, replace(c.obs, imu=imu, felt=felt), c.profile)
-    command = lander.act(c)[1]
+    c = context_at(c.state, replace(c.obs, imu=imu, felt=felt), c.profile)
+    command = descent.act(c)[1]
     assert isinstance(command, RawThrust)
     assert command.roll_rad == pytest.approx(0.0, abs=1e-9)
     known = min(1.0, held_s / 4.0)
@@ -311,16 +331,13 @@ def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     c = context("imu", reckoning=DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
-    state = lander.remember_observation(Context(c.state, obs, c.profile)).state
-    assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
+    state = observing(c.state, obs, c.profile)
+    assert state.belief.reckoning.velocity_mps[:2] == (0.3, 0.0)
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
-    moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
-    assert (
-        lander.remember_observation(Context(moved, later, c.profile)).state.reckoning.velocity_mps[
-            0
-        ]
-        < 0.2
+    moved = remembering(
+        state, reckoning=replace(state.belief.reckoning, velocity_mps=(0.1, 0.0, 0.0))
     )
+    assert observing(moved, later, c.profile).belief.reckoning.velocity_mps[0] < 0.2
 
 
 @pytest.mark.parametrize(("phase", "since_s", "is_there"), [
@@ -330,24 +347,28 @@ def test_what_carries_it_near_its_only_position_is_the_target(
     phase: Phase, since_s: float, is_there: bool
 ) -> None:
     """Late pictures show it lower. On its way down the floor carries it, too."""
-    c = context("sight", phase=phase, since={planner.Condition.CARRIED: NOW_S - since_s})
-    reckoning = replace(c.state.reckoning, below_m=0.1)
-    state = lander.remember_observation(c.evolve(reckoning=reckoning)).state
-    assert (state.reckoning.below_m == 0.0) is is_there
+    c = context("sight", phase=phase, since={CARRIED: NOW_S - since_s})
+    reckoning = replace(c.state.belief.reckoning, below_m=0.1)
+    state = observing(remembering(c.state, reckoning=reckoning), c.obs, c.profile)
+    assert (state.belief.reckoning.below_m == 0.0) is is_there
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""
     reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
-    c = context("imu", blind_height_m=2.0, reckoning=reckoning)
+    c = context("imu", reckoned_height_m=2.0, reckoning=reckoning)
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
     obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
     obs = replace(obs, imu=replace(obs.imu, t_s=NOW_S))
-    state = lander.remember_observation(Context(c.state, obs, c.profile)).state
-    assert state.reckoning.velocity_mps[2] == pytest.approx(-0.4 if later_s else -0.7, abs=0.05)
-    state = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.0, 0.0, -0.4)))
-    _, command = lander.act(Context(state, obs, c.profile))
+    state = observing(c.state, obs, c.profile)
+    assert state.belief.reckoning.velocity_mps[2] == pytest.approx(
+        -0.4 if later_s else -0.7, abs=0.05
+    )
+    state = remembering(
+        state, reckoning=replace(state.belief.reckoning, velocity_mps=(0.0, 0.0, -0.4))
+    )
+    _, command = descent.act(context_at(state, obs, c.profile))
     assert isinstance(command, RawThrust)
     assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
 
@@ -358,21 +379,23 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     """Whoever notices: what was debounced before begins anew, a catch is over, and a sight of
     before is none."""
     profile, stale = PROFILES[positioning], hung > 1.0
-    state = replace(
-        state_in(Phase.LANDING, z_m=HIGH_M), last=telemetry(NOW_S, HIGH_M), caught=False,
-        since={planner.Condition.DOWN: 0.0, planner.Condition.BATTERY_LOW: 1.0},
+    state = remembering(
+        state_in(Phase.LANDING, z_m=HIGH_M), last=telemetry(NOW_S, HIGH_M), catch_above_m=1.0,
+        since={DOWN: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
-    obs = observation(NOW_S + hung * profile.positioning.hold_s, HIGH_M)
-    after = lander.remember_observation(Context(state, obs, profile)).state
-    assert (planner.Condition.DOWN in after.since) is not stale
-    assert planner.Condition.BATTERY_LOW in after.since
-    assert after.caught is stale
+    later_s = NOW_S + hung * profile.positioning.hold_s
+    off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
+    obs = observation(later_s, telemetry=telemetry(later_s, HIGH_M, **off))
+    after = observing(state, obs, profile)
+    assert after.belief.since[DOWN] == (later_s if stale else 0.0)
+    assert after.belief.since[BATTERY_LOW] == 1.0
+    assert (after.catch_above_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
-    held = replace(state, caught=True)
-    assert lander.remember_observation(Context(held, obs, profile)).state.setpoint == held.setpoint
+    held = remembering(state, catch_above_m=None)
+    assert observing(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
-        assert (after.blind_s is not None) is stale
+        assert (after.belief.dead_reckoned_s is not None) is stale
 
 
 # --- Where it is, in the end --------------------------------------------------------------------
@@ -384,16 +407,16 @@ def ended(
     reach_s: float | None = None,
     imu: ImuMotion = UNMOVED,
     reckoning: DeadReckoning = UNRECKONED,
-    touch_s: float | None = None,
+    floor_felt_s: float | None = None,
     **observed: Any,
 ) -> RestState:
     seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
-    state = replace(
+    state = remembering(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
-        reach_s=reach_s, touch_s=touch_s, reckoning=replace(reckoning, imu=imu),
+        reach_s=reach_s, floor_felt_s=floor_felt_s, reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
-    return lander.find_rest_state(Context(state, obs, BY_TARGET))
+    return rest.find_rest_state(context_at(state, obs, BY_TARGET))
 
 
 @pytest.mark.parametrize(
@@ -421,7 +444,7 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
     sight or a floor that was felt afterwards tells."""
     silence = DeadReckoning(unsure_s=NOW_S - 3.0)
     assert ended(reach_s, reckoning=silence) is RestState.UNKNOWN
-    assert ended(reach_s, reckoning=silence, touch_s=NOW_S - 1.5) is RestState.STANDS
+    assert ended(reach_s, reckoning=silence, floor_felt_s=NOW_S - 1.5) is RestState.STANDS
     seen = replace(silence, sight_s=NOW_S - 2.5)
     told = RestState.STANDS if reach_s is None else RestState.HANGS
     assert ended(reach_s, reckoning=seen) is told
@@ -435,11 +458,13 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     seen = {"target": None, "position_age_s": 11.0, "imu": UNMOVED}
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
-    before = replace(before, reckoning=DeadReckoning(UNMOVED, below_m=below_m))
-    entered = replace(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
-    new = lander.enter_landing(Context(entered, obs, BY_TARGET), before).state
+    before = remembering(before, reckoning=DeadReckoning(UNMOVED, below_m=below_m))
+    entered = remembering(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
+    new = descent.enter_landing(
+        context_at(entered, obs, BY_TARGET).state, context_at(before, obs, BY_TARGET).state
+    )
     assert new.stopped_s == NOW_S
-    assert lander.find_rest_state(Context(new, obs, BY_TARGET)) is RestState.HANGS
+    assert rest.find_rest_state(context_at(new, obs, BY_TARGET)) is RestState.HANGS
 
 
 def test_a_target_seen_far_above_tells_that_it_stands() -> None:
@@ -483,10 +508,10 @@ REMEMBERED = st.sampled_from(
         {"contact_z_m": HANG_Z_M, "reach_s": 9.0},
         {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.9},
         {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.0, "stopped_s": 9.8, "orders": 2},
-        {"caught": False, "catch_goal_above_m": 1.0},
+        {"catch_above_m": 1.0},
         {"pressed": True},
         {"hover_thrust": 0.0},
-        {"blind_s": 9.0, "blind_height_m": 1.0},
+        {"dead_reckoned_s": 9.0, "reckoned_height_m": 1.0},
     ]
 )
 
@@ -494,10 +519,10 @@ REMEMBERED = st.sampled_from(
 def began(phase: Phase, remembered: dict[str, Any], profile: Profile) -> PlannerState:
     """In that phase; a way down has begun as it does."""
     flies = state_in(Phase.ALIGN if phase is Phase.LANDING else phase, z_m=1.0)
-    state = replace(flies, hover_thrust=remembered.get("hover_thrust", HOVER_THRUST))
+    state = remembering(flies, hover_thrust=remembered.get("hover_thrust", HOVER_THRUST))
     if phase is Phase.LANDING:
-        state = lander.begin_landing(Context(state, observation(NOW_S, 1.0), profile)).state
-    return replace(state, **{k: v for k, v in remembered.items() if k != "hover_thrust"})
+        state = descent.begin_landing(context_at(state, observation(NOW_S, 1.0), profile).state)
+    return remembering(state, **{k: v for k, v in remembered.items() if k != "hover_thrust"})
 
 
 def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
@@ -535,7 +560,7 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
     profile = PROFILES[positioning]
     state = began(phase, remembered, profile)
     for obs in observed(bits):
-        before, step = state, lander.step_landing if alone else planner.step_mission
+        before, step = state, descent.step_landing if alone else planner.step_mission
         state, command = step(before, obs, profile)
         assert profile is not BY_TARGET or not isinstance(command, Land)
         if state.phase.is_over:
@@ -543,9 +568,13 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
         if Phase.LANDING not in (before.phase, state.phase):
             continue
         assert state.severity >= before.severity
-        z_m, ground_m = obs.telemetry.position_m[2], state.ground_m
+        z_m, ground_m = obs.telemetry.position_m[2], state.belief.ground_m
         floor_m = ground_m[2] if ground_m else 0.0
-        if isinstance(command, PositionSetpoint) and state.caught and before.phase is state.phase:
+        if (
+            isinstance(command, PositionSetpoint)
+            and state.catch_above_m is None
+            and before.phase is state.phase
+        ):
             assert command.z_m <= max(z_m, floor_m + 0.05) + 1e-9
         if isinstance(command, Land):
             assert command.height_m < z_m

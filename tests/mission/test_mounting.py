@@ -13,9 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.mounting import MountingMonitor, MountSample, mount_sample, update_monitor
+from perchctl.mission.belief.mounting import (
+    MountingMonitor,
+    MountSample,
+    mount_sample,
+    update_monitor,
+)
 from perchctl.vehicle import Command, PositionSetpoint
-from tests.helpers.mission import CEILING_M, state_in, target_at, telemetry
+from tests.helpers.mission import CEILING_M, remembering, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Motors, at, fly
 
 FRAME_S = 1.0 / 30.0
@@ -92,7 +97,7 @@ def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
     watch = MountingMonitor(doubts=9, turn_rad=math.pi / 2)
-    flight = fly(replace(state_in(Phase.ALIGN), mount=watch, setpoint=ahead), at())
+    flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
     assert flight.state.row == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
     assert math.hypot(flight.command.x_m, flight.command.y_m) < 0.02
@@ -160,7 +165,7 @@ def test_a_right_mounting_flies_on() -> None:
     it = Follows(0.0)
     state = fly(state_in(Phase.ALIGN), it, 3.98).state
     assert state.phase is not Phase.LANDING
-    assert state.mount.mounting_fits
+    assert state.belief.mounting.mounting_fits
     assert max(it.far_m) > 0.3
     assert it.far_m[15] <= 0.25 * 0.3 + 1e-9
 

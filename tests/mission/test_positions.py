@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.conditions import OTHERWISE_MPS, contact_error
-from perchctl.mission.context import Context
-from perchctl.mission.imu import DeadReckoning
-from perchctl.mission.lander import LEAST_ORDERS
+from perchctl.mission.belief.contact import contact_error
+from perchctl.mission.belief.quality import OTHERWISE_MPS
+from perchctl.mission.belief.reckoning import DeadReckoning
+from perchctl.mission.descent import LEAST_ORDERS
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -35,6 +35,7 @@ from tests.helpers.mission import (
     Felt,
     changed,
     observation,
+    remembering,
     state_in,
     target_at,
     telemetry,
@@ -79,7 +80,7 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
     """Level, by thrust alone, within a second: long before the estimate itself doubts."""
-    felt, state, sent = Felt(), replace(state_in(phase), attempts=1), []
+    felt, state, sent = Felt(), remembering(state_in(phase), attempts=1), []
     for i in range(125):
         t_s = BEGIN_S + 0.01 * (i - 24)
         variance = 2e-4 + 1e-4 * max(0, math.ceil(10 * (t_s - BEGIN_S - lost_s) - 1e-6))
@@ -182,7 +183,7 @@ class Hangs(Motors):
 
 def at_the_magnet(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
     held = {"contact_z_m": HANG_Z_M, "reach_s": BEGIN_S - 5.0}
-    return replace(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
+    return remembering(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("drift_mps", [0.0, 0.2, -0.2])
@@ -246,7 +247,7 @@ def test_what_nobody_saw_hang_has_not_perched(
 
 def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
-    state = replace(
+    state = remembering(
         state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, contact_z_m=0.6, released_s=9.0,
         stopped_s=9.9, stale_s=BEGIN_S, reach_s=8.0,
     )  # fmt: skip
@@ -254,7 +255,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     felt(off(BEGIN_S - TICK_S))
     locked = felt(off(BEGIN_S, READY | LOCKED))
     assert step_mission(state, locked, MOCAP)[0].phase is Phase.ABORTED
-    hung = replace(state, phase=Phase.COMPLETE)
+    hung = remembering(state, phase=Phase.COMPLETE)
     assert step_mission(hung, locked, MOCAP)[0].phase is Phase.PERCHED
 
 
@@ -314,8 +315,8 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         return at(obs=obs, position_m=body_m)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
-    assert math.hypot(*flight.state.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
-    assert contact_error(Context(flight.state, flight.obs, profile)).sigma_m >= sigma_m - 1e-3
+    assert math.hypot(*flight.state.belief.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
+    assert contact_error(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------
@@ -353,7 +354,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
 ) -> None:
     """A world with its y up: the vehicle rises, its position slides, its height and its vertical
     speed stand. It is let down by what its accelerometer feels, one with an offset too."""
-    begin = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
+    begin = remembering(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
     it = Falls(hover, felt_too_much_g)
     state = fly(begin, it, 5.0, MOCAP, feels=True).state
     assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
@@ -373,7 +374,7 @@ def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
                 obs={"target": None}, position_m=body_m, thrust=self.thrust, supervisor=supervisor
             )(t_s)
 
-    begin = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
+    begin = remembering(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
     flight = fly(begin, OnTheFloor(60000.0), 14.0, MOCAP, feels=True)
     assert flight.state.phase is Phase.LANDED
 
@@ -401,7 +402,7 @@ def test_what_is_carried_off_farther_than_a_draught_leads_is_in_another_world(
     profile: Profile,
     lands: bool,
 ) -> None:
-    begin = replace(state_in(phase, z_m=body_m[2]), **changes)
+    begin = remembering(state_in(phase, z_m=body_m[2]), **changes)
     state = fly(begin, at(position_m=body_m), profile=profile).state
     assert (state.row == "position-astray") is lands
 
@@ -439,11 +440,11 @@ def gains_beside(
     """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
     felt = Felt()
     begun = felt(at()(BEGIN_S))
-    state = replace(state, last=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu))
+    state = remembering(state, last=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu))
     for t_s in times(lasts_s):
-        if not state.astray:
-            beside = replace(state.reckoning, beside_mps=(0.0, beside_mps))
-            state = replace(state, reckoning=beside)
+        if not state.belief.diverged:
+            beside = replace(state.belief.reckoning, beside_mps=(0.0, beside_mps))
+            state = remembering(state, reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
         obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
         state, command = step_mission(state, felt(obs), MOCAP)
@@ -455,10 +456,10 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     beside_mps: float,
 ) -> None:
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
-    begin = replace(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
+    begin = remembering(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
     state, command = gains_beside(begin, -beside_mps, 0.2)
-    assert state.astray is (beside_mps > OTHERWISE_MPS)
-    assert isinstance(command, RawThrust) is state.astray
+    assert state.belief.diverged is (beside_mps > OTHERWISE_MPS)
+    assert isinstance(command, RawThrust) is state.belief.diverged
 
 
 def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motion() -> None:
@@ -466,4 +467,4 @@ def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motio
     not, and what is reckoned by it would brake a speed that is none."""
     state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
     assert state.row == "position-astray"
-    assert abs(state.reckoning.velocity_mps[1]) < 0.15
+    assert abs(state.belief.reckoning.velocity_mps[1]) < 0.15

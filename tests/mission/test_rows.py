@@ -22,8 +22,9 @@ from perchctl.mission import (
     Phase,
     planner,
 )
-from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountingMonitor
-from perchctl.mission.state import FLYING_PHASES, Condition, Severity
+from perchctl.mission.belief.mounting import SIGHTS_IN_A_ROW, MountingMonitor
+from perchctl.mission.phase import FLYING_PHASES, Severity
+from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
     ALLOWED,
     TABLE,
@@ -53,7 +54,9 @@ from tests.helpers.mission import (
     PROFILE,
     READY,
     changed,
+    context_at,
     observation,
+    remembering,
     state_in,
     target_at,
 )
@@ -82,7 +85,7 @@ class Case:
     row: str | None = None
 
     def holds(self, table: tuple[Transition, ...] = TABLE) -> bool:
-        state = replace(state_in(self.phase, BEGIN_S, self.z_m), **self.state)
+        state = remembering(state_in(self.phase, BEGIN_S, self.z_m), **self.state)
         for t_s in times(max(2 * TICK_S, self.lasts_s)):
             state, command = planner.step_mission(state, self.look(t_s), self.profile, table)
             if state.phase is self.to:
@@ -179,7 +182,7 @@ CASES: dict[str, Case] = {
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
-        state={"mount": MountingMonitor(doubts=SIGHTS_IN_A_ROW)},
+        state={"mounting": MountingMonitor(doubts=SIGHTS_IN_A_ROW)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
@@ -333,7 +336,7 @@ def test_without_the_row_a_case_fails(name: str) -> None:
 def test_what_was_locked_while_it_landed_has_not_perched() -> None:
     """It hangs, but nobody has seen whether it hangs on the target: its outcome is that of what led
     to the landing."""
-    state = replace(
+    state = remembering(
         state_in(P.LANDING, BEGIN_S, CONTACT_Z_M), stopped_s=BEGIN_S - 1.0,
         contact_z_m=CONTACT_Z_M, outcome=O.OPERATOR,
     )  # fmt: skip
@@ -346,15 +349,15 @@ def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
     """No cause is: a wind, a weak motor and a wrong gain look alike from here."""
     sample = at(velocity_mps=(0.3, 0.0, 0.0))(BEGIN_S)
     x_m, y_m, z_m = sample.telemetry.position_m
-    state = replace(
+    state = remembering(
         state_in(P.RECOVER), entered_s=0.0, setpoint=PositionSetpoint(x_m + 0.31, y_m, z_m, 0.0)
     )
-    context = planner.Context(state, sample, PROFILE)
+    context = context_at(state, sample, PROFILE)
     row = first_transition(context, TABLE)
     assert row is not None
     text = row.reason_text(context)
     assert text.startswith("not steady 6 s after the attempt: it moves at 0.30 m/s, it is 0.31 m")
-    hangs = planner.Context(replace(state, contact_z_m=z_m), sample, PROFILE)
+    hangs = context_at(remembering(state, contact_z_m=z_m), sample, PROFILE)
     assert row.reason_text(hangs).endswith("it has not come away from its contact")
 
 
@@ -365,10 +368,10 @@ ROGUE = Transition("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARC
 
 def test_no_row_undoes_a_landing() -> None:
     """Whatever a table says: from a landing nothing leads back into the flight."""
-    landing = replace(state_in(P.LANDING), severity=Severity.LAND, orders=1)
-    context = planner.Context(landing, observation(BEGIN_S), PROFILE)
+    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, orders=1)
+    context = context_at(landing, observation(BEGIN_S), PROFILE)
     assert first_transition(context, (ROGUE,)) is None
-    flying = planner.Context(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
+    flying = context_at(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
     assert first_transition(flying, (ROGUE,)) is ROGUE
 
 
@@ -388,7 +391,7 @@ def test_a_row_of_your_own_comes_after_every_safety_row() -> None:
     assert table[at].outcome is Outcome.SAFETY
     stopped = replace(observation(BEGIN_S), operator=Operator.LAND)
     for obs, name in ((observation(BEGIN_S), "mine"), (stopped, "operator-land")):
-        row = first_transition(planner.Context(state_in(P.ALIGN), obs, PROFILE), table)
+        row = first_transition(context_at(state_in(P.ALIGN), obs, PROFILE), table)
         assert row is not None
         assert row.name == name
 
@@ -432,7 +435,7 @@ WAIT = Transition("wait", {P.ALIGN}, lambda c: c.t_s < 50.0, P.ALIGN, "mine", Se
 def test_a_row_of_your_own_waits_in_the_alignment() -> None:
     """It stays aligned and does not go on, the wait does not count, and other rows still act."""
     table = add_rows([WAIT])
-    state = waiting = replace(state_in(P.ALIGN), since={Condition.ALIGNED: 10.0})
+    state = waiting = remembering(state_in(P.ALIGN), since={ALIGNED: 10.0})
     for t_s in range(11, 50):
         waiting, command = planner.step_mission(waiting, observation(t_s), PROFILE, table)
     assert (waiting.phase, waiting.pause, waiting.hold) == (P.ALIGN, "mine", "")

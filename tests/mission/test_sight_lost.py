@@ -14,15 +14,23 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
-from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
-from perchctl.mission.guidance import LOWEST_M, MOST_BRAKED_MPS, POSITION_GAIN_PER_S
-from perchctl.mission.imu import DeadReckoning
-from perchctl.mission.lander import BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD, SINK_MPS
+from perchctl.mission.belief.belief import CORRECTED_S, DISPLACED_MPS
+from perchctl.mission.belief.reckoning import DeadReckoning
+from perchctl.mission.level_descent import BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD, SINK_MPS
+from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
-from perchctl.mission.state import Severity
+from perchctl.mission.release import MOST_BRAKED_MPS, POSITION_GAIN_PER_S
+from perchctl.mission.setpoints import LOWEST_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
-from tests.helpers.mission import CEILING_M, HANG_Z_M, HOVER_THRUST, state_in, target_at
+from tests.helpers.mission import (
+    CEILING_M,
+    HANG_Z_M,
+    HOVER_THRUST,
+    remembering,
+    state_in,
+    target_at,
+)
 from tests.helpers.mission import PROFILE as DECKS
 from tests.mission.rig import BEGIN_S, TICK_S, Flight, Look, Motors, at, fly, is_setpoint
 
@@ -51,11 +59,11 @@ def blinded(
 ) -> PlannerState:
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
     reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
-    state = replace(
-        state_in(Phase.LANDING, z_m=z_m), blind_s=BEGIN_S, blind_height_m=z_m,
+    state = remembering(
+        state_in(Phase.LANDING, z_m=z_m), dead_reckoned_s=BEGIN_S, reckoned_height_m=z_m,
         severity=Severity.LAND, reckoning=reckoning,
     )  # fmt: skip
-    return replace(state, **changes)  # type: ignore[arg-type]
+    return remembering(state, **changes)  # type: ignore[arg-type]
 
 
 def lost(state: PlannerState, lasts_s: float, z_m: float = 1.0, **tel: Any) -> Flight:
@@ -88,7 +96,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""
-    state = replace(state_in(phase, z_m=z_m), searches=2, search_step_s=0.0)
+    state = remembering(state_in(phase, z_m=z_m), searches=2, search_step_s=0.0)
     after = fly(state, unseen(z_m, for_s=max(age_s, HOLD_S + 0.01)), profile=PROFILE).state
     assert after.setpoint is None or after.setpoint.z_m <= z_m
 
@@ -132,7 +140,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
 ) -> None:
     """For 0.1 s without a sight: sideways the estimate feels none of it."""
     gained_mps = 9.81 * 0.1 * math.hypot(aside_g, ahead_g)
-    assume(abs(gained_mps - BLOWN_MPS) >= 0.05)
+    assume(abs(gained_mps - DISPLACED_MPS) >= 0.05)
 
     def look(t_s: float) -> Observation:
         passed_s = t_s - BEGIN_S
@@ -141,7 +149,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         return unseen(1.0, for_s=max(0.01, passed_s - 0.1), yaw_rad=yaw_rad, **felt)(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
-    assert (flight.state.phase is Phase.LANDING) is (gained_mps > BLOWN_MPS)
+    assert (flight.state.phase is Phase.LANDING) is (gained_mps > DISPLACED_MPS)
     if flight.state.phase is Phase.LANDING:
         assert flight.state.row == "position-lost"
         assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + CORRECTED_S
@@ -169,9 +177,9 @@ def test_a_landing_that_loses_it_goes_on_blindly() -> None:
     ordered = at(obs={"operator": Operator.LAND})
     state = fly(state_in(Phase.ALIGN), ordered, profile=PROFILE).state
     assert state.phase is Phase.LANDING
-    assert state.blind_s is None
+    assert state.belief.dead_reckoned_s is None
     state, command = step_mission(state, unseen(0.9, for_s=LAND_S + 0.1)(BEGIN_S + 2.0), PROFILE)
-    assert state.blind_s is not None
+    assert state.belief.dead_reckoned_s is not None
     assert isinstance(command, RawThrust)
 
 
@@ -180,11 +188,11 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     """Knocked off the magnet it is caught by position, and the position mode would tilt it by its
     estimate, which has felt no blow: the setpoint asks for the opposite of what that lacks."""
     unknown_mps = math.hypot(x_mps, y_mps)
-    assume(abs(unknown_mps - BLOWN_MPS) > 0.01)
+    assume(abs(unknown_mps - DISPLACED_MPS) > 0.01)
     imu = ImuMotion(t_s=BEGIN_S)
-    state = replace(
+    state = remembering(
         state_in(Phase.LANDING, z_m=1.9), contact_z_m=1.9, released_s=BEGIN_S - 1.0,
-        reach_s=BEGIN_S - 6.0, blind_s=BEGIN_S - 3.0,
+        reach_s=BEGIN_S - 6.0, dead_reckoned_s=BEGIN_S - 3.0,
         reckoning=DeadReckoning(
             imu=imu, velocity_mps=(x_mps, y_mps, -0.5), missed_mps=(x_mps, y_mps)
         ),
@@ -194,7 +202,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     _, command = step_mission(state, obs, PROFILE)
     assert is_setpoint(command, above_m=1.85)
     assert isinstance(command, PositionSetpoint)
-    if unknown_mps > BLOWN_MPS:
+    if unknown_mps > DISPLACED_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
             braked_mps = max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps))
             assert way_m == pytest.approx(-braked_mps / POSITION_GAIN_PER_S, abs=0.02)
@@ -281,7 +289,7 @@ def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
 
 
 def heading_lost() -> PlannerState:
-    return replace(state_in(Phase.LANDING), heading_lost=True)
+    return remembering(state_in(Phase.LANDING), heading_lost=True)
 
 
 def test_what_does_not_sink_gets_less_until_the_floor_proves_itself() -> None:

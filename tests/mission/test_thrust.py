@@ -9,14 +9,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, lander, planner
-from perchctl.mission.conditions import CONDITIONS
-from perchctl.mission.context import Context
-from perchctl.mission.guidance import FLOOR_M, limit_setpoint
-from perchctl.mission.state import FLYING_PHASES, Condition
+from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
+from perchctl.mission.belief.contact import MAGNET_HOLDS, SATURATED_THRUST
+from perchctl.mission.phase import FLYING_PHASES
+from perchctl.mission.setpoints import FLOOR_M, limit_setpoint
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
-from tests.helpers.mission import CEILING_M, PROFILE, changed, observation, state_in, target_at
+from tests.helpers.mission import (
+    CEILING_M,
+    PROFILE,
+    changed,
+    context_at,
+    observation,
+    observing,
+    remembering,
+    state_in,
+    target_at,
+)
 from tests.mission.rig import BEGIN_S, Motors, at, fly, times
 
 CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
@@ -34,7 +43,7 @@ def flown(
     """For so long in that state of flight, or until the phase changes."""
     for t_s in times(for_s):
         if setpoint_z_m is not None:
-            state = replace(state, setpoint=PositionSetpoint(0.0, 0.0, setpoint_z_m, 0.0))
+            state = remembering(state, setpoint=PositionSetpoint(0.0, 0.0, setpoint_z_m, 0.0))
         target = target_at(t_s, (aside_m, 0.0, CEILING_M), (0.0, 0.0, z_m))
         new, _ = planner.step_mission(state, at(z_m, obs={"target": target}, **tel)(t_s), profile)
         if new.phase is not state.phase:
@@ -57,9 +66,9 @@ def flown(
 def test_how_little_thrust_proves_that_the_magnet_holds(
     hover: float, thrust: float, holds: bool
 ) -> None:
-    hangs = replace(state_in(Phase.COMPLETE), hover_thrust=hover, contact_z_m=CONTACT_Z_M)
-    c = Context(hangs, at(CONTACT_Z_M, thrust=float(thrust))(BEGIN_S), PROFILE)
-    assert CONDITIONS[Condition.MAGNET_HOLDS](c) is holds
+    hangs = remembering(state_in(Phase.COMPLETE), hover_thrust=hover, contact_z_m=CONTACT_Z_M)
+    c = context_at(hangs, at(CONTACT_Z_M, thrust=float(thrust))(BEGIN_S), PROFILE)
+    assert MAGNET_HOLDS.holds(c.belief) is holds
 
 
 @pytest.mark.parametrize(
@@ -77,12 +86,13 @@ def test_how_little_thrust_proves_that_the_magnet_holds(
     ids=["quiet", "climbs", "pressed", "speeds up", "brakes", "climbs hard", "journey", "stale"],
 )
 def test_only_quiet_flight_teaches_the_hover_thrust(how: dict[str, Any], learns: bool) -> None:
-    start = replace(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_spread_m=1.0)
-    assert flown(start, 0.3, thrust=50000.0, **how).hover_thrust == (50000.0 if learns else 0.0)
+    start = remembering(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_spread_m=1.0)
+    after = flown(start, 0.3, thrust=50000.0, **how)
+    assert after.belief.hover_thrust == (50000.0 if learns else 0.0)
 
 
 def pressing(hover: float, thrust: float) -> PlannerState:
-    start = replace(state_in(Phase.PERCH, z_m=CONTACT_Z_M), hover_thrust=hover)
+    start = remembering(state_in(Phase.PERCH, z_m=CONTACT_Z_M), hover_thrust=hover)
     return flown(start, 0.5, CONTACT_Z_M, PROFILE, thrust=thrust)
 
 
@@ -99,7 +109,7 @@ RAW = changed({"planner.perch.mode": "raw"})
 def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) -> None:
     """Raw thrust of 60000 at a hover thrust of 59500: the vehicle would hang in the air."""
     z_m = CONTACT_Z_M - PROFILE.planner.ascend.standoff_m
-    start = replace(state_in(Phase.ASCEND, z_m=z_m), hover_thrust=hover)
+    start = remembering(state_in(Phase.ASCEND, z_m=z_m), hover_thrust=hover)
     state = flown(start, 0.5, z_m, RAW, thrust=hover)
     assert state.phase is (Phase.PERCH if presses else Phase.LANDING)
     if not presses:
@@ -114,7 +124,7 @@ def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) 
 def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
     hover: float, lasts_s: float, row: str
 ) -> None:
-    start = replace(state_in(Phase.ALIGN), hover_thrust=hover)
+    start = remembering(state_in(Phase.ALIGN), hover_thrust=hover)
     state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
     assert state.row == row
     assert row != "too-weak" or "battery too low" in state.reason
@@ -133,19 +143,15 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
     raw_order: int | None, reads: float, known: bool
 ) -> None:
     """It proves no hold: a magnet that carries nothing would pass for one that carries it all."""
-    state = replace(
+    state = remembering(
         state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_order=raw_order, released_s=9.5,
         setpoint=None if raw_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
     )  # fmt: skip
     for t_s in times(0.38):
         obs = at(CONTACT_Z_M, thrust=reads)(t_s)
-        state = replace(
-            lander.remember_observation(Context(state, obs, PROFILE)).state,
-            t_s=t_s,
-            last=obs.telemetry,
-        )
-    c = Context(state, obs, PROFILE)
-    assert c.thrust_is_known is CONDITIONS[Condition.MAGNET_HOLDS](c) is known
+        state = replace(observing(state, obs, PROFILE), t_s=t_s)
+    b = state.belief
+    assert b.thrust_is_known is MAGNET_HOLDS.holds(b) is known
 
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
@@ -165,9 +171,9 @@ def test_a_press_ends_before_the_turn_that_would_be_too_late(late_s: float) -> N
 def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     """Late turns hold a vehicle in place: by the press's own setpoint they would press on."""
     t_s = 10.1 + PROFILE.planner.perch.timeout_s
-    saturated = {Condition.SATURATED: 10.5}
+    saturated = {SATURATED_THRUST: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
-    state = replace(above, since=saturated, caught=True)
+    state = remembering(above, since=saturated, catch_above_m=None)
     for _ in range(2):
         state, command = planner.step_mission(state, pressed_late(t_s, 0.3), PROFILE)
         assert state.phase is Phase.RECOVER  # and full thrust is no sign of a heavy vehicle
@@ -186,8 +192,8 @@ GROUND_Z_M = 0.4
 
 @given(st.floats(-5, 5), st.sampled_from(sorted(FLYING_PHASES | {Phase.LANDING}, key=str)))
 def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
-    state = replace(state_in(phase), ground_m=(0.0, 0.0, GROUND_Z_M))
-    c = Context(state, observation(10.02), PROFILE)
+    state = remembering(state_in(phase), ground_m=(0.0, 0.0, GROUND_Z_M))
+    c = context_at(state, observation(10.02), PROFILE)
     lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else FLOOR_M)
     sent = limit_setpoint(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
     assert sent >= lowest

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ContactError, ImuMotion, Observation, Outcome, Phase, PlannerState
-from perchctl.mission.guidance import UNREAD_S
-from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, onboard_landing
+from perchctl.mission.belief.contact import CONTACT
+from perchctl.mission.descent import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, onboard_landing
 from perchctl.mission.planner import step_mission
-from perchctl.mission.state import Condition
+from perchctl.mission.release import UNREAD_S
 from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
@@ -39,6 +39,7 @@ from tests.helpers.mission import (
     READY,
     Felt,
     observation,
+    remembering,
     state_in,
     target_at,
     telemetry,
@@ -51,7 +52,7 @@ OFF: dict[str, Any] = {"thrust": 0.0, "supervisor": READY}
 
 def landing(z_m: float = HANG_Z_M, phase: Phase = Phase.LANDING, **changes: Any) -> PlannerState:
     """In a landing from a height, or in another phase."""
-    return replace(state_in(phase, z_m=z_m), **changes)
+    return remembering(state_in(phase, z_m=z_m), **changes)
 
 
 def hanging(phase: Phase = Phase.LANDING, **changes: Any) -> PlannerState:
@@ -161,10 +162,10 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
             seen.append(look(t_s))
             state, command = step_mission(state, seen[-1], PROFILE)
             assert not isinstance(command, EmergencyStop)
-            assert state.ground_m is not None
-            ground_z_m[t_s] = state.ground_m[2]
+            assert state.belief.ground_m is not None
+            ground_z_m[t_s] = state.belief.ground_m[2]
             if isinstance(command, StopMotors):
-                floor = on_the_floor(seen, ground_z_m, state.entry_m[2] - state.ground_m[2])
+                floor = on_the_floor(seen, ground_z_m, state.entry_m[2] - state.belief.ground_m[2])
                 assert floor or ((begin or state.released_s) and on_the_ceiling(seen))
                 return
             if state.phase is not Phase.LANDING:
@@ -343,8 +344,8 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
     assert {"beside-the-magnet", row} <= flight.rows
     assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
     if ends is Phase.PERCHED:
-        assert flight.state.contact is not None
-        assert flight.state.contact.aside_m == pytest.approx(aside_m)
+        assert flight.state.belief.contact is not None
+        assert flight.state.belief.contact.aside_m == pytest.approx(aside_m)
 
 
 # --- Where it touched, as it is remembered -------------------------------------------------------
@@ -357,20 +358,20 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
     share: float, steady_s: float, since_s: float, touched: bool
 ) -> None:
     tel = telemetry(10.02, HANG_Z_M, thrust=share * HOVER_THRUST)
-    pressing = landing(phase=Phase.PERCH, since={Condition.CONTACT: since_s})
+    pressing = landing(phase=Phase.PERCH, since={CONTACT: since_s})
     row = next(row for row in TABLE if row.name == "no-contact")
     backs_off = (replace(row, when=lambda c: True),)
     obs = observation(10.02, telemetry=tel, imu=ImuMotion(steady_s=steady_s))
     after, _ = step_mission(pressing, obs, PROFILE, backs_off)
     assert after.phase is Phase.RECOVER
-    assert (after.contact is not None) is touched
+    assert (after.belief.contact is not None) is touched
 
 
 def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_recovered() -> None:
     """Steady because it sticks there, the next attempt would begin pressed."""
     touched = hanging(Phase.RECOVER, contact=ContactError(0.01, 0.02))
     state = fly(touched, at(HANG_Z_M - 0.1)).state
-    assert (state.contact_z_m, state.contact) == (None, None)
+    assert (state.belief.contact_z_m, state.belief.contact) == (None, None)
     assert fly(touched, at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER
 
 
@@ -444,7 +445,7 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
 def test_nothing_is_caught_on_an_old_speed() -> None:
     """Two seconds of full thrust on a speed of long ago would end far above."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
-    slipped = landing(HANG_Z_M, Phase.RECOVER, caught=False, catch_goal_above_m=1.0, setpoint=below)
+    slipped = landing(HANG_Z_M, Phase.RECOVER, catch_above_m=1.0, setpoint=below)
     late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
     _, command = step_mission(slipped, late(10.08), PROFILE)
     assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
@@ -461,9 +462,11 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
     remembered moves with the estimate."""
     state = landing(1.0, last=telemetry(10.0, 1.0))
     new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
-    assert state.ground_m is not None
-    assert new.ground_m is not None
-    assert new.ground_m[2] - state.ground_m[2] == pytest.approx(-0.98 if moves else 0.0)
+    assert state.belief.ground_m is not None
+    assert new.belief.ground_m is not None
+    assert new.belief.ground_m[2] - state.belief.ground_m[2] == pytest.approx(
+        -0.98 if moves else 0.0
+    )
     assert not moves or new.entry_m[2] == pytest.approx(0.02)  # it has not moved: held where it is
 
 
@@ -477,8 +480,8 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
     slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
     state, command = step_mission(state, slow(10.14), PROFILE)
     assert isinstance(command, Land)
-    assert state.ground_m is not None
-    assert command.height_m < state.ground_m[2]
+    assert state.belief.ground_m is not None
+    assert command.height_m < state.belief.ground_m[2]
 
 
 # --- Its own landing -----------------------------------------------------------------

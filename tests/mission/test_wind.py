@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion, Observation, Operator, Phase
-from perchctl.mission.guidance import MOST_TRIM_M, STANDS_MPS
-from perchctl.mission.imu import DeadReckoning, advance_reckoning
-from perchctl.mission.state import Condition
+from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
+from perchctl.mission.phases.recover import STEADY
+from perchctl.mission.setpoints import MOST_TRIM_M, STANDS_MPS
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import BY_TARGET, MOCAP, observation, state_in, target_at, telemetry
 from tests.mission.rig import BEGIN_S, Look, at, fly
@@ -50,7 +50,7 @@ def test_a_velocity_that_no_position_shows_is_no_motion(
     wind, while the vehicle stands still."""
     flight = fly(state_in(Phase.RECOVER), blown(0.0, reads_mps, towards_rad), LEARNED_S, MOCAP)
     assert Phase.ESTIMATE in {tick.state.phase for tick in flight.ticks}  # steady, it goes on
-    bias_mps = flight.state.reckoning.velocity_bias_mps
+    bias_mps = flight.state.belief.reckoning.velocity_bias_mps
     assert bias_mps == pytest.approx(
         (reads_mps * math.cos(towards_rad), reads_mps * math.sin(towards_rad)), abs=0.02
     )
@@ -62,8 +62,8 @@ def test_a_motion_that_positions_show_stays_one(flown_mps: float, towards_rad: f
     look = blown(0.6, 0.0, towards_rad, flown_mps)
     flight = fly(state_in(Phase.RECOVER), look, 3.0, MOCAP, one_phase=True)
     assert flight.state.phase is Phase.RECOVER
-    assert math.hypot(*flight.state.reckoning.velocity_bias_mps) < 0.02
-    assert Condition.STEADY not in flight.state.since
+    assert math.hypot(*flight.state.belief.reckoning.velocity_bias_mps) < 0.02
+    assert STEADY not in flight.state.since
 
 
 @BRIEFLY
@@ -159,8 +159,8 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
 
     flight = fly(state_in(Phase.PERCH, z_m=1.9), look, 1.2, BY_TARGET, feels=True, one_phase=True)
     assert flight.state.phase is Phase.PERCH
-    first = next(tick.state.reckoning for tick in flight.ticks if tick.t_s > lost_s + 0.2)
-    last = flight.state.reckoning
+    first = next(tick.state.belief.reckoning for tick in flight.ticks if tick.t_s > lost_s + 0.2)
+    last = flight.state.belief.reckoning
     assert last.bias_mps2[0] == pytest.approx(first.bias_mps2[0], abs=1e-6)
     way_m = 0.5 * 9.81 * push_g * 0.5**2
     assert first.aside_m[0] - last.aside_m[0] == pytest.approx(way_m, rel=0.1)

@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import Phase
-from perchctl.mission.context import Context
 from perchctl.perception import History
 from perchctl.perception.online_calibration import (
     CHANGED_S,
@@ -25,7 +24,7 @@ from perchctl.perception.online_calibration import (
 )
 from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.vision import CameraErrors, CameraModel, MarkerPose, PoseSetup
-from tests.helpers.mission import PROFILE, observation, state_in, telemetry
+from tests.helpers.mission import PROFILE, context_at, observation, state_in, telemetry
 
 FRAME_S = 1 / 30
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
@@ -129,5 +128,5 @@ def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:
     limit_s = PROFILE.planner.ascend.fresh_s + PROFILE.camera.start_latency_s
     target = replace(old.target, measured_s=10.02 - limit_s - 0.03)
     stale = replace(old, target=target)
-    assert not Context(state, stale, PROFILE).fresh
-    assert Context(state, replace(stale, delay_s=0.05), PROFILE).fresh
+    assert not context_at(state, stale).belief.target.is_fresh
+    assert context_at(state, replace(stale, delay_s=0.05)).belief.target.is_fresh

@@ -23,7 +23,6 @@ from perchctl.mission import (
     FlightReport,
     Outcome,
     Phase,
-    PlannerState,
     SentCommand,
 )
 from perchctl.profile import apply_settings, load_profile
@@ -31,6 +30,7 @@ from perchctl.record import LogWatcher, exact, read_log, write
 from perchctl.vehicle import EmergencyStop, Idle
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
+from tests.helpers.mission import state_with
 from tests.helpers.waiting import stopwatch
 
 
@@ -104,7 +104,7 @@ def test_a_record_without_a_form_costs_itself_alone(
 def test_a_tick_without_a_form_costs_itself_alone(tmp_path: Path) -> None:
     """A log that raised would be left out of its flight."""
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
-    good = synthetic.tick(1.0, synthetic.telemetry(), Idle(), PlannerState())
+    good = synthetic.tick(1.0, synthetic.telemetry(), Idle(), state_with())
     for tick in (good, replace(good, t_s=1.02, command="fly!"), replace(good, t_s=1.04)):  # type: ignore[arg-type]
         log.tick(tick)
     summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
@@ -124,7 +124,7 @@ def test_an_event_or_a_truth_without_a_form_costs_itself_alone(tmp_path: Path) -
     for event in (good, replace(good, kind="odd"), replace(good, t_s=1.04)):  # type: ignore[arg-type]
         log.event(event)
     log.truth = no_truth
-    log.tick(synthetic.tick(1.06, synthetic.telemetry(), Idle(), PlannerState()))
+    log.tick(synthetic.tick(1.06, synthetic.telemetry(), Idle(), state_with()))
     summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
     assert [event["t_s"] for event in read_log(log.path).events] == [1.0, 1.04]
     assert summary is not None

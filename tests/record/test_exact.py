@@ -26,7 +26,6 @@ from perchctl.mission import (
     TurnInputs,
     UnfilteredPose,
 )
-from perchctl.mission.state import Condition
 from perchctl.record import from_exact_json, to_exact_json
 from perchctl.record.exact import decode_line, encode_line, to_rounded_json
 from perchctl.record.read import parse_exact, parse_turn
@@ -89,14 +88,14 @@ def test_an_observation_comes_back(
 
 @dataclass(frozen=True)
 class Since:
-    since: dict[Condition, float]
+    since: dict[Phase, float]
     outcome: Outcome | None = Outcome.SAFETY
 
 
 @pytest.mark.parametrize(
     "value",
     [
-        Since({Condition.ALIGNED: 0.1 + 0.2, Condition.DOWN: -0.0}),
+        Since({Phase.ALIGN: 0.1 + 0.2, Phase.LANDING: -0.0}),
         Since({}, None),
         *(
             CameraModel((640, 480), np.eye(3), array)

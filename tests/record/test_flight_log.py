@@ -19,9 +19,9 @@ from perchctl.mission import (
     FlightReport,
     Outcome,
     Phase,
-    PlannerState,
     RestState,
 )
+from perchctl.mission.phase import Claim
 from perchctl.mission.state import BatteryOutlook
 from perchctl.record import FlightSummary, LogWatcher, path_beside, read_log
 from perchctl.record.exact import to_rounded_json
@@ -39,7 +39,7 @@ from perchctl.vehicle import (
 )
 from perchctl.vision import CameraErrors
 from tests.helpers import log as synthetic
-from tests.helpers.mission import held
+from tests.helpers.mission import held, state_with
 
 KINDS = {"number": (int, float), "string": (str,), "boolean": (bool,), "array": (list,)}
 STARTED = datetime(2024, 3, 1, 14, 5, 9, tzinfo=UTC)
@@ -99,7 +99,7 @@ def test_every_field_is_filled_by_something() -> None:
     frame.poses["joint"] = frame.poses["large"]
     frame = replace(frame, lock_note="not the tracked target")
     battery = BatteryOutlook(60.0, 3, 12.5, 3.9)
-    state = PlannerState(Phase.ALIGN, reason="steady", hold="no picture", battery=battery)
+    state = state_with(phase=Phase.ALIGN, reason="steady", hold="no picture", battery=battery)
     place = ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0))
     seen: set[str] = set()
     for command, name in (
@@ -138,7 +138,10 @@ def test_the_recording_is_found_by_the_log_the_packed_log_and_itself(name: str) 
 @pytest.mark.parametrize("uri", ["sim://", "radio://0/80/2M/E7E7E7E7E7"])
 def test_only_a_real_flight_asks_to_change_a_profile(tmp_path: Path, uri: str) -> None:
     """As it ends, and as its log is read: the simulated camera is the scenario's."""
-    landing = Event(1.0, EventKind.PHASE, "camera seems turned", Phase.LANDING, "mounting")
+    landing = Event(
+        1.0, EventKind.PHASE, "camera seems turned", Phase.LANDING, "mounting",
+        claims=Claim.PROFILE_SUSPECT,
+    )  # fmt: skip
     found = Findings(0.04, 0.003, (0.0, 0.0, 0.0), (0.3, 0.3, 0.8), ("set camera.latency_s",))
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(uri=uri))
     log.event(landing)

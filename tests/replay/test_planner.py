@@ -19,7 +19,7 @@ from perchctl.analysis import replay
 from perchctl.analysis.decide import Comparison
 from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
-from perchctl.mission import Turn, guidance, step_mission
+from perchctl.mission import Turn, setpoints, step_mission
 from perchctl.profile import Profile, apply_settings
 from perchctl.record import FlightLog, LogWatcher, json_line, read_log
 from perchctl.record.header import make_header
@@ -67,7 +67,7 @@ def test_a_changed_constant_is_named_by_tick_and_field(
     """By the last bit: 0.25 s and the next number above it. That much may be tolerated."""
     log = logs("perched")
     assert replay(log).is_identical
-    monkeypatch.setattr(guidance, "HEIGHT_RATE_S", 0.25000000000000006)
+    monkeypatch.setattr(setpoints, "HEIGHT_RATE_S", 0.25000000000000006)
     found = replay(log)
     first = found.differences[0]
     assert first.field == "command.z_m"

@@ -1,0 +1,1 @@
+"""What is believed about the vehicle, computed once per tick; knows no phases and no decisions."""

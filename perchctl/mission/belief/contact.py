@@ -1,0 +1,373 @@
+"""What carries, presses or holds the vehicle, and the evidence for it.
+
+Without a force sensor a contact shows in three readings together. A vehicle in the air accelerates
+by thrust less weight; one that is carried or pressed reads 1 g and does not move, whatever its
+thrust is. So thrust far from hover thrust, at 1 g and at rest, is a contact: with more of it the
+vehicle presses, with less something carries it. Where it is, and what it was flown to do, then tell
+a magnet from the floor, and both from something else.
+
+Three sets of thresholds for "pressing" and "carried" live here side by side, named for what each
+is used for: the proof of contact (`CONTACT`), something in the way (`BLOCKED`), and what is felt
+without a position (`CARRIED`).
+"""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.belief import Belief, ContactError
+from perchctl.mission.belief.evidence import Condition, Rests
+from perchctl.profile import Profile
+from perchctl.vehicle import FLYING, FULL_THRUST
+
+# --- thrust ---
+LEAST_POSITION_THRUST = 20000
+"""The least thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
+SATURATED = 0.98
+"""Share of full thrust above which it is not known how much more the vehicle would take."""
+LITTLE_LEFT = 0.93
+"""Share of full thrust: if hovering takes more, more thrust is no sign of a press. Smaller: heavy
+vehicles are never seen to press."""
+MOST_HOLDING = 0.8
+"""Share of hover thrust: with more, the air under the ceiling may hold the vehicle."""
+PROVABLE = 0.99
+"""Share of the pressing thrust that a proof of contact asks for at most."""
+STILL_MOTORS_THRUST = 5000
+"""Raw thrust at which the motors stand still, and less."""
+PRESSING_PART = 0.95
+"""Share of full thrust from which a still vehicle presses, as an attempt ends."""
+PRESSING_RATIO = 1.05
+"""The same as a multiple of hover thrust."""
+LEAST_HOVER = 1000
+"""Thrust below which nothing flies."""
+
+# --- motion and place ---
+STILL_MPS = 0.05
+"""Vertical speed below which the vehicle does not move. Larger: a slow sink counts as hanging."""
+UNPRESSED_MPS = 0.05
+"""Vertical speed up to which it may press, as an attempt ends."""
+QUIET_MPS = 0.3
+"""Speed up to which thrust is hover thrust."""
+QUIET_CLIMB_MPS = 0.27
+"""Vertical speed up to which thrust is hover thrust."""
+QUIET_G = 0.1
+"""Distance from 1 g up to which thrust is hover thrust."""
+CARRIED_ON_MPS = 0.1
+"""A pressed vehicle's estimated height may run away by this. Larger: a contact is believed far from
+the target. Smaller: a true one is not proven when the target has not been seen for long."""
+PRESSED_M = 0.08
+"""A setpoint this far above a still vehicle presses it. Larger: a blocked climb is seen late."""
+TOUCHES_M = 0.001
+"""By so much the touch itself moves the gear."""
+SHAKEN_M = 0.002
+"""Spread that the impact on the ceiling adds to a deck's position."""
+SLIDES_MPS = 0.01
+"""Spread that a deck's position gains each second without a sighting."""
+DRIFTED_M = 0.02
+"""A slip counts although the estimate has drifted up by this."""
+DESCENDED_M = 0.1
+"""A descent this far below its start has come down."""
+HELD_WITHIN_M = 0.1
+"""A descent that has not come down this far is held where it began."""
+OFF_FLOOR_M = 0.3
+"""Height above which what carries the vehicle is not the floor."""
+OFF_GROUND_M = 0.15
+"""Height above which a blocked vehicle has left the ground."""
+STANDING_BELOW_M = 0.1
+"""Height below which a vehicle may still stand on the ground, rather than press."""
+AT_TARGET_M = 0.15
+"""A gear this near to the target's height may hang on its magnet."""
+NEAR_TARGET_M = 0.3
+"""A gear this near to the target's height does not stand on the floor."""
+FALLING_MPS = -0.05
+"""Vertical speed at which a released vehicle that reads light falls."""
+SINKING_SLOWLY_MPS = -0.15
+"""A vehicle at full thrust that sinks faster falls; it is not too weak."""
+
+# --- time ---
+SUPERVISOR_S = 5.0
+"""Time after which motors that were stopped count as off: the flying bit outlives them by 2 s."""
+HANGING_S = 1.0
+"""Time in which a magnet's hold is proven."""
+
+
+# --- Where the gear is under the target ---
+
+
+def contact_error(b: Belief) -> ContactError:
+    """The gear's distance from the target's axis, and its sigma, which with decks grows after the
+    last sighting: the estimate drifts, and the impact on the ceiling shakes it."""
+    reckoning = b.reckoning
+    sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
+    if b.profile.positioning.source.is_deck and b.position_valid:
+        sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * b.sighting_age_s)
+    return ContactError(math.hypot(*reckoning.aside_m), sigma_m)
+
+
+def last_touch_error(b: Belief) -> ContactError | None:
+    """The `contact_error` of the last touch, in a retreat only; None with a fresh sighting, or once
+    motion capture shows that the vehicle has left the place of that touch."""
+    if not b.sent.maneuver.retreats or b.contact is None or b.target.is_fresh:
+        return None
+    x_m, y_m, _ = b.telemetry.position_m
+    away_m = math.hypot(x_m - b.sent.began_m[0], y_m - b.sent.began_m[1])
+    by_capture = b.profile.positioning.source.is_mocap and b.position_valid
+    if by_capture and away_m > b.profile.planner.perch.contact_xy_m:
+        return None
+    return b.contact
+
+
+def newest_contact_error(b: Belief) -> ContactError:
+    """The error of the last touch where that still counts, else of now."""
+    return last_touch_error(b) or contact_error(b)
+
+
+def contact_tolerance_m(b: Belief) -> float:
+    """The height difference (m) between gear and target up to which the gear is in contact."""
+    planner = b.profile.planner
+    drift_mps = CARRIED_ON_MPS if b.by_target else planner.landing.drift_mps
+    return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * b.sighting_age_s)
+
+
+def is_at_contact_height(b: Belief) -> bool:
+    """True if the gear is at the target's height, within the tolerance of a contact."""
+    return abs(b.target.error_z_m) <= contact_tolerance_m(b)
+
+
+def is_at_target(b: Belief) -> bool:
+    """True if the gear is surely in the magnet's reach."""
+    near = contact_error(b).is_within(b.profile.planner.perch.contact_xy_m)
+    return near and is_at_contact_height(b)
+
+
+# --- What the thrust shows ---
+
+
+def max_press_thrust(profile: Profile) -> float:
+    """The largest thrust that a press can have, 0..65535."""
+    perch = profile.planner.perch
+    return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
+
+
+def is_hover_thrust(b: Belief) -> bool:
+    """True if the thrust is hover thrust: nothing carries, presses or accelerates the vehicle."""
+    tel, setpoint = b.telemetry, b.sent.setpoint
+    vz = tel.velocity_mps[2]
+    stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < STILL_MPS
+    return (
+        b.proves
+        and b.position_valid
+        and LEAST_HOVER <= tel.thrust < SATURATED * FULL_THRUST
+        and b.speed_mps < QUIET_MPS
+        and abs(vz) < QUIET_CLIMB_MPS
+        and abs(tel.acc_z_g - 1.0) < QUIET_G
+        and not stuck
+    )
+
+
+def is_carried_by_other_than_thrust(b: Belief) -> bool:
+    """True if the thrust could not carry the vehicle.
+
+    Position mode goes no lower than `LEAST_POSITION_THRUST`, which is more than `hold_ratio` of the
+    hover thrust where the motors are strong: then that is what proves the hold.
+    """
+    most = b.profile.planner.complete.hold_ratio * b.hover_thrust
+    if MOST_HOLDING * b.hover_thrust >= LEAST_POSITION_THRUST:
+        most = max(most, LEAST_POSITION_THRUST)
+    return b.thrust_is_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
+
+
+def is_strong(b: Belief) -> bool:
+    """True if the thrust is at its limit, or above hover thrust."""
+    thrust, hover = b.telemetry.thrust, b.hover_thrust
+    return thrust >= PRESSING_PART * FULL_THRUST or (hover > 0 and thrust >= PRESSING_RATIO * hover)
+
+
+def is_pressing(b: Belief) -> bool:
+    """True if the thrust is at its limit, or above hover thrust, and the vehicle does not move."""
+    return (
+        is_strong(b)
+        and abs(b.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
+        and b.height_m >= STANDING_BELOW_M
+    )
+
+
+# --- Conditions that count over time ---
+
+
+def is_slipping(b: Belief) -> bool:
+    """True if it falls away from the proven contact, by position or by acceleration."""
+    complete, tel = b.profile.planner.complete, b.telemetry
+    if b.contact_z_m is None or not b.is_sinking(complete.slip_mps):
+        return False
+    above_m = tel.position_m[2] - b.contact_z_m
+    return not b.position_valid or above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g
+
+
+def is_still(b: Belief) -> bool:
+    """True if it does not move, and something carries it: the accelerometer reads one g."""
+    return b.reads_one_g and (abs(b.telemetry.velocity_mps[2]) < STILL_MPS or not b.position_valid)
+
+
+def _is_in_contact(b: Belief) -> bool:
+    """True if position, acceleration and thrust together show a contact (fault 40).
+
+    The gear has stopped at the target's height, the accelerometer reads one g, and the thrust is
+    above what hovering takes: the ceiling must carry the difference.
+    """
+    perch, tel = b.profile.planner.perch, b.telemetry
+    steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and b.position_valid
+    felt_s = b.obs.t_s - b.imu.steady_s
+    wanted = perch.contact_thrust_ratio * b.hover_thrust  # as far as there is more
+    return (
+        abs(b.target.error_z_m)
+        <= perch.contact_z_m + (CARRIED_ON_MPS * b.sighting_age_s if b.by_target else 0)
+        and (steady or felt_s >= perch.contact_dwell_s)
+        and b.reads_one_g
+        and b.hover_thrust > 0
+        and b.thrust_is_known
+        and tel.thrust >= min(wanted, PROVABLE * max_press_thrust(b.profile))
+    )
+
+
+def _magnet_holds(b: Belief) -> bool:
+    return (
+        is_carried_by_other_than_thrust(b)
+        and not is_slipping(b)
+        and (b.position_valid or is_still(b))
+    )
+
+
+def _is_weight_hanging(b: Belief) -> bool:
+    """True if the motors stand still, and the vehicle hangs where it made contact."""
+    return (
+        b.sent.released_s is not None
+        and (b.telemetry.thrust <= STILL_MOTORS_THRUST or not b.thrust_is_known)
+        and is_still(b)
+        and not is_slipping(b)
+    )
+
+
+def _is_hanging(b: Belief) -> bool:
+    """True if something holds it up: it is still, off the floor, on a thrust that could not carry
+    it. Without a position a magnet looks like the floor; the slow release suits both."""
+    tel, complete = b.telemetry, b.profile.planner.complete
+    if not b.position_valid:
+        return is_carried_by_other_than_thrust(b) and is_still(b)
+    held = is_carried_by_other_than_thrust(b) and b.height_m > OFF_FLOOR_M and is_still(b)
+    if not b.sent.maneuver.descends:
+        return held
+    at_contact = (
+        b.contact_z_m is not None and abs(tel.position_m[2] - b.contact_z_m) <= complete.slip_m
+    )
+    at_target = b.obs.target is not None and abs(b.target.error_z_m) <= AT_TARGET_M
+    stayed = b.sent.began_m[2] - tel.position_m[2] < HELD_WITHIN_M and not b.target.is_far_above
+    return held and (at_contact or at_target or stayed)
+
+
+def _is_down(b: Belief) -> bool:
+    """True if the motors are off, and the supervisor agrees, or has not changed its word long."""
+    stopped_s = b.sent.stopped_s
+    long_off = stopped_s is not None and b.obs.t_s - stopped_s > SUPERVISOR_S
+    return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
+
+
+def _is_on_floor(b: Belief) -> bool:
+    """True if it does not move on a thrust that could not carry it, low or come down: a drifting
+    estimate may place the floor anywhere."""
+    near_target = b.obs.target is not None and abs(b.target.error_z_m) <= NEAR_TARGET_M
+    came_down_m = b.sent.began_m[2] - b.telemetry.position_m[2]
+    came_down = b.sent.maneuver.descends and came_down_m > DESCENDED_M
+    handover_m = b.profile.planner.landing.handover_m
+    low = b.height_m < handover_m or (came_down and b.contact_z_m is None)
+    return is_carried_by_other_than_thrust(b) and low and not near_target and is_still(b)
+
+
+def _is_blocked(b: Belief) -> bool:
+    """True if it is pressed against something: the setpoint is above, the thrust at its limit or
+    above what hovering takes, and nothing moves."""
+    setpoint, tel = b.sent.setpoint, b.telemetry
+    if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
+        return False
+    hover = b.hover_thrust
+    ratio = b.profile.safety.blocked_thrust_ratio
+    pressing = hover < LITTLE_LEFT * FULL_THRUST and (
+        tel.thrust >= SATURATED * FULL_THRUST or (hover > 0 and tel.thrust >= ratio * hover)
+    )
+    return pressing and b.height_m > OFF_GROUND_M and is_still(b)
+
+
+def _is_carried_by_feel(b: Belief) -> bool:
+    """True if accelerometer and thrust alone show that something carries or presses it: by much
+    more or much less thrust than hovering takes it would rise or sink in the air."""
+    tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
+    apart = (b.profile.safety.blocked_thrust_ratio - 1.0) * hover
+    pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
+    return (
+        0 < hover < LITTLE_LEFT * FULL_THRUST
+        and b.thrust_is_known
+        and (pressed or tel.thrust <= hover - apart)
+        and b.reads_one_g
+        and b.obs.t_s - b.imu.steady_s >= perch.contact_dwell_s
+    )
+
+
+def _is_saturated(b: Belief) -> bool:
+    full = b.telemetry.thrust >= SATURATED * FULL_THRUST
+    return full and SINKING_SLOWLY_MPS < b.climb_mps < STILL_MPS
+
+
+CONTACT = Condition("contact", _is_in_contact, rests_on=Rests.POSITION)
+MAGNET_HOLDS = Condition("magnet holds", _magnet_holds, rests_on=Rests.TELEMETRY)
+SLIPPING = Condition("slipping", is_slipping)
+WEIGHT_HANGS = Condition("the whole weight hangs", _is_weight_hanging, rests_on=Rests.TELEMETRY)
+HANGING = Condition("hanging", _is_hanging, rests_on=Rests.POSITION)
+DOWN = Condition("down", _is_down, rests_on=Rests.TELEMETRY)
+ON_FLOOR = Condition("on the floor", _is_on_floor, rests_on=Rests.POSITION)
+BLOCKED = Condition("blocked", _is_blocked)
+CARRIED = Condition(
+    "carried or pressed, by feel", _is_carried_by_feel, lasts=True, rests_on=Rests.TELEMETRY
+)
+SATURATED_THRUST = Condition(
+    "thrust at its limit", _is_saturated, lasts=True, rests_on=Rests.TELEMETRY
+)
+CONTACT_CONDITIONS = (
+    CONTACT,
+    MAGNET_HOLDS,
+    SLIPPING,
+    WEIGHT_HANGS,
+    HANGING,
+    DOWN,
+    ON_FLOOR,
+    BLOCKED,
+    CARRIED,
+    SATURATED_THRUST,
+)
+
+
+def counts(b: Belief, condition: Condition[Belief]) -> bool:
+    """True if what the condition rests on is fresh in this tick.
+
+    By the target alone a press is proven by the place of the last sighting, for a while. In a
+    descent `HANGING` begins a release, which goes on over fresh telemetry only: late telemetry may
+    begin it, and so may a missing position, or the vehicle would hang there until it is cut.
+    """
+    if condition is HANGING and b.sent.maneuver.descends:
+        return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
+    match condition.rests_on:
+        case Rests.NOTHING:
+            return True
+        case Rests.TELEMETRY:
+            return b.imu_proves
+        case Rests.POSITION:
+            reckons = condition is CONTACT and b.by_target and b.sent.maneuver.presses
+            return b.imu_proves and (b.position_valid or reckons)
+
+
+def has_slipped(b: Belief) -> bool:
+    """True if the vehicle has slipped off its contact: debounced, but at once in free fall."""
+    tel, complete = b.telemetry, b.profile.planner.complete
+    falls = b.sent.released_s is not None and tel.acc_z_g < complete.slip_acc_g
+    if falls and b.imu_proves and b.climb_mps < FALLING_MPS:
+        return True
+    return b.held_s(SLIPPING) >= complete.slip_dwell_s

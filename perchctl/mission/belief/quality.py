@@ -1,0 +1,101 @@
+"""Whether what is known is good enough to fly by, and conditions that say it is not."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.belief import Belief
+from perchctl.mission.belief.evidence import Condition, Rests
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
+
+KNOCKED_MPS = 0.5
+"""Sideways speed that no draught gives. Larger: a blow during the press is noticed late."""
+OTHERWISE_MPS = 0.15
+"""Velocity that the estimate alone has gained; true positions make at most 0.07. Larger: positions
+in other axes lead farther before they are noticed."""
+BELOW_M = 0.3
+"""No target on the ceiling can be so far below the vehicle."""
+UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
+
+
+def _moves_otherwise(b: Belief) -> bool:
+    """True if the estimate follows a motion capture against the accelerometer."""
+    by_capture = b.profile.positioning.source.is_mocap
+    return by_capture and math.hypot(*b.reckoning.beside_mps) > OTHERWISE_MPS
+
+
+def _is_tilted(b: Belief) -> bool:
+    return b.imu_proves and b.tilt_rad > math.radians(b.profile.safety.max_tilt_deg)
+
+
+def _battery_is_low(b: Belief) -> bool:
+    """True if the firmware reports low power, or a measured voltage is low."""
+    tel = b.telemetry
+    known = tel.battery_v >= NO_BATTERY_READING_V
+    low = known and tel.battery_v < b.profile.safety.min_load_v
+    return tel.battery_state == LOW_POWER or low
+
+
+TILTED = Condition("tilted", _is_tilted, lasts=True)
+KNOCKED = Condition[Belief](
+    "knocked aside",
+    lambda b: b.position_valid and math.hypot(*b.velocity_mps[:2]) > KNOCKED_MPS,
+)
+UNSURE = Condition[Belief]("unsure", lambda b: b.is_unsure, lasts=True)
+TARGET_BELOW = Condition[Belief](
+    "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -BELOW_M
+)
+BATTERY_LOW = Condition("battery low", _battery_is_low, lasts=True)
+MOVES_OTHERWISE = Condition("moves otherwise than its positions", _moves_otherwise, lasts=True)
+QUALITY_CONDITIONS = (TILTED, KNOCKED, UNSURE, TARGET_BELOW, BATTERY_LOW, MOVES_OTHERWISE)
+assert all(each.rests_on is Rests.NOTHING for each in QUALITY_CONDITIONS)
+
+
+def hold_reason(b: Belief, maneuver: Maneuver) -> str:
+    """Why the vehicle must stay where it is in this tick of the maneuver, or the empty string."""
+    safety = b.profile.safety
+    if maneuver.in_the_open and b.position_is_stale:
+        return position_loss_text(b)
+    if not maneuver.by_camera:
+        return ""
+    if b.telemetry_age_s > safety.telemetry_hold_s:
+        return f"telemetry is {b.telemetry_age_s:.1f} s old"
+    if b.jump_s is not None:
+        return "the state estimate jumped"
+    if b.is_unsure:
+        return f"the state estimate is unsure ({unsure_text(b)})"
+    if b.obs.loop_late_s > safety.loop_late_hold_s:
+        return f"the control loop is {b.obs.loop_late_s:.1f} s late"
+    if maneuver.needs_pictures and b.obs.camera_age_s > safety.camera_hold_s:
+        return no_picture_reason(b)
+    return ""
+
+
+def position_loss_text(b: Belief) -> str:
+    """Text: for how long no external position was sent, and why."""
+    if b.is_displaced:
+        return "pushed aside while the target was not seen"
+    age_s, why = b.position_age_s, b.obs.position_problem
+    if b.profile.positioning.source.is_deck:
+        why = why or UNCORRECTED
+    text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
+    return f"{text}: {why}" if why else text
+
+
+def unsure_text(b: Belief) -> str:
+    """Text: the variance by which the estimate is unsure, and the most that is allowed."""
+    safety = b.profile.safety
+    what, variance, unit = "velocity", b.velocity_variance_m2ps2, "(m/s)^2"
+    most = safety.flight_velocity_variance_m2ps2
+    if variance <= most:
+        what = "height" if b.profile.positioning.source.is_deck else "position"
+        variance, most, unit = b.position_variance_m2, safety.flight_variance_m2, "m^2"
+    if math.isinf(variance):
+        return f"the {what}'s variance is not known"
+    return f"the {what}'s variance is {variance:.2g} {unit}, at most {most:g} allowed"
+
+
+def no_picture_reason(b: Belief) -> str:
+    """Text: why there is no picture, or for how long there was none."""
+    return b.obs.camera_problem or f"no picture for {b.obs.camera_age_s:.1f} s"

@@ -1,0 +1,124 @@
+"""How long the battery lasts, and whether that is enough for an attempt and a landing."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.battery import (
+    LEAST_LOADED_S,
+    Drive,
+    EnergyState,
+    charge_from_rest_v,
+    drive_of,
+    fit_sag_model,
+    full_thrust_share_per_s,
+)
+from perchctl.mission.belief.contact import max_press_thrust
+from perchctl.mission.context import Context
+from perchctl.mission.phase import Phase
+from perchctl.mission.state import BatteryOutlook
+from perchctl.profile import Profile
+from perchctl.vehicle import FULL_THRUST
+
+UNKNOWN_S = 5.0
+"""Without a reading for longer the charge is unknown."""
+SETTLING_S = 3.0
+"""Time of settling at the stand-off, as measured in simulated flights."""
+TOUCHING_S = 1.0
+"""The same of the touch."""
+LANDING_S = 3.0
+"""The same of a landing's end, beyond its way down."""
+PRESS_DIP_V = 0.3
+"""Below `safety.min_load_v`, for a press shorter than the debounce."""
+BACK_OFF_S = 3.0
+"""Time until the vehicle is steady after an attempt, and sees the target again."""
+
+
+def battery_outlook(c: Context) -> BatteryOutlook:
+    """Return how long the battery still lasts, and for how many attempts. An unknown charge counts
+    for at most the time that a vehicle without a reading may fly (fault 7)."""
+    energy = c.belief.energy
+    used_mah = energy.used_share * c.profile.vehicle.battery_mah
+    load = (c.belief.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
+    counted_s = hover_left_s(energy, c.profile, load, drive_of(c.telemetry))
+    seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
+    if c.belief.target.world_m is None:
+        return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
+    enough_s, (attempt_s, again_s, landing_s) = seconds, attempt_retry_landing_s(c)
+    if enough_s is None:
+        enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
+    spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
+    left = c.planner.attempts - c.state.attempts
+    attempts = 0  # also where the figures are no numbers
+    if spare_s >= 0.0:
+        attempts = 1 + math.floor(min(spare_s / again_s, max(0, left)))
+    return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
+
+
+def hover_left_s(state: EnergyState, profile: Profile, load: float, drive: Drive) -> float | None:
+    """Seconds of hovering with `load`, a share of full thrust, until `battery-low` fires; None if
+    unknown."""
+    if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
+        return None
+    safety, perch = profile.safety, profile.planner.perch
+    hover_v = max(
+        float(profile.link.parameters.get("pm.lowVoltage", drive.low_power_v)), safety.min_load_v
+    )
+    lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
+    press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
+    press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
+    sag_v, hunger = fit_sag_model(state)
+    end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
+    share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
+    return max(0.0, share) / (
+        hunger * load * full_thrust_share_per_s(profile.vehicle.battery_mah, drive)
+    )
+
+
+def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
+    """The seconds that this attempt, each retry and the landing take, in this order, by the
+    height of the known target."""
+    planner = c.planner
+    up_m = max(0.0, c.belief.target.contact_goal_z_m - c.telemetry.position_m[2])
+    touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
+    touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
+    aligned_s = 0.0
+    if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
+        aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
+    again_m = planner.recover.descend_m + planner.ascend.standoff_m
+    attempt_s = aligned_s + _climb_s(c.profile, up_m) + touch_s
+    again_s = 2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s
+    return (
+        attempt_s,
+        again_s,
+        max(0.0, c.belief.height_m + up_m) / planner.landing.speed_mps + LANDING_S,
+    )
+
+
+def is_short_of_charge(c: Context) -> bool:
+    """True if the charge is not enough for an attempt at a known target."""
+    gated = c.safety.energy_gate and c.belief.target.world_m is not None
+    return gated and not c.state.battery.attempts
+
+
+def battery_shortfall(c: Context) -> str:
+    """Text: the seconds left, and those that an attempt, the landing and the reserve take."""
+    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, attempt_retry_landing_s(c)
+    has = "what the battery has left is not known"
+    if seconds is not None:
+        has = f"the battery has {seconds:.0f} s left"
+    return (
+        f"{has}; an attempt takes {attempt_s:.0f} s, the landing {landing_s:.0f} s, "
+        f"the reserve is {c.safety.energy_reserve_s:g} s"
+    )
+
+
+def _grace_s(c: Context) -> float:
+    """Seconds that `battery-unknown` leaves to a vehicle whose reading is unknown."""
+    return c.safety.battery_stale_s - max(c.belief.energy.unknown_s, c.obs.battery_age_s)
+
+
+def _climb_s(profile: Profile, up_m: float) -> float:
+    ascend = profile.planner.ascend
+    near_m = min(up_m, ascend.near_m)
+    return (up_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps

@@ -1,0 +1,1 @@
+"""The phases of a mission, one file each: entry, action, exits, and their constants."""

@@ -1,0 +1,73 @@
+"""Phase 4, ALIGN: move under the target at one height, and turn like it."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.endurance import battery_shortfall, is_short_of_charge
+from perchctl.mission.phase import Phase, Severity
+from perchctl.mission.phases.recover import has_recovered
+from perchctl.mission.setpoints import Action, fly_under_target, hold_here
+from perchctl.mission.transition import Transition, back_off_row, land_row
+
+ALIGNED = Condition[Context](
+    "aligned",
+    lambda c: (
+        c.belief.target.is_fresh
+        and c.belief.target.error_xy_m <= c.planner.align.xy_m
+        and abs(c.belief.target.error_yaw_rad) <= math.radians(c.planner.align.yaw_deg)
+    ),
+)
+
+
+def act(c: Context) -> Action:
+    """Move under the target at the height of the setpoint."""
+    return fly_under_target(c, (c.state.setpoint or hold_here(c)).z_m)
+
+
+def is_aligned(c: Context) -> bool:
+    """True once the vehicle has been aligned for long enough."""
+    return c.held_s(ALIGNED) >= c.planner.align.dwell_s
+
+
+def lacks_charge_to_begin(c: Context) -> bool:
+    """True if an attempt or a retry is due, and the battery has not enough charge for it."""
+    begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
+    return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
+
+
+ALIGN = PhaseDefinition(
+    phase=Phase.ALIGN,
+    maneuver=Maneuver(in_the_open=True, by_camera=True, needs_pictures=True, learns_hover=True),
+    act=act,
+    conditions=(ALIGNED,),
+    exits=(
+        Transition(
+            "align-lost",
+            {Phase.ALIGN},
+            lambda c: not c.belief.target.is_tracked,
+            Phase.SEARCH,
+            "target lost in alignment",
+            Severity.HOLD,
+        ),
+        back_off_row(
+            "align-timeout",
+            {Phase.ALIGN},
+            lambda c: c.in_phase_s - c.state.waited_s > c.planner.align.timeout_s,
+            "alignment took too long",
+        ),
+        land_row(
+            "too-little-left",
+            {Phase.ALIGN, Phase.RECOVER},
+            lacks_charge_to_begin,
+            battery_shortfall,
+        ),
+        Transition(
+            "aligned", {Phase.ALIGN}, is_aligned, Phase.ASCEND, "aligned in position and heading"
+        ),
+    ),
+)

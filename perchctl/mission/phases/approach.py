@@ -1,0 +1,69 @@
+"""Phase 1, APPROACH: take off and rise to the height from which the target is looked for."""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Phase
+from perchctl.mission.setpoints import Action, fly_to, step_towards
+from perchctl.mission.transition import Transition, land_row
+from perchctl.vehicle import PositionSetpoint
+
+LIFT_ABOVE_M = 0.1
+"""Height below which the vehicle may still stand: there the height is not corrected. Larger: a
+heavy vehicle hangs near the ground for longer. Smaller: what still stands jumps."""
+APPROACH_PART = 0.7
+"""Share of the take-off height above which it flies to `planner.approach_xy_m`."""
+AT_HEIGHT_PART = 0.8
+"""Share of the take-off height that counts as reached."""
+AT_HEIGHT_MPS = 0.25
+"""Speed up to which it hovers."""
+AT_HEIGHT_S = 0.3
+"""Time for which it has to hover."""
+
+AT_TAKEOFF_HEIGHT = Condition[Context](
+    "at take-off height",
+    lambda c: (
+        c.belief.height_m >= AT_HEIGHT_PART * c.planner.takeoff_height_m
+        and c.belief.speed_mps <= AT_HEIGHT_MPS
+        and c.state.setpoint is not None
+    ),
+)
+
+
+def act(c: Context) -> Action:
+    """Rise from the ground on position setpoints, without which the firmware levels out."""
+    planner, state, b = c.planner, c.state, c.belief
+    assert b.ground_m is not None
+    x, y, z = b.ground_m
+    start = state.setpoint or PositionSetpoint(x, y, z, state.entry_yaw_rad)
+    if planner.approach_xy_m is not None and b.height_m > APPROACH_PART * planner.takeoff_height_m:
+        x, y = planner.approach_xy_m
+    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
+    setpoint = step_towards(c, start, goal, up_mps=planner.takeoff_speed_mps)
+    return fly_to(c, setpoint, lift=b.height_m > LIFT_ABOVE_M)
+
+
+APPROACH = PhaseDefinition(
+    phase=Phase.APPROACH,
+    maneuver=Maneuver(in_the_open=True),
+    act=act,
+    conditions=(AT_TAKEOFF_HEIGHT,),
+    exits=(
+        Transition(
+            "approached",
+            {Phase.APPROACH},
+            lambda c: c.held_s(AT_TAKEOFF_HEIGHT) >= AT_HEIGHT_S,
+            Phase.SEARCH,
+            "hovering in the perching area",
+        ),
+        land_row(
+            "approach-timeout",
+            {Phase.APPROACH},
+            lambda c: c.in_phase_s > c.planner.approach_timeout_s,
+            lambda c: f"take-off reached only {c.belief.height_m:.2f} m",
+        ),
+    ),
+)

@@ -1,0 +1,119 @@
+"""Phase 5, ASCEND: climb inside a cone under the target, and settle at the stand-off."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Phase, Severity
+from perchctl.mission.setpoints import Action, fly_under_target, hold_here
+from perchctl.mission.state import PlannerState
+from perchctl.mission.transition import Transition, back_off_row
+from perchctl.values import replace
+
+CLIMB_WITHIN = 0.7
+"""Share of the cone inside which it climbs. Larger: it leaves the cone and goes back to align."""
+MOST_LAG_M = 0.15
+"""The most that the setpoint is above the vehicle while it climbs. Larger: a weak vehicle is sent
+far above where it is."""
+LEAST_CLIMB_MPS = 0.02
+"""Speed at which the setpoint closes in on the stand-off."""
+
+
+def cone_m(c: Context) -> float:
+    """How far from the target's axis an ascent may be at the present height."""
+    ascend = c.planner.ascend
+    return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.error_z_m)
+
+
+def is_near_standoff(c: Context) -> bool:
+    """True if the gear is at the height at which an ascent settles."""
+    ascend = c.planner.ascend
+    return c.belief.target.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+
+
+def _is_settled(c: Context) -> bool:
+    """True if it is slow under the target at the stand-off, by the small marker (fault 33)."""
+    ascend, target = c.planner.ascend, c.belief.target
+    return (
+        target.is_fresh
+        and target.is_small_fresh
+        and is_near_standoff(c)
+        and target.error_xy_m <= ascend.settle_xy_m
+        and abs(target.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
+        and c.belief.speed_mps <= ascend.settle_speed_mps
+    )
+
+
+NEAR_STANDOFF = Condition[Context](
+    "near the stand-off", lambda c: c.belief.target.is_tracked and is_near_standoff(c)
+)
+SETTLED = Condition[Context]("settled", _is_settled)
+
+
+def enter(state: PlannerState, before: Context) -> PlannerState:
+    """A target that was aligned with is searched for from the beginning if it is lost."""
+    del before
+    return replace(state, searches=0)
+
+
+def act(c: Context) -> Action:
+    """Climb only with a fresh target and well inside the cone; slower near the target."""
+    ascend, target = c.planner.ascend, c.belief.target
+    setpoint = c.state.setpoint or hold_here(c)
+    goal_z = target.contact_goal_z_m - ascend.standoff_m
+    may_climb = target.is_fresh and target.error_xy_m < CLIMB_WITHIN * cone_m(c)
+    lag_m = setpoint.z_m - c.telemetry.position_m[2]
+    speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps
+    speed = min(speed, max(LEAST_CLIMB_MPS, goal_z - setpoint.z_m))
+    return fly_under_target(c, goal_z, up_mps=speed if may_climb and lag_m < MOST_LAG_M else 0.0)
+
+
+ASCEND = PhaseDefinition(
+    phase=Phase.ASCEND,
+    maneuver=Maneuver(
+        in_the_open=True,
+        by_camera=True,
+        needs_pictures=True,
+        learns_hover=True,
+        nears_target=True,
+    ),
+    enter=enter,
+    act=act,
+    conditions=(NEAR_STANDOFF, SETTLED),
+    exits=(
+        back_off_row(
+            "ascend-lost",
+            {Phase.ASCEND},
+            lambda c: not c.belief.target.is_tracked,
+            "target lost in ascent",
+        ),
+        Transition(
+            "outside-cone",
+            {Phase.ASCEND},
+            lambda c: c.belief.target.error_xy_m > cone_m(c),
+            Phase.ALIGN,
+            "drifted out of the cone",
+            Severity.HOLD,
+        ),
+        back_off_row(
+            "ascend-timeout",
+            {Phase.ASCEND},
+            lambda c: (
+                c.in_phase_s > c.planner.ascend.timeout_s
+                or c.held_s(NEAR_STANDOFF) > c.planner.ascend.settle_timeout_s
+            ),
+            "does not settle under the target",
+        ),
+        Transition(
+            "settled",
+            {Phase.ASCEND},
+            lambda c: c.held_s(SETTLED) >= c.planner.ascend.settle_dwell_s,
+            Phase.PERCH,
+            "settled at the stand-off",
+        ),
+    ),
+)

@@ -1,0 +1,99 @@
+"""Phase 7, COMPLETE: put the weight on the magnet, stop the motors, and watch."""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.contact import (
+    DOWN,
+    MAGNET_HOLDS,
+    has_slipped,
+    newest_contact_error,
+)
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.release import lower_thrust, release_by_thrust, stop_motors
+from perchctl.mission.rest import is_still_hanging
+from perchctl.mission.setpoints import Action
+from perchctl.mission.state import PlannerState
+from perchctl.mission.transition import Transition, back_off_row, land_row
+from perchctl.values import replace
+
+OFF_S = 0.1
+"""Time for which the motors have to be seen off."""
+UNSTOPPED_S = 10.0
+"""Time beyond the watch after which motors whose thrust still reads are given up."""
+
+
+def enter(state: PlannerState, before: Context) -> PlannerState:
+    """The magnet holds it from here on, as far from the centre as the touch was."""
+    belief = replace(
+        state.belief,
+        contact_z_m=before.telemetry.position_m[2],
+        contact=newest_contact_error(before.belief),
+    )
+    return replace(state, belief=belief, released_s=None)
+
+
+def act(c: Context) -> Action:
+    """Release in two stages; stop the motors once the whole weight hangs; watch."""
+    if c.state.stopped_s is not None:
+        return stop_motors(c)
+    holds = c.held_s(MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
+    return release_by_thrust(c) if holds or c.state.released_s is not None else lower_thrust(c)
+
+
+def stopped_for_s(c: Context) -> float:
+    """Seconds since the first order to stop the motors; -1 before that order."""
+    return -1.0 if c.state.stopped_s is None else c.t_s - c.state.stopped_s
+
+
+def release_monitored(c: Context) -> bool:
+    """True if the motors have been off for as long as a perched vehicle is monitored."""
+    return stopped_for_s(c) >= c.planner.complete.watch_s and c.held_s(DOWN) >= OFF_S
+
+
+COMPLETE = PhaseDefinition(
+    phase=Phase.COMPLETE,
+    maneuver=Maneuver(),
+    enter=enter,
+    act=act,
+    exits=(
+        back_off_row(
+            "slipped",
+            {Phase.COMPLETE},
+            lambda c: has_slipped(c.belief),
+            lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
+            claims=Claim.SLIPPED,
+        ),
+        back_off_row(
+            "not-released",
+            {Phase.COMPLETE},
+            lambda c: (
+                c.state.stopped_s is None and c.in_phase_s > c.planner.complete.release_timeout_s
+            ),
+            "the thrust could not be released",
+            claims=Claim.STILL_ATTACHED,
+        ),
+        Transition(
+            "perched",
+            {Phase.COMPLETE},
+            lambda c: release_monitored(c) and is_still_hanging(c),
+            Phase.PERCHED,
+            "hanging still with the motors off",
+            outcome=Outcome.PERCHED,
+        ),
+        land_row(
+            "fell-unseen",
+            {Phase.COMPLETE},
+            release_monitored,
+            "it is not known to hang where it did",
+        ),
+        land_row(
+            "not-stopped",
+            {Phase.COMPLETE},
+            lambda c: stopped_for_s(c) > c.planner.complete.watch_s + UNSTOPPED_S,
+            lambda c: f"motors stopped, but their thrust still reads {c.telemetry.thrust:.0f}",
+        ),
+    ),
+)

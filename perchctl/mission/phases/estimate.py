@@ -1,0 +1,52 @@
+"""Phase 3, ESTIMATE: stay and look until the target's pose has settled."""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Phase, Severity
+from perchctl.mission.setpoints import Action, fly_to, hold_here
+from perchctl.mission.transition import Transition
+
+UNTRACKED_S = 1.0
+"""Time without the target after which it is searched for again."""
+
+UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
+ESTIMATED = Condition[Context](
+    "estimated",
+    lambda c: c.belief.target.is_fresh and c.belief.target_spread_m <= c.planner.estimate.spread_m,
+)
+
+
+def act(c: Context) -> Action:
+    """Stay where it is."""
+    return fly_to(c, c.state.setpoint or hold_here(c))
+
+
+ESTIMATE = PhaseDefinition(
+    phase=Phase.ESTIMATE,
+    maneuver=Maneuver(in_the_open=True, by_camera=True, needs_pictures=True, learns_hover=True),
+    act=act,
+    conditions=(UNTRACKED, ESTIMATED),
+    exits=(
+        Transition(
+            "estimate-lost",
+            {Phase.ESTIMATE},
+            lambda c: (
+                c.held_s(UNTRACKED) > UNTRACKED_S or c.in_phase_s > c.planner.estimate.timeout_s
+            ),
+            Phase.SEARCH,
+            "the target's pose does not settle",
+            Severity.HOLD,
+        ),
+        Transition(
+            "estimated",
+            {Phase.ESTIMATE},
+            lambda c: c.held_s(ESTIMATED) >= c.planner.estimate.dwell_s,
+            Phase.ALIGN,
+            "pose is steady",
+        ),
+    ),
+)

@@ -1,0 +1,31 @@
+"""The three phases that are never left: PERCHED, LANDED, and ABORTED with its motor stop."""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.descent import is_landing_over
+from perchctl.mission.phase import Phase
+from perchctl.mission.release import motors_are_still
+from perchctl.mission.setpoints import Action
+from perchctl.values import replace
+from perchctl.vehicle import Idle, StopMotors
+
+
+def rest(c: Context) -> Action:
+    """Send nothing."""
+    return c.state, Idle()
+
+
+def abort(c: Context) -> Action:
+    """The motor stop, once; what hangs with its motors still would be locked without one."""
+    if c.state.orders:
+        return c.state, Idle()
+    ends = StopMotors() if motors_are_still(c) or is_landing_over(c) else Idle()
+    return replace(c.state, orders=1, ordered_s=c.t_s), c.state.stop or ends
+
+
+PERCHED = PhaseDefinition(phase=Phase.PERCHED, maneuver=Maneuver(), act=rest)
+LANDED = PhaseDefinition(phase=Phase.LANDED, maneuver=Maneuver(), act=rest)
+ABORTED = PhaseDefinition(phase=Phase.ABORTED, maneuver=Maneuver(), act=abort)

@@ -1,0 +1,110 @@
+"""LANDING: the way down, by `perchctl.mission.descent`, until the vehicle rests with motors off."""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.contact import DOWN
+from perchctl.mission.belief.reckoning import discount_wrong_positions
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.descent import MANEUVER, act, enter_landing
+from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.rest import RestState, find_rest_state
+from perchctl.mission.state import PlannerState
+from perchctl.mission.transition import Predicate, Transition, give_up_row
+from perchctl.values import replace
+from perchctl.vehicle import FLYING, FRESH_S
+
+OFF_S = 0.1
+"""Time for which the motors have to be seen off."""
+LOOKED_S = 2.0
+"""Time in which a target far above shows, after the motors are off."""
+
+
+def enter(state: PlannerState, before: Context) -> PlannerState:
+    """Begin the way down with what the transition claims of positions, mounting and contact."""
+    claims, b = state.claims, state.belief
+    # The mounting may be right and the motion capture's axes wrong, by which the landing would
+    # speed up until it tilts over.
+    capture = b.profile.positioning.source.is_mocap and b.mounting.is_wrong
+    if Claim.POSITIONS_WRONG in claims or (Claim.MOUNTING_WRONG in claims and capture):
+        reckoning = b.reckoning if b.diverged else discount_wrong_positions(b.reckoning)
+        b = replace(b, diverged=True, reckoning=reckoning)
+    if before.state.phase is Phase.RECOVER and Claim.HANGS not in claims:
+        b = replace(b, contact=None)  # nothing was felt to hold it there
+    # With a wrong mounting the setpoint is ahead, in a wrong direction.
+    setpoint = None if Claim.MOUNTING_WRONG in claims else state.setpoint
+    return enter_landing(replace(state, belief=b, setpoint=setpoint), before.state)
+
+
+def rests_as(rest: RestState) -> Predicate:
+    """The predicate that the motors are off and the vehicle is in this rest state."""
+    return lambda c: c.held_s(DOWN) >= OFF_S and find_rest_state(c) is rest
+
+
+def unconfirmed_reason(c: Context) -> str:
+    """Text: why the landing could not be confirmed, as far as the telemetry shows."""
+    age_s, proof_age_s = c.belief.attitude_age_s, c.safety.proof_age_s
+    if age_s > FRESH_S:
+        cause = f"the newest telemetry is {age_s:.1f} s old"
+    elif c.telemetry.has_bit(FLYING) or c.telemetry.thrust >= 1:
+        cause = "by its telemetry the vehicle still flies"
+    elif age_s > proof_age_s:
+        cause = f"the telemetry is {age_s:.2f} s old, and at most {proof_age_s:g} s old is proof"
+    else:
+        cause = "by its telemetry the vehicle does not rest yet"
+    return f"the landing was not confirmed in time: {cause}"
+
+
+def _hung_outcome(before: Outcome | None) -> Outcome | None:
+    """A vehicle that hangs has found its target after all."""
+    return Outcome.ATTEMPTS_USED_UP if before is Outcome.TARGET_NOT_FOUND else before
+
+
+LANDING = PhaseDefinition(
+    phase=Phase.LANDING,
+    maneuver=MANEUVER,
+    enter=enter,
+    act=act,
+    exits=(
+        Transition(
+            "hung",
+            {Phase.LANDING},
+            rests_as(RestState.HANGS),
+            Phase.PERCHED,
+            "hanging with the motors off",
+            outcome=_hung_outcome,
+        ),
+        Transition(
+            "landed",
+            {Phase.LANDING},
+            rests_as(RestState.STANDS),
+            Phase.LANDED,
+            lambda c: (
+                "motors off"
+                + (
+                    ""
+                    if c.belief.dead_reckoned_s is None
+                    else "; it was felt to come down to the floor"
+                )
+            ),
+        ),
+        give_up_row(
+            "held-elsewhere",
+            rests_as(RestState.HELD),
+            "motors off; something holds it where its estimate has no target: look before you "
+            "touch it",
+        ),
+        give_up_row(
+            "hangs-or-stands",
+            lambda c: c.held_s(DOWN) >= LOOKED_S,
+            "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
+            "whether it hangs or stands: look before you touch it",
+        ),
+        give_up_row(
+            "landing-timeout",
+            lambda c: c.in_phase_s > c.planner.landing.timeout_s,
+            unconfirmed_reason,
+            claims=Claim.UNCONFIRMED,
+        ),
+    ),
+)

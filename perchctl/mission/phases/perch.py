@@ -1,0 +1,96 @@
+"""Phase 6, PERCH: press the gear against the target until a contact is proven.
+
+Entry: settled at the stand-off. Action: the setpoint rises through the target, or raw thrust.
+Exits: a contact is proven by position, acceleration and thrust together (`CONTACT`), off the magnet
+or on it; else it is pushed aside, flown unseen for too long, or nothing is touched in time.
+"""
+
+from __future__ import annotations
+
+from perchctl.mission.belief.contact import CONTACT, contact_error
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.belief.quality import KNOCKED, position_loss_text
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Phase
+from perchctl.mission.setpoints import (
+    Action,
+    fly_to,
+    hold_here,
+    setpoint_under_target,
+    step_towards,
+)
+from perchctl.mission.transition import Transition, back_off_row
+from perchctl.vehicle import RawThrust
+
+KNOCKED_S = 0.04
+"""Time for which it has to move aside: more than one sample of telemetry."""
+BLIND_PRESS_S = 1.25
+"""The last centimetres are flown unseen; by the target alone, by dead reckoning. Larger: it presses
+beside the magnet. Smaller: a covered marker ends attempts that would perch."""
+
+
+def act(c: Context) -> Action:
+    """Press. Position and trim stay as they are: against the ceiling they would wind up."""
+    perch, target = c.planner.perch, c.belief.target
+    if perch.mode == "raw":
+        return c.state, RawThrust(perch.thrust)
+    old = c.state.setpoint or hold_here(c)
+    if target.world_m is None:
+        return fly_to(c, old, lift=False)
+    goal = setpoint_under_target(c, target.contact_goal_z_m + perch.press_m)
+    setpoint = step_towards(c, old, goal, up_mps=perch.climb_mps, down_mps=0.0)
+    return fly_to(c, setpoint, lift=False)
+
+
+def is_in_contact(c: Context) -> bool:
+    """True once a contact is proven."""
+    return c.held_s(CONTACT) >= c.planner.perch.contact_dwell_s
+
+
+def contact_reason(c: Context) -> str:
+    """Text: by what the contact is proven, and where."""
+    by = "position, acceleration and thrust"
+    if not c.belief.position_valid:
+        by = f"acceleration and thrust, {position_loss_text(c.belief)}"
+    return f"contact proven by {by}; {contact_error(c.belief).text}"
+
+
+PERCH = PhaseDefinition(
+    phase=Phase.PERCH,
+    maneuver=Maneuver(presses=True),
+    act=act,
+    exits=(
+        back_off_row(
+            "beside-the-magnet",
+            {Phase.PERCH},
+            lambda c: (
+                is_in_contact(c)
+                and not contact_error(c.belief).is_within(c.planner.perch.contact_xy_m)
+            ),
+            lambda c: f"contact {contact_error(c.belief).text}",
+        ),
+        Transition("contact", {Phase.PERCH}, is_in_contact, Phase.COMPLETE, contact_reason),
+        back_off_row(
+            "pressed-blindly",
+            {Phase.PERCH},
+            lambda c: c.belief.by_target and c.belief.position_age_s > BLIND_PRESS_S,
+            lambda c: (
+                f"no contact {c.belief.position_age_s:.1f} s after the last sight of the target"
+            ),
+        ),
+        back_off_row(
+            "knocked-aside",
+            {Phase.PERCH},
+            lambda c: c.held_s(KNOCKED) >= KNOCKED_S,
+            "pushed aside under the target",
+        ),
+        back_off_row(
+            # Not in time, or not before the next turn of a loop as late as this one.
+            "no-contact",
+            {Phase.PERCH},
+            lambda c: c.in_phase_s + c.obs.loop_late_s > c.planner.perch.timeout_s,
+            "no proof of contact",
+        ),
+    ),
+)

@@ -1,0 +1,165 @@
+"""RECOVER: after an attempt that failed, leave what was touched, and hold below it until steady."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.belief import ContactError
+from perchctl.mission.belief.contact import (
+    CARRIED,
+    CONTACT,
+    contact_error,
+    is_at_contact_height,
+)
+from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Claim, Outcome, Phase
+from perchctl.mission.release import (
+    catch_goal_above_m,
+    catch_slip,
+    clear_contact_below,
+    leave_press,
+)
+from perchctl.mission.setpoints import (
+    Action,
+    body_xy_under_target,
+    fly_to,
+    hold_here,
+    step_towards,
+)
+from perchctl.mission.state import PlannerState
+from perchctl.mission.transition import Transition, land_row
+from perchctl.values import replace
+from perchctl.vehicle import PositionSetpoint
+
+CARRIED_RATIO = 0.85
+"""Share of the hover thrust with which a vehicle that slips sinks slowly, and needs no catch."""
+AWAY_M = 0.05
+"""So far below the contact, or half of the way down, it has left."""
+SEEN_LATELY_S = 3.0
+"""Age of a target under which the vehicle is still moved."""
+ATTEMPTS_SEEN_S = 0.5
+"""Time for which it recovers before the last attempt ends the flight."""
+DOWN_MPS = 10.0
+"""A speed limit that limits nothing: the setpoint is where it leads."""
+
+STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
+
+
+def enter(state: PlannerState, before: Context) -> PlannerState:
+    """Begin with what was touched, and with a catch if the vehicle falls."""
+    old, b, claims = before.state, before.belief, state.claims
+    z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
+    touched = old.phase is Phase.PERCH or Claim.BLOCKED in claims
+    # What the motors carry most of hardly falls.
+    falls = Claim.SLIPPED in claims and thrust < CARRIED_RATIO * b.hover_thrust
+    belief = replace(
+        state.belief,
+        contact=_touched(before, claims),
+        # In the magnet's reach until it is seen below.
+        contact_z_m=z_m if touched else b.contact_z_m,
+    )
+    return replace(
+        state,
+        belief=belief,
+        stopped_s=None,
+        released_s=None,
+        catch_above_m=catch_goal_above_m(b.hover_thrust, thrust) if falls else None,
+        blocked_z_m=z_m if Claim.BLOCKED in claims else old.blocked_z_m,
+    )
+
+
+def _touched(before: Context, claims: Claim) -> ContactError | None:
+    """Where the gear touched something as the attempt ended; None if nothing is known of a
+    touch."""
+    old, b = before.state, before.belief
+    if Claim.STILL_ATTACHED in claims:  # the contact was proven, and nothing has come off
+        return b.contact
+    if old.phase is Phase.RECOVER:  # pressed again before it had left
+        return b.contact if b.contact_z_m is not None else None
+    proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
+    carried = proven or b.held_s(CARRIED) >= 0.0  # which has that dwell in itself
+    if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
+        return contact_error(b)
+    return None
+
+
+def act(c: Context) -> Action:
+    """Hold in the air `descend_m` below where the attempt ended, in position mode all along."""
+    if (caught := catch_slip(c)) is not None:
+        return caught
+    recover = c.planner.recover
+    c = Context(clear_contact_below(c.state, min(AWAY_M, 0.5 * recover.descend_m)))
+    state, away = leave_press(c)
+    if away is not None:
+        return state, away
+    if state.catch_above_m is not None:
+        x, y, z = c.telemetry.position_m  # from where it sinks no more
+        entry_m = (x, y, z + recover.descend_m)
+        state = replace(state, catch_above_m=None, setpoint=None, entry_m=entry_m)
+    z = state.entry_m[2] - recover.descend_m
+    setpoint = state.setpoint or hold_here(c)
+    if setpoint.z_m > z:
+        setpoint = replace(setpoint, z_m=z)
+    target = c.belief.target
+    if target.world_m is not None and target.age_s < SEEN_LATELY_S:
+        x, y = body_xy_under_target(c, setpoint.yaw_rad)
+        goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
+    else:
+        goal = replace(setpoint, z_m=z)
+    c = Context(replace(state, setpoint=setpoint))
+    return fly_to(c, step_towards(c, setpoint, goal, down_mps=DOWN_MPS))
+
+
+def has_recovered(c: Context) -> bool:
+    """True if the vehicle has been steady for long enough, away from its contact."""
+    dwell_s = c.planner.recover.dwell_s
+    steady = c.held_s(STEADY) >= dwell_s and c.in_phase_s >= dwell_s
+    return steady and c.belief.contact_z_m is None
+
+
+def unsteady_reason(c: Context) -> str:
+    """Text: what kept a recovering vehicle from being steady, as it was seen; no cause is known."""
+    b, setpoint = c.belief, c.state.setpoint
+    seen = [f"it moves at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
+    if b.position_valid and setpoint is not None:
+        x_m, y_m, _ = c.telemetry.position_m
+        aside_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
+        seen.append(f"it is {aside_m:.2f} m beside its setpoint")
+    if b.contact_z_m is not None:
+        seen.append("it has not come away from its contact")
+    text = f"not steady {c.planner.recover.timeout_s:g} s after the attempt"
+    return f"{text}: {', '.join(seen)}" if seen else text
+
+
+RECOVER = PhaseDefinition(
+    phase=Phase.RECOVER,
+    maneuver=Maneuver(in_the_open=True, by_camera=True, retreats=True),
+    enter=enter,
+    act=act,
+    conditions=(STEADY,),
+    exits=(
+        land_row(
+            "attempts-used",
+            {Phase.RECOVER},
+            lambda c: c.state.attempts >= c.planner.attempts and c.in_phase_s > ATTEMPTS_SEEN_S,
+            "all perching attempts are used up",
+            Outcome.ATTEMPTS_USED_UP,
+        ),
+        Transition(
+            "recovered",
+            {Phase.RECOVER},
+            has_recovered,
+            Phase.ESTIMATE,
+            "steady again, trying once more",
+        ),
+        land_row(
+            "recover-timeout",
+            {Phase.RECOVER},
+            lambda c: c.in_phase_s > c.planner.recover.timeout_s,
+            unsteady_reason,
+        ),
+    ),
+)

@@ -1,0 +1,99 @@
+"""Phase 2, SEARCH: wait for the target, then climb a step, turn a step and wait again."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.maneuver import Maneuver
+from perchctl.mission.belief.mounting import MountingMonitor
+from perchctl.mission.context import Context
+from perchctl.mission.definition import PhaseDefinition
+from perchctl.mission.phase import Outcome, Phase
+from perchctl.mission.setpoints import Action, body_xy_under_target, fly_to, hold_here, step_towards
+from perchctl.mission.state import PlannerState
+from perchctl.mission.transition import Transition, land_row
+from perchctl.values import replace
+from perchctl.vehicle import PositionSetpoint
+
+BLOCKED_ROOM_M = 0.1
+"""Distance that a search keeps below what blocked it."""
+WARY_M = 0.2
+"""Way sideways to a target that was seen, while nothing confirms the camera's mounting. Larger: a
+turned camera leads it farther astray."""
+
+
+def enter(state: PlannerState, before: Context) -> PlannerState:
+    """Search from where the vehicle was sent."""
+    setpoint = before.state.setpoint
+    if setpoint is None:
+        return state
+    entry_m = (setpoint.x_m, setpoint.y_m, setpoint.z_m)
+    return replace(state, entry_m=entry_m, entry_yaw_rad=setpoint.yaw_rad)
+
+
+def act(c: Context) -> Action:
+    """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
+    before is looked for from under it."""
+    search, state, b = c.planner.search, c.state, c.belief
+    ground_m = b.ground_m
+    assert ground_m is not None
+    if c.t_s - state.search_step_s > search.wait_s:
+        state = replace(state, searches=state.searches + 1, search_step_s=c.t_s)
+        c = Context(state)
+    x, y, z = state.entry_m
+    if b.target.world_m is not None:
+        there = body_xy_under_target(c, state.entry_yaw_rad)
+        unconfirmed = b.mounting.is_unconfirmed
+        x, y = _not_far(b.mounting, (x, y), there) if unconfirmed else there
+        height = min(z, b.target.contact_goal_z_m - c.planner.ascend.near_m)
+    else:
+        top = max(z, ground_m[2] + search.max_height_m)
+        if state.blocked_z_m is not None:
+            top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
+        height = min(z + search.step_m * state.searches, top)
+    yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
+    goal = PositionSetpoint(x, y, height, yaw)
+    old = state.setpoint or hold_here(c)
+    return fly_to(c, step_towards(c, old, goal, up_mps=c.planner.ascend.speed_mps))
+
+
+def _not_far(
+    mount: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
+) -> tuple[float, float]:
+    """The goal, world x and y (m), cut to `WARY_M` from the last sighting, else from `start`."""
+    if mount.sights:
+        start = (mount.sights[-1].vehicle_m.real, mount.sights[-1].vehicle_m.imag)
+    dx, dy = goal[0] - start[0], goal[1] - start[1]
+    part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
+    return start[0] + part * dx, start[1] + part * dy
+
+
+def not_found_reason(c: Context) -> str:
+    """Text: that the target was not found, and why as far as known."""
+    text, why = "target not found in the allowed attempts", c.obs.camera_problem
+    why = why or c.obs.target_refused
+    return f"{text}: {why}" if why else text
+
+
+SEARCH = PhaseDefinition(
+    phase=Phase.SEARCH,
+    maneuver=Maneuver(in_the_open=True, by_camera=True, needs_pictures=True),
+    enter=enter,
+    act=act,
+    exits=(
+        Transition(
+            "found",
+            {Phase.SEARCH},
+            lambda c: c.state.confirmed >= c.planner.search.confirm_frames,
+            Phase.ESTIMATE,
+            "target seen",
+        ),
+        land_row(
+            "searched-out",
+            {Phase.SEARCH},
+            lambda c: c.state.searches >= c.planner.search.attempts,
+            not_found_reason,
+            Outcome.TARGET_NOT_FOUND,
+        ),
+    ),
+)

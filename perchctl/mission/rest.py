@@ -1,0 +1,94 @@
+"""Where a vehicle with its motors off is: on the magnet, on the floor, or nobody knows."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+from perchctl.mission.belief.contact import contact_tolerance_m
+from perchctl.mission.belief.target import FAR_BELOW_M
+from perchctl.mission.context import Context
+from perchctl.mission.phase import Claim, Phase
+
+HUNG_WITHIN_M = 0.3
+"""A vehicle this little below its contact still hangs there, by an estimate that has drifted."""
+HIGH_M = 0.45
+"""A descent that began higher than this can tell hanging from standing by the height."""
+LOW_M = 0.3
+"""Height below which the vehicle stands."""
+STAYED_M = 0.15
+"""A vehicle that has not come down this far hangs where the descent began. Larger: one on a table
+hangs. Smaller: a drifting estimate has let one go that hangs."""
+
+
+class RestState(Enum):
+    """Where a vehicle with its motors off is, in words without a full stop."""
+
+    HANGS = "the vehicle hangs on the magnet, its motors are off"
+    HELD = "something holds the vehicle away from the target; the motors are off"
+    STANDS = "the vehicle stands on the floor, its motors are off"
+    UNKNOWN = "the motors are off; it is not known whether the vehicle hangs or stands"
+    UNSEEN = "how it ended could not be confirmed: keep away from the vehicle"
+
+
+def find_rest_state(c: Context) -> RestState:
+    """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
+    above, or by the falls measured since the vehicle came into the magnet's reach."""
+    b, state = c.belief, c.state
+    if _is_held_elsewhere(c):
+        return RestState.HELD
+    if b.by_target or not b.position_valid:
+        if b.target.is_tracked and b.target.is_far_above:
+            return RestState.STANDS
+        return _by_falls(c)
+    high = state.entry_m[2] - b.ground_z_m > HIGH_M
+    came_down_m = state.entry_m[2] - b.telemetry.position_m[2]
+    stayed = high and not b.target.is_far_above and came_down_m < STAYED_M
+    at_contact = b.contact_z_m is not None and not b.target.is_far_above
+    if stayed or (b.height_m > LOW_M and at_contact):
+        return RestState.HANGS
+    return RestState.STANDS
+
+
+def _is_held_elsewhere(c: Context) -> bool:
+    b, state = c.belief, c.state
+    if state.phase is not Phase.LANDING:
+        return False
+    if b.position_valid and state.entry_m[2] - b.telemetry.position_m[2] >= STAYED_M:
+        return False
+    if Claim.HELD_BY_OTHER in state.claims:
+        return b.imu.fell_s <= state.entered_s
+    below = contact_tolerance_m(b) < b.target.error_z_m <= FAR_BELOW_M and b.contact is None
+    by_position = b.position_valid and not b.by_target and b.jump_s is None and b.height_m > HIGH_M
+    return below and (b.target.is_fresh or by_position)
+
+
+def _by_falls(c: Context) -> RestState:
+    """By the falls since the vehicle came within the magnet's reach, if ever, and by the silences
+    that could hide one."""
+    b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.reach_s
+    felt_s = c.state.descent.floor_felt_s
+    down_s = max(b.imu.fell_s, -math.inf if felt_s is None else felt_s)
+    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sighting ends the doubt
+    if since_s is None or down_s > since_s:
+        return RestState.UNKNOWN if unsure else RestState.STANDS
+    came_unheard = unsure and reckoning.unsure_s <= since_s
+    return RestState.UNKNOWN if came_unheard or b.imu.gap_s > since_s else RestState.HANGS
+
+
+def is_still_hanging(c: Context) -> bool:
+    """True if a position shows the vehicle at its contact, or the accelerometer shows no fall."""
+    b, tel = c.belief, c.telemetry
+    if not b.by_target and b.position_valid and b.contact_z_m is not None:
+        falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
+        if not falls and b.contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
+            return True
+    return _by_falls(c) is RestState.HANGS
+
+
+def hangs_with_motors_off(c: Context) -> bool:
+    """True if the motors were stopped while the vehicle hung, and it still hangs."""
+    stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
+    if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
+        return False
+    return is_still_hanging(c)

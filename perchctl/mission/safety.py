@@ -1,0 +1,454 @@
+"""The rows of the table that hold in many phases, gravest first.
+
+They stand before each phase's own exits: an operator's word, a locked or tumbled vehicle, a lost
+link, old telemetry, positions and pictures that cannot be relied on, limits, the battery; then a
+magnet that catches early, and something in the way.
+"""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.belief.contact import (
+    BLOCKED,
+    HANGING,
+    HANGING_S,
+    SATURATED,
+    SATURATED_THRUST,
+    contact_error,
+    contact_tolerance_m,
+    is_at_contact_height,
+    is_at_target,
+    last_touch_error,
+    max_press_thrust,
+    newest_contact_error,
+)
+from perchctl.mission.belief.motion import PUSHED_S
+from perchctl.mission.belief.quality import (
+    BATTERY_LOW,
+    MOVES_OTHERWISE,
+    TARGET_BELOW,
+    TILTED,
+    UNSURE,
+    no_picture_reason,
+    position_loss_text,
+    unsure_text,
+)
+from perchctl.mission.context import Context
+from perchctl.mission.phase import (
+    BEFORE_COMPLETION,
+    BEFORE_CONTACT,
+    BY_CAMERA,
+    FLYING_PHASES,
+    IN_THE_OPEN,
+    Claim,
+    Operator,
+    Outcome,
+    Phase,
+)
+from perchctl.mission.phases.ascend import NEAR_STANDOFF
+from perchctl.mission.rest import hangs_with_motors_off
+from perchctl.mission.transition import (
+    Transition,
+    back_off_row,
+    land_row,
+    motor_cut_row,
+    supervisor_row,
+)
+from perchctl.profile import USED_LATENCY_S
+from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
+
+LIFTED_M = 0.05
+"""Height below which a take-off may run aside by `SIDEWAYS_M` only."""
+SIDEWAYS_M = 0.12
+"""The most that a vehicle runs aside before it has lifted. Larger: a wrong mounting tips it
+over."""
+LOW_M = 0.3
+"""Height below which positions in other axes lead into the floor."""
+DIVERGED_LOW_M = 0.22
+"""Distance aside there, and in a climb that should be straight, at which positions have
+diverged."""
+DIVERGED_LANDING_M = 0.4
+"""The same in a landing."""
+DIVERGED_M = 0.8
+"""The same in the open: farther than any draught carries the vehicle. Larger: it meets the
+walls."""
+ASIDE_BY_LATENCY_MPS = 4.0
+"""How far aside a take-off by the target may run for each second of the latency's sigma: by 0.1 s
+that pictures are later than assumed, up to 0.2 m. Larger: a turned camera leads farther away."""
+ABOVE_START_M = 0.1
+"""A setpoint this near above the start only climbs."""
+MOVES_OTHERWISE_S = 0.1
+"""Time for which the estimate has to move against the accelerometer."""
+SWINGS_MPS = 0.5
+"""Sink that only swings of position control reach."""
+BELOW_S = 0.3
+"""Time for which a target has to seem below the vehicle."""
+WEAK_S = 2.0
+"""Time at full thrust after which no thrust is left to press with."""
+HELD_S = 2.0
+"""Time after which the magnet has been told from other things."""
+BLIND_VARIANCE_M2PS2 = 0.02
+"""Variance of the velocity about 3 s after the last sighting."""
+
+
+# --- Whether the position, the pictures and their mounting can be relied on ---
+
+
+def has_diverged(c: Context) -> bool:
+    """True if external positions in other axes than the vehicle's lead position control away from
+    its setpoint (fault 11): farther than any draught carries it, or in swings."""
+    setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
+    if b.profile.positioning.source.is_deck or not b.position_valid:
+        return False
+    if c.held_s(MOVES_OTHERWISE) >= MOVES_OTHERWISE_S or _swings(c):
+        return True
+    if setpoint is None:
+        return False
+    if phase is Phase.LANDING:
+        touched = b.contact_z_m is not None or c.state.stopped_s is not None
+        return not touched and _away_m(c) > DIVERGED_LANDING_M
+    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if b.by_target else 0.0
+    if phase is Phase.APPROACH and b.height_m < LIFTED_M:
+        return _away_m(c) > SIDEWAYS_M + spare_m
+    ground = b.ground_m
+    above_start = ground is not None and (
+        math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < ABOVE_START_M
+    )
+    only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
+    is_pushed = b.imu.t_s - b.imu.pushed_s <= PUSHED_S  # by moving air
+    stays = b.height_m < LOW_M or (only_climbs and not is_pushed)
+    return _away_m(c) > (DIVERGED_LOW_M + spare_m if stays else DIVERGED_M)
+
+
+def _swings(c: Context) -> bool:
+    moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
+    by_capture = c.profile.positioning.source.is_mocap
+    return moves and by_capture and c.belief.climb_mps < -SWINGS_MPS
+
+
+def _away_m(c: Context) -> float:
+    (x_m, y_m, _), setpoint = c.telemetry.position_m, c.state.setpoint
+    return 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
+
+
+def divergence_reason(c: Context) -> str:
+    """Text: how far positions have led the vehicle away, and what may be the cause."""
+    b = c.belief
+    if _swings(c):
+        return (
+            f"it swings up and down, now at {-b.climb_mps:.1f} m/s: are the positions of the "
+            f"motion capture late?"
+        )
+    cause = (
+        "swapped axes in the motion capture, positions that are late, or a body that is turned in "
+        "it; perchctl check --lift tells"
+    )
+    if b.by_target:
+        cause = "does camera.mount have the camera turned as it is?"
+    return (
+        f"position control leads astray, {_away_m(c):.2f} m aside at a height of {b.height_m:.2f} "
+        f"m: {cause}"
+    )
+
+
+def is_position_lost(c: Context) -> bool:
+    """True if no position came for `positioning.land_s`, or the estimate is useless earlier."""
+    b = c.belief
+    if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
+        return True
+    unsure = b.velocity_variance_m2ps2 > BLIND_VARIANCE_M2PS2
+    return b.by_target and b.position_is_stale and unsure
+
+
+def is_outside_fence(c: Context) -> bool:
+    """True if the vehicle is farther from its start than the fence allows."""
+    ground_m = c.belief.ground_m
+    if ground_m is None:
+        return False
+    x, y, _ = c.telemetry.position_m
+    dx, dy = x - ground_m[0], y - ground_m[1]
+    return math.hypot(dx, dy) > c.safety.fence_radius_m
+
+
+def latency_reason(c: Context) -> str:
+    """Text: how old the pictures are, and how old they should be."""
+    camera, b = c.profile.camera, c.belief
+    assumed_s = camera.start_latency_s + c.obs.delay_s
+    found = f"the pictures are {1e3 * (assumed_s + b.mismatch.later_s):.0f} ms old"
+    if not b.proves:  # by late telemetry, pictures that are in time seem late
+        return (
+            f"pictures and telemetry do not fit each other, by {1e3 * b.mismatch.later_s:.0f} ms; "
+            f"the telemetry is {b.telemetry_age_s:.1f} s old"
+        )
+    if isinstance(camera.latency_s, str):
+        least_s, most_s = USED_LATENCY_S
+        return (
+            f"{found}; a measured latency (camera.latency_s) can be {1e3 * least_s:.0f} to "
+            f"{1e3 * most_s:.0f} ms: find what delays them"
+        )
+    return f"{found}, not {1e3 * assumed_s:.0f} as camera.latency_s says: find what delays them"
+
+
+def is_mounting_wrong(c: Context) -> bool:
+    """True if the target moves along with the vehicle, or seems to lie below the vehicle."""
+    b = c.belief
+    below = c.held_s(TARGET_BELOW) >= BELOW_S
+    return b.mounting.is_wrong or b.mismatch.turn_rad != 0.0 or below
+
+
+def mounting_reason(c: Context) -> str:
+    """Text: how the camera seems to be mounted, and what to do."""
+    b = c.belief
+    turn_rad = b.mismatch.turn_rad
+    if turn_rad or b.mounting.is_wrong:
+        turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.turn_rad) / 10.0)
+        turn_deg = 180 if turn_deg == -180 else turn_deg
+        text = (
+            f"camera seems turned by about {turn_deg} deg from what the profile says: the target "
+            f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
+            f"{turn_deg} to the last of camera.mount.rpy_deg"
+        )
+        capture = not turn_rad and c.profile.positioning.source.is_mocap
+        return f"{text}; or swapped axes in the motion capture" if capture else text
+    return (
+        f"the target seems to lie {-b.target.error_z_m:.1f} m below the vehicle: camera.mount does "
+        f"not look up"
+    )
+
+
+# --- Whether something holds or blocks the vehicle, or its thrust is too weak ---
+
+
+def is_held(c: Context) -> bool:
+    """True if the target's magnet holds the vehicle already."""
+    if c.held_s(HANGING) < HANGING_S:
+        return False
+    touched, radius_m = last_touch_error(c.belief), c.planner.perch.contact_xy_m
+    near = touched is not None and max(touched.aside_m, touched.sigma_m) <= radius_m
+    return near or is_at_target(c.belief)
+
+
+def is_held_elsewhere(c: Context) -> bool:
+    """True if something holds the vehicle off the target's height, or beside the target."""
+    touched = last_touch_error(c.belief)
+    error = touched or contact_error(c.belief)
+    at_its_height = touched is not None or is_at_contact_height(c.belief)
+    beside = error.aside_m - 2.0 * error.sigma_m > c.planner.perch.contact_xy_m
+    return c.held_s(HANGING) >= HELD_S and (beside or not at_its_height)
+
+
+def is_blocked(c: Context) -> bool:
+    """True if the vehicle has pressed against something for `safety.blocked_s`."""
+    return c.held_s(BLOCKED) >= c.safety.blocked_s
+
+
+def is_blocked_off_target(c: Context) -> bool:
+    """True if the vehicle is blocked, and not where a press would prove the contact."""
+    pressing = c.state.phase is Phase.PERCH
+    return is_blocked(c) and not (
+        pressing and abs(c.belief.target.error_z_m) <= contact_tolerance_m(c.belief)
+    )
+
+
+def lacks_press_thrust(c: Context) -> bool:
+    """True if no thrust is left to press with: seen at full thrust, or known before the press."""
+    if c.state.pressed:
+        return False
+    if c.held_s(SATURATED_THRUST) >= WEAK_S:
+        return True
+    near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
+    return near and c.belief.hover_thrust > SATURATED * max_press_thrust(c.profile)
+
+
+SAFETY_ROWS: tuple[Transition, ...] = (
+    motor_cut_row(
+        "operator-stop",
+        lambda c: c.obs.operator >= Operator.STOP,
+        "the operator cut the motors",
+        Outcome.EMERGENCY,
+    ),
+    Transition(
+        "hung-but-locked",
+        {Phase.COMPLETE, Phase.LANDING},
+        lambda c: c.telemetry.has_bit(LOCKED) and hangs_with_motors_off(c),
+        Phase.PERCHED,
+        "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
+        outcome=lambda before: before or Outcome.PERCHED,  # a landing keeps its own
+    ),
+    supervisor_row(
+        "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"
+    ),
+    supervisor_row("tumbled", TUMBLED, "the vehicle has tumbled: inspect and restart it"),
+    supervisor_row(
+        "crashed", CRASHED, "the supervisor reports a crash: inspect and restart the vehicle"
+    ),
+    motor_cut_row(
+        "tilted",
+        lambda c: c.held_s(TILTED) >= c.safety.tilt_debounce_s and c.state.stopped_s is None,
+        "tilted beyond the limit: motors cut",
+    ),
+    land_row(
+        "operator-land",
+        FLYING_PHASES,
+        lambda c: c.obs.operator >= Operator.LAND,
+        "the operator asked to land",
+        Outcome.OPERATOR,
+    ),
+    land_row(
+        "link-lost",
+        FLYING_PHASES,
+        lambda c: c.obs.link_problem is not None,
+        lambda c: f"link lost: {c.obs.link_problem}",
+    ),
+    land_row(
+        "telemetry-stale",
+        FLYING_PHASES,
+        lambda c: c.belief.telemetry_age_s > c.safety.telemetry_land_s,
+        lambda c: f"the newest telemetry is {c.belief.telemetry_age_s:.1f} s old",
+    ),
+    land_row(
+        "heading-lost",
+        BEFORE_CONTACT,
+        lambda c: c.belief.heading_lost,
+        "the estimated heading jumped: down level, by thrust alone",
+    ),
+    land_row(
+        "position-astray",
+        IN_THE_OPEN | {Phase.LANDING},
+        has_diverged,
+        divergence_reason,
+        claims=Claim.POSITIONS_WRONG | Claim.PROFILE_SUSPECT,
+    ),
+    land_row(
+        "position-lost",
+        IN_THE_OPEN | {Phase.PERCH},
+        is_position_lost,
+        lambda c: f"{position_loss_text(c.belief)}; down level, by thrust alone",
+    ),
+    land_row(
+        "estimator-jump",
+        BEFORE_CONTACT,
+        lambda c: c.belief.jump_s is not None and c.t_s - c.belief.jump_s >= c.safety.jump_hold_s,
+        "the state estimate jumped: landing where it is",
+    ),
+    land_row(
+        "estimate-unsure",
+        IN_THE_OPEN,
+        lambda c: c.held_s(UNSURE) >= c.safety.variance_land_s,
+        lambda c: f"{unsure_text(c.belief)}: is the positioning system gone?",
+    ),
+    land_row(
+        "battery-low",
+        BEFORE_CONTACT,
+        lambda c: c.held_s(BATTERY_LOW) >= c.safety.battery_debounce_s,
+        lambda c: f"battery at {c.telemetry.battery_v:.2f} V under load",
+    ),
+    land_row(
+        "battery-unknown",
+        BEFORE_CONTACT,
+        lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
+        "the battery's reading stands still",
+    ),
+    land_row(
+        "latency",
+        IN_THE_OPEN,
+        lambda c: c.belief.mismatch.later_s != 0.0,
+        latency_reason,
+        claims=Claim.PROFILE_SUSPECT,
+    ),
+    land_row(
+        "mounting",
+        IN_THE_OPEN,
+        is_mounting_wrong,
+        mounting_reason,
+        claims=Claim.MOUNTING_WRONG | Claim.PROFILE_SUSPECT,
+    ),
+    land_row(
+        "height-limit",
+        BEFORE_CONTACT,
+        lambda c: c.belief.height_m > c.safety.max_height_m,
+        lambda c: f"height {c.belief.height_m:.2f} m is above the limit",
+    ),
+    land_row("fence", BEFORE_CONTACT, is_outside_fence, "outside the fence"),
+    land_row(
+        "camera-gone",
+        BY_CAMERA,
+        lambda c: c.obs.camera_age_s > c.safety.camera_land_s,
+        lambda c: no_picture_reason(c.belief),
+    ),
+    land_row(
+        "loop-late",
+        FLYING_PHASES,
+        lambda c: c.obs.loop_late_s > c.safety.loop_late_land_s,
+        lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late",
+    ),
+    land_row(
+        "markers-disagree",
+        BY_CAMERA,
+        lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
+        "large and small marker contradict each other: check the printed sizes in the "
+        "profile and the camera's calibration",
+    ),
+    land_row(
+        "log-lost",
+        BEFORE_CONTACT,
+        lambda c: c.safety.land_on_log_error and c.obs.log_problem is not None,
+        lambda c: f"flight log: {c.obs.log_problem}",
+    ),
+    land_row(
+        "time-over",
+        BEFORE_CONTACT,
+        lambda c: c.t_s - c.state.started_s > c.planner.perching_time_s,
+        "the perching time is over",
+        Outcome.ATTEMPTS_USED_UP,
+    ),
+    # --- the magnet may catch early ---
+    Transition(
+        "caught", BEFORE_COMPLETION, is_held, Phase.COMPLETE, "hanging on the magnet already"
+    ),
+    land_row(
+        "held",
+        BEFORE_COMPLETION,
+        is_held_elsewhere,
+        "something holds it where the target is not",
+        claims=Claim.HELD_BY_OTHER,
+    ),
+    land_row(
+        "hangs-at-contact",
+        BEFORE_COMPLETION,
+        lambda c: c.held_s(HANGING) >= HELD_S,
+        lambda c: (
+            f"it hangs at the target's height, {newest_contact_error(c.belief).text}: "
+            f"that may be its magnet"
+        ),
+        claims=Claim.HANGS,
+    ),
+    # --- something is in the way ---
+    land_row(
+        "cannot-rise",
+        {Phase.APPROACH},
+        lambda c: is_blocked(c) or lacks_press_thrust(c),
+        lambda c: (
+            f"pressed at {c.belief.height_m:.2f} m: something is above, or the thrust is weak"
+        ),
+    ),
+    back_off_row(
+        "blocked",
+        BEFORE_COMPLETION,
+        is_blocked_off_target,
+        lambda c: (
+            f"pressed against something at {c.belief.height_m:.2f} m"
+            + ("" if c.belief.hover_thrust else ", or the thrust is weak")
+        ),
+        claims=Claim.BLOCKED,
+    ),
+    land_row(
+        "too-weak",
+        BY_CAMERA,
+        lacks_press_thrust,
+        "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
+        "something is above",
+    ),
+)
+"""In this order; your own rows come behind them, and before the phases' exits."""

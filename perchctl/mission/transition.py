@@ -1,0 +1,116 @@
+"""A row of the mission's table, and builders for the kinds of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import dataclass
+
+from perchctl.mission.context import Context
+from perchctl.mission.phase import AIRBORNE, Claim, Outcome, Phase, Severity
+from perchctl.vehicle import EmergencyStop, StopMotors
+
+Predicate = Callable[[Context], bool]
+Reason = str | Callable[[Context], str]
+NewOutcome = Outcome | Callable[[Outcome | None], Outcome | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Transition:
+    """A row of the table: from any of `phases`, if `when` returns True, to the phase `to`.
+
+    `when` gets a `Context`. `reason`, a text or a function of it, is shown to the user; `outcome`,
+    a value or a function of the outcome before, is why the flight ends; `stop` is what a transition
+    into ABORTED sends at once; `claims` is what the row claims of the vehicle.
+    """
+
+    name: str
+    phases: Set[Phase]
+    when: Predicate
+    to: Phase
+    reason: Reason
+    severity: Severity = Severity.CONTINUE
+    outcome: NewOutcome | None = None
+    stop: EmergencyStop | StopMotors | None = None
+    claims: Claim = Claim.NONE
+
+    def waits_in(self, phase: Phase) -> bool:
+        """True if the row keeps the mission in this phase instead of leaving it."""
+        return self.to is phase and self.severity is Severity.HOLD
+
+    def reason_text(self, c: Context) -> str:
+        """The reason in words."""
+        return self.reason if isinstance(self.reason, str) else self.reason(c)
+
+    def new_outcome(self, before: Outcome | None) -> Outcome | None:
+        """The flight's outcome after this transition."""
+        if self.outcome is None or isinstance(self.outcome, Outcome):
+            return self.outcome or before
+        return self.outcome(before)
+
+
+def motor_cut_row(
+    name: str, when: Predicate, reason: str, outcome: Outcome = Outcome.SAFETY
+) -> Transition:
+    """A row that cuts and locks the motors at once, in any airborne phase."""
+    return Transition(
+        name, AIRBORNE, when, Phase.ABORTED, reason, Severity.STOP, outcome, stop=EmergencyStop()
+    )
+
+
+def supervisor_row(name: str, bit: int, reason: str) -> Transition:
+    """A row that stops the motors and aborts, since the supervisor has set `bit`."""
+
+    def when(c: Context) -> bool:
+        return c.telemetry.has_bit(bit)
+
+    return Transition(
+        name,
+        AIRBORNE,
+        when,
+        Phase.ABORTED,
+        reason,
+        Severity.STOP,
+        Outcome.SAFETY,
+        stop=StopMotors(),
+    )
+
+
+def land_row(
+    name: str,
+    phases: Set[Phase],
+    when: Predicate,
+    reason: Reason,
+    outcome: Outcome = Outcome.SAFETY,
+    claims: Claim = Claim.NONE,
+) -> Transition:
+    """A row that ends the mission and begins the way down."""
+    return Transition(
+        name, phases, when, Phase.LANDING, reason, Severity.LAND, outcome, claims=claims
+    )
+
+
+def back_off_row(
+    name: str,
+    phases: Set[Phase],
+    when: Predicate,
+    reason: Reason,
+    claims: Claim = Claim.NONE,
+) -> Transition:
+    """A row that ends the attempt: descend a little and try again."""
+    return Transition(name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, claims=claims)
+
+
+def give_up_row(
+    name: str, when: Predicate, reason: Reason, claims: Claim = Claim.NONE
+) -> Transition:
+    """A row that ends a landing which could not be completed normally."""
+    return Transition(
+        name,
+        {Phase.LANDING},
+        when,
+        Phase.ABORTED,
+        reason,
+        Severity.LAND,
+        Outcome.SAFETY,
+        claims=claims,
+    )
