@@ -227,7 +227,7 @@ def truly_moved(way: Stops, from_s: float, to_s: float) -> capture.PairedMotion:
 
 
 @given(tilt_deg=st.floats(20.0, 40.0), before_s=st.floats(0.2, 5.0), after_s=st.floats(0.2, 20.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_what_is_asked_for_is_enough_however_long_it_stands(
     tilt_deg: float, before_s: float, after_s: float
 ) -> None:
@@ -242,7 +242,7 @@ def test_what_is_asked_for_is_enough_however_long_it_stands(
 
 
 @given(wobble_deg=st.floats(0.0, 5.0), stands_s=st.floats(0.2, 20.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_a_hand_that_wobbles_has_tilted_nothing(wobble_deg: float, stands_s: float) -> None:
     up, wobble, turn = (0.0, 0.0, 0.3), math.radians(wobble_deg), math.radians(90.0)
     way = Stops((
