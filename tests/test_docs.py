@@ -189,7 +189,7 @@ LONG = (
     "perchctl simulate",
     "perchctl calibrate aideck:",
     "perchctl calibrate check",
-    "perchctl calibrate images:board -b",
+    "perchctl calibrate images:",
     "perchctl fit-weights collect",
     "perchctl make-target design",
     "python docs/pictures/make.py",

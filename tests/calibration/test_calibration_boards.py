@@ -131,7 +131,7 @@ def april_grid() -> Grey:
 @pytest.mark.parametrize(
     ("picture", "named", "said"),
     [
-        (april_grid(), EVEN, "an AprilGrid"),
+        pytest.param(april_grid(), EVEN, "an AprilGrid", marks=pytest.mark.long),
         (np.full((300, 400), 120, np.uint8), EVEN, ""),
         # A part of the right board is no other board.
         (sheet(Board.parse(EVEN))[64:160, 64:160], EVEN, ""),

@@ -127,15 +127,17 @@ def test_a_good_camera_fails_nothing() -> None:
 
 @pytest.mark.parametrize(("fault", "name", "verdict", "words"), [
     ("frozen", "pictures", "fail", "stands still"),
-    ("snow", "pictures", "fail", "snow"),
-    ("dark", "pictures", "fail", "dark"),
     ("mirrored", "pictures", "fail", "mirrored"),
     ("lossy, and a wrong print", "print", "fail", "print error"),
-    ("slow", "frame rate", "fail", "6 Hz"),
-    ("out of focus", "focus", "fail", "blur sigma 3"),
     ("bare", "target", "skipped", "not in view"),
-    ("silent", "lost frames", "fail", "none for the last 0."),
-    ("out of order", "pictures", "fail", "came after newer ones"),
+    *(pytest.param(*each, marks=pytest.mark.long) for each in (
+        ("snow", "pictures", "fail", "snow"),
+        ("dark", "pictures", "fail", "dark"),
+        ("slow", "frame rate", "fail", "6 Hz"),
+        ("out of focus", "focus", "fail", "blur sigma 3"),
+        ("silent", "lost frames", "fail", "none for the last 0."),
+        ("out of order", "pictures", "fail", "came after newer ones"),
+    )),
 ])  # fmt: skip
 def test_a_fault_of_the_simulated_camera_makes_its_row(
     fault: str, name: str, verdict: str, words: str

@@ -110,7 +110,7 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
 
 
-@pytest.mark.parametrize("rest_v", [3.9, 3.95])
+@pytest.mark.parametrize("rest_v", [3.9, pytest.param(3.95, marks=pytest.mark.long)])
 def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_v: float) -> None:
     """Its bits name its motors; the battery holds 350 mAh, and low power is reported sooner."""
     cell = {"ohm": 0.143 * MAH / BRUSHLESS_MAH, "charge": BRUSHLESS_MAH / MAH}

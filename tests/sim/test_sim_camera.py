@@ -168,7 +168,9 @@ def at_once(t_s: float, turn_radps: float = 0.0) -> Picture:
     return Renderer(STILL, CAMERA, TargetConfig()).render([pose(t_s, turn_radps)])
 
 
-@pytest.mark.parametrize("fields", ["progressive", "top", "bottom"])
+@pytest.mark.parametrize(
+    "fields", ["progressive", "top", pytest.param("bottom", marks=pytest.mark.long)]
+)
 def test_each_row_of_a_rolling_shutter_shows_its_own_moment(fields: str) -> None:
     """Of a frame, and of a field."""
     readout_s = 0.02

@@ -95,7 +95,13 @@ def kinds(state: FieldState, frames: list[Frame]) -> list[Any]:
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
 @pytest.mark.parametrize(
-    "velocity_mps", [(0.2, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.05, 0.0), (0.1, 0.1, 0.2)]
+    "velocity_mps",
+    [
+        (0.2, 0.0, 0.0),
+        pytest.param((0.0, 0.15, 0.0), marks=pytest.mark.long),
+        (0.0, -0.05, 0.0),
+        pytest.param((0.1, 0.1, 0.2), marks=pytest.mark.long),
+    ],
 )
 def test_the_order_is_found_within_a_few_frames(
     first: PictureKind, velocity_mps: tuple[float, float, float]

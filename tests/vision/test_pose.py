@@ -186,7 +186,9 @@ def test_attitude_or_the_frame_before_decides_the_tilt() -> None:
     assert levelled.mean() < 0.7 * alone.mean()
 
 
-@pytest.mark.parametrize("seen", [["large"], ["large", "small"]])
+@pytest.mark.parametrize(
+    "seen", [pytest.param(["large"], marks=pytest.mark.long), ["large", "small"]]
+)
 def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
     """Mean squared error in units of the covariance: its degrees of freedom, within 20 %."""
     rng = np.random.default_rng(8)

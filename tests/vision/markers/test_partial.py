@@ -88,7 +88,9 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
     assert np.mean(np.square(squares)) < 2.0
 
 
-@pytest.mark.parametrize("share", [0.02, 0.04, 0.25, 0.4])
+@pytest.mark.parametrize(
+    "share", [0.02, *(pytest.param(share, marks=pytest.mark.long) for share in (0.04, 0.25)), 0.4]
+)
 def test_the_edge_of_the_picture_is_taken_for_no_side(share: float) -> None:
     """Alone, the large marker is measured or refused, and never made smaller than it is."""
     measured = 0
@@ -138,8 +140,10 @@ def test_a_cut_marker_is_verified_where_it_is_expected(share: float) -> None:
     assert "large" not in followed(other, near)
 
 
-@pytest.mark.parametrize("radius", [0.12, 0.2, 0.3])
-@pytest.mark.parametrize("corner", range(4))
+@pytest.mark.parametrize("radius", [0.12, pytest.param(0.2, marks=pytest.mark.long), 0.3])
+@pytest.mark.parametrize(
+    "corner", [0, *(pytest.param(corner, marks=pytest.mark.long) for corner in (1, 2)), 3]
+)
 def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) -> None:
     pose = pose_of(0.03, -0.02, 0.35, 0.7 + corner, 0.05, -0.08)
     true = corners("large", pose)

@@ -77,7 +77,9 @@ EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
 NEAR, ASIDE = pose_of(0.05, -0.05, 1.2, 0.4), pose_of(-0.45, 0.3, 1.2, 0.4)
 
 
-@pytest.mark.parametrize("lost", [0, 1, 2, 3, 7, pytest.param(40, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "lost", [0, 1, 2, *(pytest.param(lost, marks=pytest.mark.long) for lost in (3, 7, 40))]
+)
 @pytest.mark.parametrize("place", [NEAR, ASIDE])
 def test_what_comes_back_is_found_by_the_second_frame(
     build: Build, lost: int, place: tuple[np.ndarray, np.ndarray]
