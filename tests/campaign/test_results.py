@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.campaign import (
@@ -70,6 +70,7 @@ def test_a_campaign_of_three() -> None:
     }
 
 
+@settings(max_examples=20)  # each a whole campaign
 @given(RESULTS)
 def test_figures_of_any_campaign(results: list[FlightResult]) -> None:
     figures = campaign_summary(results)

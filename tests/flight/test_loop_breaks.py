@@ -20,6 +20,7 @@ from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Land, PositionSetpoint, R
 from tests.helpers.loop_rig import (
     HANG_AT_S,
     PROFILE,
+    SOON_GIVEN_UP,
     Broken,
     Camera,
     Guarded,
@@ -128,7 +129,7 @@ def test_a_failure_right_after_the_take_off_order_lands(after_s: float) -> None:
 @pytest.mark.parametrize("heard", [True, False])
 def test_after_an_error_it_is_said_whether_the_landing_was_seen(heard: bool) -> None:
     link = Guarded(lambda s: s if heard or s.t_s < 1.5 else None)
-    rig = Rig(link, watcher=breaks_at(1.5))
+    rig = Rig(link, watcher=breaks_at(1.5), profile=SOON_GIVEN_UP)
     with pytest.raises(Broken):
         rig.fly()
     assert link.own == []  # no setpoint that would take the landing back
@@ -300,7 +301,7 @@ def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
 def test_a_landing_that_nobody_saw_is_no_landing(
     changed: Callable[..., Any], words: list[str]
 ) -> None:
-    rig = Rig(Vehicle(changed))
+    rig = Rig(Vehicle(changed), profile=SOON_GIVEN_UP)
     if len(words) == 1:
         rig.operator = lambda: Operator.LAND if rig.link.now_s > 2.0 else Operator.NONE
     report = rig.fly()

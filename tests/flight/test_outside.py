@@ -23,7 +23,7 @@ from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition, PositionSetpoint
 from tests.helpers.capture import TURNS, named_up
-from tests.helpers.loop_rig import Rig, Vehicle
+from tests.helpers.loop_rig import SOON, Rig, Vehicle
 from tests.helpers.mission import MOCAP, READY, changed, telemetry
 
 REST = telemetry(1.0, 0.02, thrust=0.0, supervisor=READY)
@@ -140,6 +140,7 @@ def test_positions_that_lead_astray_are_sent_no_more() -> None:
     it, outside = rig(
         Vehicle(lambda tel: replace(tel, position_m=(tel.position_m[2], 0.0, tel.position_m[2])))
     )
+    it.profile = changed(SOON, MOCAP)
     assert "swapped axes" in it.fly().reason
     assert len(outside.stopped_s) == 1
 

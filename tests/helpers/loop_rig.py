@@ -40,13 +40,23 @@ from perchctl.vehicle import (
 )
 from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
 from tests.helpers.hangs import hang_in_the_camera
-from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, remembering, telemetry
+from tests.helpers.mission import (
+    AIRBORNE,
+    HOVER_THRUST,
+    READY,
+    changed,
+    remembering,
+    telemetry,
+)
 
 SIZE_PX = (64, 48)
 CAMERA = CameraModel(
     SIZE_PX, np.array([[40.0, 0.0, 32.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]), np.zeros(5)
 )
 PROFILE = Profile()
+SOON = {"planner.landing.timeout_s": 8.0}
+"""For a landing that this vehicle never ends: it obeys no thrust, and flies on unheard."""
+SOON_GIVEN_UP = changed(SOON, PROFILE)
 SETUP = make_pipeline(PROFILE, CAMERA)
 CLIMB_MPS, SINK_MPS = 0.5, 0.4
 

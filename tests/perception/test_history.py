@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from perchctl.mission import Outcome
 from perchctl.perception import History, add_samples
 from perchctl.vehicle import Telemetry
-from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
+from tests.helpers.loop_rig import PROFILE, SOON_GIVEN_UP, Rig, Vehicle
 from tests.helpers.mission import telemetry
 
 SAFETY = PROFILE.safety
@@ -115,7 +115,8 @@ def _steps_up(sample: Telemetry) -> Telemetry:
 def test_an_estimate_that_jumps_or_is_no_number_lands(
     until_s: float, spoil: Callable[[Telemetry], Telemetry], words: str
 ) -> None:
-    report = Rig(Vehicle(lambda s: spoil(s) if 1.5 < s.t_s < until_s else s)).fly()
+    vehicle = Vehicle(lambda s: spoil(s) if 1.5 < s.t_s < until_s else s)
+    report = Rig(vehicle, profile=SOON_GIVEN_UP).fly()
     assert report.outcome is Outcome.SAFETY
     assert words in report.reason
 
