@@ -88,7 +88,7 @@ MOST_NAMES = {
     "flight": 19,
     "link": 14,
     "record": 12,
-    "mission": 33,
+    "mission": 34,
     "perception": 5,
     "positioning": 10,
     "profile": 33,

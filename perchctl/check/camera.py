@@ -93,7 +93,7 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
         advice = _AGAIN.get(rehearsal.scheme, _RESTART)
         return [Row(first, *failed(why, advice)), *skipped_rows(rest, why)]
     rows = evaluate_rows(PICTURES, rehearsal, profile)
-    if profile.positioning.by == "target":
+    if profile.positioning.source.is_target:
         rows.append(evaluate_row(IN_VIEW, _in_view, rehearsal, profile, camera))
     return rows
 
@@ -227,7 +227,7 @@ IN_VIEW = "in view"
 
 def picture_row_names(profile: Profile) -> tuple[str, ...]:
     """The names of the rows of checks on pictures, in order."""
-    return (*PICTURES, *([IN_VIEW] if profile.positioning.by == "target" else ()))
+    return (*PICTURES, *([IN_VIEW] if profile.positioning.source.is_target else ()))
 
 
 # --- The computer that looks at the pictures ---

@@ -43,7 +43,7 @@ def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
     plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = evaluate_rows(JUDGES, plan)
     rows += [evaluate_row(name, _limits, name, profile) for name in DOUBTFUL]
-    if profile.positioning.by == "target":
+    if profile.positioning.source.is_target:
         rows.append(evaluate_row("latency", _latency, plan))
     return rows
 

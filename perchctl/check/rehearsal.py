@@ -108,7 +108,7 @@ class _TelemetryOnly:
 
 def rehearsal_telemetry(take: TakeTelemetry, profile: Profile) -> _TelemetryOnly:
     """A stand-in for the link, whose telemetry for a rehearsal is what `take` returns."""
-    by_target = profile.positioning.by == "target"
+    by_target = profile.positioning.source.is_target
     return _TelemetryOnly(take, (0.0, 0.0, profile.safety.ground_z_m) if by_target else None)
 
 

@@ -253,7 +253,7 @@ def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
 def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
     judged = profile
-    if profile.positioning.by != "deck":
+    if not profile.positioning.source.is_deck:
         if not vehicle.position_decks(profile):
             return skipped(BY_FLY)
         judged = profile.with_({"positioning.by": "deck"})  # until fly sends positions
@@ -279,7 +279,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
 
 def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t = vehicle.known_telemetry
-    if profile.positioning.by != "deck":
+    if not profile.positioning.source.is_deck:
         return skipped(BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
         return failed("the position is no number", "restart the vehicle")

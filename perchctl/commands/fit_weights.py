@@ -193,7 +193,7 @@ def _collect_with_person(
 
 def _open_capture(profile: Profile, target_body: str) -> MocapPoses:
     """Return the profile's motion capture, connected. Errors: UsageError, those of connecting."""
-    if profile.positioning.by != "mocap":
+    if not profile.positioning.source.is_mocap:
         raise UsageError(
             "--truth mocap needs a profile with its motion capture, as in "
             "positioning: {by: mocap, system: vicon, host: 192.168.1.2, body: cf}"

@@ -116,7 +116,7 @@ class FaultyFlight:
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
         self._oracle = Oracle(safety.max_height_m, safety.max_tilt_deg, radius_m)
         self._place_bound = PositionBound(scenario, profile)
-        by_target = profile.positioning.by == "target"
+        by_target = profile.positioning.source.is_target
         self._drift = UndetectedDrift(case.effects, scenario, by_target=by_target)
         self._descent_bound = DescentBound(case.effects, profile)
         self._facts = FactsRecorder(vehicle, profile, case.effects)

@@ -417,7 +417,7 @@ def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
     elif effect.func is e.camera_fault:
         if values["kind"] in NO_PICTURE and phase in BY_CAMERA:
             limit_s = safety.camera_land_s
-        if values["kind"] in NO_SIGHT and profile.positioning.by == "target":
+        if values["kind"] in NO_SIGHT and profile.positioning.source.is_target:
             limit_s = min(limit_s, profile.positioning.land_s)
     elif effect.func is e.deck_silent or values.get("how") in NO_POSITION:
         limit_s = profile.positioning.land_s

@@ -193,7 +193,7 @@ class GroundCriteria:
         has placed it since the estimator last started. A Flow deck measures the height alone.
         """
         telemetry, safety = self.telemetry, self.profile.safety
-        is_placed = self.profile.positioning.by != "deck" or {*self.decks} & {*ABSOLUTE_DECKS}
+        is_placed = not self.profile.positioning.source.is_deck or {*self.decks} & {*ABSOLUTE_DECKS}
         return (
             Variance(
                 what="velocity",
@@ -213,7 +213,7 @@ class GroundCriteria:
     def estimate_unsettled(self) -> Problem | None:
         """Problem: a variance of the state estimate is too large, unknown or old."""
         telemetry, advice = self.telemetry, "is there a positioning system?"
-        if self.profile.positioning.by == "target":
+        if self.profile.positioning.source.is_target:
             advice = "do the positions arrive, and does the target stay in view?"
         unreported = "variance" in self.profile.link.unreported
         for each in self.variances:
@@ -328,7 +328,7 @@ class GroundCriteria:
         if not samples:
             return None
         newest, advice = samples[-1], "let it stand still; if it did, check its positioning"
-        if profile.positioning.by == "deck":
+        if profile.positioning.source.is_deck:
             advice += " (light, floor, base stations)"
         window = rest_window(samples)
         lasts_s = newest.t_s - window[0].t_s
@@ -364,7 +364,7 @@ class GroundCriteria:
         """Problem: `place` is in another unit, has another axis up, or is too far from the
         expected target. If the target is the source, only the distance is checked."""
         x, y, z = place.position_m
-        if self.profile.positioning.by == "target":
+        if self.profile.positioning.source.is_target:
             return self._unreachable(place)
         if not max(abs(x), abs(y), abs(z)) < ROOM_M:
             return Problem(
@@ -428,7 +428,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
 
 def feed_name(profile: Profile) -> str:
     """Name of the source of external positions in messages."""
-    by_target = profile.positioning.by == "target"
+    by_target = profile.positioning.source.is_target
     return "the sight of the target" if by_target else "the motion capture"
 
 

@@ -91,7 +91,7 @@ class FlightInputs:
 
     def __post_init__(self) -> None:
         self.perception = Perception(self.pipeline, self.profile)
-        if self.profile.positioning.by == "target":
+        if self.profile.positioning.source.is_target:
             self.target_positioning = TargetPositioning(self.send, self.pipeline, self.profile)
 
     @property

@@ -58,9 +58,9 @@ def refuse_armed(telemetry: Telemetry | None) -> None:
 def refuse_without_positions(link: Link, profile: Profile, *, has_feed: bool) -> None:
     """Raises SafetyAbort without any position source. `has_feed`: the positions of a motion
     capture are being sent."""
-    if profile.positioning.by == "deck":
+    if profile.positioning.source.is_deck:
         abort_on(GroundCriteria.no_position_source(link.decks(), profile))
-    elif profile.positioning.by == "mocap" and not has_feed:
+    elif profile.positioning.source.is_mocap and not has_feed:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
 
@@ -121,7 +121,7 @@ def still_waiting_for(turn: GroundTurn) -> str:
     good before and is not now is waited for again. Errors: TimedOut after too long a wait,
     SafetyAbort off the ground or too near to the target."""
     profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
-    limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
+    limit_s, by_target = profile.safety.estimator_wait_s, profile.positioning.source.is_target
     if not turn.samples:
         return _bounded("telemetry", waited_s, limit_s)
     if not turn.telemetry_age_s <= profile.safety.telemetry_hold_s:
@@ -133,7 +133,7 @@ def still_waiting_for(turn: GroundTurn) -> str:
     seen = None if feed is None else feed.measured
     waiting = _first(
         {
-            "positions of the motion capture": None if by_sight else unsent,
+            "positions of the motion capture": None if by_target else unsent,
             "the state estimate to settle": criteria.estimate_unsettled,
             f"the state estimate to agree with {feed_name(profile)}": None
             if seen is None

@@ -73,14 +73,14 @@ def check_options(options: FlyOptions) -> None:
     table_of(options.profile.planner.rows)
     if not options.has_own_link:
         check_uri(options.uri)
-    elif load_extension(options.uri, "link.uri") and options.profile.positioning.by != "deck":
+    elif load_extension(options.uri, "link.uri") and not options.profile.positioning.source.is_deck:
         raise UsageError(
             f"a link of your own, as {options.uri}, sends no positions: set positioning: deck, "
             f"not {options.profile.positioning.by}"
         )
-    if options.profile.positioning.by == "mocap" and not options.simulated:
+    if options.profile.positioning.source.is_mocap and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
-    elif options.profile.positioning.by == "mocap" and find_spec("motioncapture") is None:
+    elif options.profile.positioning.source.is_mocap and find_spec("motioncapture") is None:
         raise no_motion_capture()  # the simulated room has a capture of its own
     source = parse_source(options.source)
     if source.is_own:

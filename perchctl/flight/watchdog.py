@@ -185,7 +185,7 @@ class Watchdog:
         new = [*waiting, *([] if newest is None else [newest])]
         self._history = history = add_samples(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
-        if self._profile.positioning.by == "target":  # no sight is sent without the loop
+        if self._profile.positioning.source.is_target:  # no sight is sent without the loop
             age_s = last.obs.position_age_s + now_s - last.obs.t_s
         return Observation(
             t_s=now_s,
@@ -270,7 +270,7 @@ def rescue(
             link.send(command)
             on_sent(SentCommand(clock.now(), "rescue", command))
 
-    by_target = profile.positioning.by == "target"
+    by_target = profile.positioning.source.is_target
     start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:

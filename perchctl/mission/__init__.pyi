@@ -5,6 +5,7 @@ from .descent import step_landing as step_landing
 from .observation import Mismatch as Mismatch
 from .observation import Observation as Observation
 from .observation import VisualInertialMotion as VisualInertialMotion
+from .phase import Claim as Claim
 from .phase import Operator as Operator
 from .phase import Outcome as Outcome
 from .phase import Phase as Phase
@@ -24,8 +25,8 @@ from .report import Findings as Findings
 from .report import FlightReport as FlightReport
 from .report import Rest as Rest
 from .report import Touchdown as Touchdown
+from .report import claims_of as claims_of
 from .report import find_rest as find_rest
-from .report import suspects_profile as suspects_profile
 from .rest import RestState as RestState
 from .state import PlannerState as PlannerState
 from .table import add_rows as add_rows

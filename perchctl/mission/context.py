@@ -24,44 +24,24 @@ class Context:
         t_s: time on the loop's clock.
     """
 
-    __slots__ = ("belief", "state")
-
     def __init__(self, state: PlannerState) -> None:
         self.state = state
         self.belief: Belief = state.belief
-
-    @property
-    def obs(self) -> Observation:
-        return self.belief.obs
-
-    @property
-    def profile(self) -> Profile:
-        return self.belief.profile
-
-    @property
-    def planner(self) -> PlannerConfig:
-        return self.belief.profile.planner
-
-    @property
-    def safety(self) -> SafetyConfig:
-        return self.belief.profile.safety
-
-    @property
-    def telemetry(self) -> Telemetry:
-        return self.belief.obs.telemetry
-
-    @property
-    def t_s(self) -> float:
-        return self.belief.obs.t_s
+        self.obs: Observation = self.belief.obs
+        self.profile: Profile = self.belief.profile
+        self.planner: PlannerConfig = self.profile.planner
+        self.safety: SafetyConfig = self.profile.safety
+        self.telemetry: Telemetry = self.obs.telemetry
+        self.t_s: float = self.obs.t_s
 
     @property
     def in_phase_s(self) -> float:
         """Time since the phase began."""
-        return self.belief.obs.t_s - self.state.entered_s
+        return self.t_s - self.state.entered_s
 
     def held_s(self, condition: Condition[Any]) -> float:
         """Seconds for which a condition has been true; -1 while it is false."""
         began_s = self.belief.since.get(condition)
         if began_s is None:
             began_s = self.state.since.get(condition)
-        return -1.0 if began_s is None else self.belief.obs.t_s - began_s
+        return -1.0 if began_s is None else self.t_s - began_s

@@ -35,10 +35,9 @@ TURN_GATE_DEG = 2.0
 """The same of a turn: 35 mm at 1 m, more than the cone of an ascent forgives."""
 
 
-def suspects_profile(row_name: str) -> bool:
-    """True if the row of that name, as a log holds it, claims that the profile's camera or
-    positioning may be wrong."""
-    return any(row.name == row_name and Claim.PROFILE_SUSPECT in row.claims for row in TABLE)
+def claims_of(row_name: str) -> Claim:
+    """What the row of that name, as a log holds it, claims; nothing if it is not of the table."""
+    return next((row.claims for row in TABLE if row.name == row_name), Claim.NONE)
 
 
 @dataclass(frozen=True)

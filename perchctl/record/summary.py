@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.mission import ContactError, Findings, Touchdown, suspects_profile
+from perchctl.mission import Claim, ContactError, Findings, Touchdown, claims_of
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -96,7 +96,9 @@ class FlightSummary:
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
             simulated=simulated,
-            blames_profile=any(suspects_profile(str(event.get("row"))) for event in log.events),
+            blames_profile=any(
+                Claim.PROFILE_SUSPECT in claims_of(str(event.get("row"))) for event in log.events
+            ),
         )
 
     def as_record(self) -> dict[str, Any]:

@@ -178,7 +178,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = between("first_contact_share")
     extra = {"analogue": sim.camera_analogue} if sim.camera_analogue else {}
-    if profile.positioning.by != "deck":
+    if not profile.positioning.source.is_deck:
         extra["external_position"] = 1.0  # and no deck
     return Scenario(
         seed=seed,

@@ -162,7 +162,7 @@ def make_design(
     large = target.large.side_m
     small = target.small.side_m
     # Where the target is the positioning system, it has to be seen from the ground.
-    ground = profile.positioning.by == "target"
+    ground = profile.positioning.source.is_target
     height_m = 0.0 if ground else profile.planner.search.max_height_m
     start_m = None
     if ceiling_m is not None:
