@@ -546,7 +546,7 @@ def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
             )  # fmt: skip
 
 
-@settings(max_examples=30)
+@settings(max_examples=60)
 @given(
     positioning=st.sampled_from(sorted(PROFILES)),
     phase=st.sampled_from(sorted(FLYING_PHASES, key=lambda p: p.value)) | st.just(Phase.LANDING),

@@ -26,6 +26,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import attrgetter
+from typing import Self
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.values import replace
@@ -136,39 +137,16 @@ class Impact:
     z_m: float = 0.0  # where the state estimate had the vehicle
 
 
-@dataclass(frozen=True)
-class ImuMotion:
-    """The vehicle's motion by accelerometer and attitude alone; loop times are -inf for never."""
+# --- The detectors: each a small value with a law of its own (tests/mission/test_detectors.py) ---
 
-    t_s: float = -math.inf  # of the newest sample
-    velocity_mps: Vector = ZERO  # since the first sample, world axes
-    offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
-    fell_s: float = -math.inf  # when it last fell, or came down and met the floor
-    silent_s: float = -math.inf  # end of the newest silence
-    gap_s: float = -math.inf  # of the newest that may hide a fall
-    started_s: float = -math.inf  # first heard again after it had started anew
-    sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
-    steady_s: float = math.inf  # since when the vertical speed has stayed what it is
-    steady_mps: float = 0.0
-    steady_aside_s: float = math.inf  # the same of the sideways speed
-    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # the mean of the last moment
-    light_since_s: float = math.inf
-    sink_mps: float = 0.0
-    offset_mps2: float = 0.0
-    blow_mps: float = 0.0
-    blow_s: float = -math.inf
+
+@dataclass(frozen=True)
+class FreezeDetector:
+    """How long readings have stood still. A vehicle in the air never reads the very same twice."""
+
     frozen_s: float = 0.0  # for how long the accelerometer has read the very same
     attitude_frozen_s: float = -math.inf  # the same of the attitude; -inf before a change
     place_frozen_s: float = -math.inf  # the same of position and velocity
-    hover_thrust: float = 0.0  # for each measured g in flight
-    aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes
-    pushed_s: float = -math.inf  # when something last pushed it sideways
-    misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
-    turning_radps: tuple[float, float] = (0.0, 0.0)
-    corrections: FusionAge = FusionAge()  # of the estimate beside this motion
-    last_moment: tuple[Impact, ...] = ()  # what a blow that begins now has ended
-    blow: Impact = Impact()  # the newest from below
-    off_s: float = math.inf  # since when the motors have been off; inf while they turn
 
     @property
     def attitude_age_s(self) -> float:
@@ -180,30 +158,199 @@ class ImuMotion:
         """Seconds of the same position and velocity readings while the accelerometer changed."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
+    def compare(self, last: Telemetry | None, new: Telemetry) -> Self:
+        """The detector with one more sample; the first is compared with nothing."""
+        return replace(
+            self,
+            frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
+            attitude_frozen_s=_frozen_s(self.attitude_frozen_s, last, new, _ATTITUDE),
+            place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _PLACE),
+        )
+
+
+@dataclass(frozen=True)
+class FallDetector:
+    """When the vehicle last fell, or came down and met the floor.
+
+    With the vertical acceleration a, less its slowly learned offset, and cut off at an impact's,
+
+        sink' = min(0, sink + a dt - sink dt / SINK_MEMORY_S)
+
+    is the downward speed that was gained lately. It fell if that is more than `SINK_MPS`, or if it
+    has read less than `FALL_G` for longer than a rebound does. Wrong for a sink slower than
+    `OFFSET_MEMORY_S` learns.
+    """
+
+    fell_s: float = -math.inf  # when it last fell, or came down and met the floor
+    light_since_s: float = math.inf
+    sink_mps: float = 0.0
+    offset_mps2: float = 0.0
+
+    def watch_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
+        """The detector after `dt_s` of vertical acceleration `up_mps2`, with a specific force of
+        `reads_g` along the body's z axis at its end."""
+        offset = self.offset_mps2 + (
+            max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2)) - self.offset_mps2
+        ) * min(1.0, dt_s / OFFSET_MEMORY_S)
+        felt_mps2 = max(up_mps2, IMPACT_G * GRAVITY_MPS2) - offset
+        sink = self.sink_mps + felt_mps2 * dt_s
+        sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
+        light = min(self.light_since_s, t_s) if reads_g < FALL_G else math.inf
+        fell = sink < SINK_MPS or t_s - light >= FALL_S
+        return replace(
+            self,
+            fell_s=t_s if fell else self.fell_s,
+            light_since_s=light,
+            sink_mps=sink,
+            offset_mps2=offset,
+        )
+
+
+@dataclass(frozen=True)
+class ImpactDetector:
+    """The newest blow from below, such as a touchdown's: within a moment it gains more upward speed
+    than any thrust gives. Of a blow and its bounces the hardest counts."""
+
+    blow_mps: float = 0.0
+    blow_s: float = -math.inf
+    last_moment: tuple[Impact, ...] = ()  # what a blow that begins now has ended
+    blow: Impact = Impact()  # the newest from below
+
+    def watch_impact(self, now: Impact, up_mps2: float, dt_s: float) -> Self:
+        """The detector after `dt_s` of vertical acceleration `up_mps2`; `now` is this moment, which
+        a blow may have ended."""
+        gained_mps = max(0.0, self.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
+        recent = (m for m in self.last_moment if now.t_s - m.t_s <= BEFORE_BLOW_S)
+        last_moment = (*recent, now)
+        return replace(
+            self,
+            blow_mps=gained_mps,
+            blow_s=now.t_s if gained_mps > BLOW_MPS else self.blow_s,
+            last_moment=last_moment,
+            blow=_newest_impact(self.blow, now, last_moment, gained_mps),
+        )
+
+
+def _newest_impact(
+    old: Impact, now: Impact, last_moment: tuple[Impact, ...], gained_mps: float
+) -> Impact:
+    """The newest blow, which has gained `gained_mps` by now; of its bounces the hardest counts. The
+    onboard estimate has the whole of a blow before its second sample arrives."""
+    follows = now.t_s - old.t_s <= BOUNCES_S
+    if gained_mps > BLOW_MPS:
+        begun = Impact(
+            now.t_s,
+            min(moment.estimated_mps for moment in last_moment),
+            min(moment.felt_mps for moment in last_moment),
+            max(moment.peak_g for moment in last_moment),
+            now.z_m,
+        )
+        if not follows:
+            return begun
+        return replace(
+            old,
+            peak_g=max(old.peak_g, begun.peak_g),
+            estimated_mps=min(old.estimated_mps, begun.estimated_mps),
+            felt_mps=min(old.felt_mps, begun.felt_mps),
+        )
+    return replace(old, peak_g=max(old.peak_g, now.peak_g)) if follows else old
+
+
+@dataclass(frozen=True)
+class SteadySpeed:
+    """Since when the vertical speed has stayed what it is, and the sideways speed near its mean."""
+
+    steady_s: float = math.inf  # since when the vertical speed has stayed what it is
+    steady_mps: float = 0.0
+    steady_aside_s: float = math.inf  # the same of the sideways speed
+    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # the mean of the last moment
+
+    def watch_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
+        """The detector after `dt_s`, at a velocity in world axes."""
+        x, y, z = velocity_mps
+        steady_s, steady_mps = self.steady_s, self.steady_mps
+        if abs(z - steady_mps) > STEADY_MPS:
+            steady_s, steady_mps = t_s, z
+        steady_aside_s, (mean_x, mean_y) = self.steady_aside_s, self.steady_aside_mps
+        keeps = math.exp(-dt_s / ASIDE_MEMORY_S)
+        steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
+        if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
+            steady_aside_s = t_s
+        return replace(
+            self,
+            steady_s=steady_s,
+            steady_mps=steady_mps,
+            steady_aside_s=steady_aside_s,
+            steady_aside_mps=steady_aside_mps,
+        )
+
+
+@dataclass(frozen=True)
+class PushDetector:
+    """When something last pushed the vehicle sideways: the mean specific force across its z axis is
+    more than drag in flight makes."""
+
+    aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes
+    pushed_s: float = -math.inf  # when something last pushed it sideways
+
+    def watch_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
+        """The detector after `dt_s`, with what the accelerometer reads then and read at rest."""
+        keeps = math.exp(-dt_s / PUSH_MEMORY_S)
+        x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
+        mean_x_g, mean_y_g = self.aside_g
+        aside_g = (
+            x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
+            y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
+        )
+        pushes = math.hypot(*aside_g) > PUSHED_G
+        return replace(self, aside_g=aside_g, pushed_s=new.t_s if pushes else self.pushed_s)
+
+
+# --- All of it ---
+
+
+@dataclass(frozen=True)
+class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushDetector):
+    """The vehicle's motion by accelerometer and attitude alone; loop times are -inf for never."""
+
+    t_s: float = -math.inf  # of the newest sample
+    velocity_mps: Vector = ZERO  # since the first sample, world axes
+    offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
+    silent_s: float = -math.inf  # end of the newest silence
+    gap_s: float = -math.inf  # of the newest that may hide a fall
+    started_s: float = -math.inf  # first heard again after it had started anew
+    sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
+    hover_thrust: float = 0.0  # for each measured g in flight
+    misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
+    turning_radps: tuple[float, float] = (0.0, 0.0)
+    corrections: FusionAge = FusionAge()  # of the estimate beside this motion
+    off_s: float = math.inf  # since when the motors have been off; inf while they turn
+
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
         """The motion with one more sample; `last`: the sample before it, None at the first."""
         dt_s = math.inf if last is None else new.t_s - last.t_s
         started_anew = last is not None and new.start != last.start
         motion = replace(
-            self,
+            self.compare(last, new),
             t_s=new.t_s,
             started_s=new.t_s if started_anew else self.started_s,
-            frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
-            attitude_frozen_s=_frozen_s(self.attitude_frozen_s, last, new, _ATTITUDE),
-            place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _PLACE),
             corrections=self.corrections.update(new),
             off_s=min(self.off_s, new.t_s) if new.thrust < 1 else math.inf,
         )
         if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
             return _after_silence(motion, last, new)
         motion, up_mps2 = _integrate(motion, last, new, dt_s)
-        motion = _detect_fall(motion, new, up_mps2, dt_s)
-        motion = _detect_impact(motion, new, up_mps2, dt_s)
-        motion = _detect_steady_speed(motion, dt_s)
-        motion = _detect_push(motion, new, dt_s)
-        return replace(
-            motion, sunk_m=0.0, hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s)
+        now = Impact(
+            new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g, new.position_m[2]
         )
+        motion = (
+            motion.watch_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
+            .watch_impact(now, up_mps2, dt_s)
+            .watch_speed(new.t_s, motion.velocity_mps, dt_s)
+            .watch_push(new, motion.offset_g, dt_s)
+        )
+        hover_thrust = _hover_thrust(motion.hover_thrust, new, dt_s)
+        return replace(motion, sunk_m=0.0, hover_thrust=hover_thrust)
 
     @staticmethod
     def acceleration_mps2(
@@ -260,9 +407,6 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     return abs(gained_mps) <= NO_FALL_MPS and abs(way_m) <= NO_FALL_M
 
 
-# --- One sample more: the integral, and a detector each ---
-
-
 def _integrate(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[ImuMotion, float]:
@@ -284,101 +428,6 @@ def _integrate(
         turning_radps=turning_radps,
     )
     return motion, dv[2] / dt_s
-
-
-def _detect_fall(motion: ImuMotion, new: Telemetry, up_mps2: float, dt_s: float) -> ImuMotion:
-    """It fell if it has gained a downward speed that its slowly learned offset does not explain, or
-    has read light for longer than a rebound does."""
-    offset = motion.offset_mps2 + (
-        max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2)) - motion.offset_mps2
-    ) * min(1.0, dt_s / OFFSET_MEMORY_S)
-    felt_mps2 = max(up_mps2, IMPACT_G * GRAVITY_MPS2) - offset
-    sink = motion.sink_mps + felt_mps2 * dt_s
-    sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
-    light = min(motion.light_since_s, new.t_s) if new.acc_z_g < FALL_G else math.inf
-    fell = sink < SINK_MPS or new.t_s - light >= FALL_S
-    return replace(
-        motion,
-        fell_s=new.t_s if fell else motion.fell_s,
-        light_since_s=light,
-        sink_mps=sink,
-        offset_mps2=offset,
-    )
-
-
-def _detect_impact(motion: ImuMotion, new: Telemetry, up_mps2: float, dt_s: float) -> ImuMotion:
-    """A blow from below gains more upward speed, in a moment, than any thrust gives."""
-    gained_mps = max(0.0, motion.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
-    now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
-    last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
-    return replace(
-        motion,
-        blow_mps=gained_mps,
-        blow_s=new.t_s if gained_mps > BLOW_MPS else motion.blow_s,
-        last_moment=last_moment,
-        blow=_newest_impact(motion.blow, new, last_moment, gained_mps),
-    )
-
-
-def _newest_impact(
-    old: Impact, new: Telemetry, last_moment: tuple[Impact, ...], gained_mps: float
-) -> Impact:
-    """The newest blow, which has gained `gained_mps` by now; of its bounces the hardest counts. The
-    onboard estimate has the whole of a blow before its second sample arrives."""
-    follows = new.t_s - old.t_s <= BOUNCES_S
-    if gained_mps > BLOW_MPS:
-        begun = Impact(
-            new.t_s,
-            min(moment.estimated_mps for moment in last_moment),
-            min(moment.felt_mps for moment in last_moment),
-            max(moment.peak_g for moment in last_moment),
-            new.position_m[2],
-        )
-        if not follows:
-            return begun
-        return replace(
-            old,
-            peak_g=max(old.peak_g, begun.peak_g),
-            estimated_mps=min(old.estimated_mps, begun.estimated_mps),
-            felt_mps=min(old.felt_mps, begun.felt_mps),
-        )
-    return replace(old, peak_g=max(old.peak_g, new.acc_z_g)) if follows else old
-
-
-def _detect_steady_speed(motion: ImuMotion, dt_s: float) -> ImuMotion:
-    """Since when the vertical speed has stayed what it is, and the sideways speed near its mean."""
-    x, y, z = motion.velocity_mps
-    steady_s, steady_mps = motion.steady_s, motion.steady_mps
-    if abs(z - steady_mps) > STEADY_MPS:
-        steady_s, steady_mps = motion.t_s, z
-    steady_aside_s, (mean_x, mean_y) = motion.steady_aside_s, motion.steady_aside_mps
-    keeps = math.exp(-dt_s / ASIDE_MEMORY_S)
-    steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
-    if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
-        steady_aside_s = motion.t_s
-    return replace(
-        motion,
-        steady_s=steady_s,
-        steady_mps=steady_mps,
-        steady_aside_s=steady_aside_s,
-        steady_aside_mps=steady_aside_mps,
-    )
-
-
-def _detect_push(motion: ImuMotion, new: Telemetry, dt_s: float) -> ImuMotion:
-    """Something pushes it if the mean sideways force is more than drag in flight makes."""
-    keeps = math.exp(-dt_s / PUSH_MEMORY_S)
-    x_g, y_g = new.acc_x_g - motion.offset_g[0], new.acc_y_g - motion.offset_g[1]
-    mean_x_g, mean_y_g = motion.aside_g
-    aside_g = (
-        x_g + keeps * (mean_x_g - new.acc_x_g + motion.offset_g[0]),
-        y_g + keeps * (mean_y_g - new.acc_y_g + motion.offset_g[1]),
-    )
-    return replace(
-        motion,
-        aside_g=aside_g,
-        pushed_s=new.t_s if math.hypot(*aside_g) > PUSHED_G else motion.pushed_s,
-    )
 
 
 def _tilt_by_corrections(
