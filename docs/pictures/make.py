@@ -49,7 +49,7 @@ from perchctl.display.panel import status_panel  # noqa: E402
 from perchctl.flight import KEY_HELP, STOP_HELP, FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
 from perchctl.mission import Observation, Phase, PlannerState, Tick  # noqa: E402
-from perchctl.mission.state import BatteryOutlook  # noqa: E402
+from perchctl.mission.state import BatteryOutlook, PhaseEntry  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
     BLUE,
@@ -145,8 +145,8 @@ class Flight:
         on_ground = replace(telemetry, position_m=(0.0, 0.0, first["z_m"]))
         state = replace(
             PlannerState.on_ground(Observation(t_s, on_ground), self.profile),
-            phase=Phase(r["phase"]), entered_s=t_s - (since_s - span.start_s), reason=r["reason"],
-            attempts=r["attempts"], battery=battery,
+            phase=Phase(r["phase"]), attempts=r["attempts"], battery=battery,
+            entry=PhaseEntry(t_s=t_s - (since_s - span.start_s), reason=r["reason"]),
         )  # fmt: skip
         ages = (r["late_s"], r["cam_age_s"], r["tel_age_s"])
         return Tick(t_s, telemetry, None, target, state, Idle(), *ages)

@@ -38,7 +38,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
         f"   loop late {_age(tick.loop_late_s)}"
     )
     return [
-        ("phase", f"{state.phase.value}  {tick.t_s - state.entered_s:.1f} s"),
+        ("phase", f"{state.phase.value}  {tick.t_s - state.entry.t_s:.1f} s"),
         ("error", error),
         ("markers", f"{stage}   attempts {state.attempts}"),
         ("height", f"{height_m:.2f} m   battery {_battery_text(tick)}"),

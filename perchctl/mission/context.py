@@ -37,7 +37,7 @@ class Context:
     @property
     def in_phase_s(self) -> float:
         """Time since the phase began."""
-        return self.t_s - self.state.entered_s
+        return self.t_s - self.state.entry.t_s
 
     def held_s(self, condition: Condition[Any]) -> float:
         """Seconds for which a condition has been true; -1 while it is false."""

@@ -27,7 +27,7 @@ class PhaseDefinition:
     Attributes:
         maneuver: what the vehicle is flown to do in it, as far as evidence depends on it.
         enter: the state with what the phase begins with, from the state that has just entered it
-            and the tick before the transition. `state.claims` are the transition's.
+            and the tick before the transition. `state.entry.claims` are the transition's.
         act: the phase's new state and command in each tick.
         exits: its own rows, in their order; the rows that hold in many phases stand before them.
         conditions: its own conditions, which its exits count.

@@ -135,12 +135,10 @@ def begin_landing(state: PlannerState) -> PlannerState:
     new = replace(
         state,
         phase=Phase.LANDING,
-        entered_s=b.obs.t_s,
+        entry=replace(state.entry, t_s=b.obs.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
         severity=max(state.severity, Severity.LAND),
         since={},
         belief=forget_evidence(b),
-        entry_m=tel.position_m,
-        entry_yaw_rad=tel.yaw_rad,
         pressed=state.catch_above_m is None and is_pressing(b),
         ordered_s=None,
         orders=0,
@@ -233,7 +231,7 @@ def is_landing_over(c: Context) -> bool:
     setpoint, ground_m = c.state.setpoint, c.belief.ground_m
     if setpoint is not None and ground_m is not None:
         low = setpoint.z_m <= ground_m[2] + c.planner.landing.handover_m
-        if low and Claim.UNCONFIRMED in c.state.claims:
+        if low and Claim.UNCONFIRMED in c.state.entry.claims:
             return True
     return 0.0 < c.state.descent.thrust <= LEAST_PART * c.belief.hover_thrust + 1.0
 
@@ -280,9 +278,7 @@ def _caught_again(c: Context) -> Action:
         ordered_s=None,
         orders=0,
         descent=replace(c.state.descent, thrust=0.0),
-        entered_s=c.t_s,
-        entry_m=tel.position_m,
-        entry_yaw_rad=tel.yaw_rad,
+        entry=replace(c.state.entry, t_s=c.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
     )
     c = Context(state)
     return _catch(c) or descend(c)
@@ -304,7 +300,7 @@ def _by_setpoints(c: Context) -> Action:
     if state.catch_above_m is None and state.setpoint is not None:
         start = state.setpoint
     start = replace(start, z_m=min(start.z_m, here.z_m))
-    x, y, _ = state.entry_m
+    x, y, _ = state.entry.position_m
     goal = replace(start, x_m=x, y_m=y, z_m=b.ground_z_m + 0.5 * landing.handover_m)
     setpoint = step_towards(c, start, goal, down_mps=landing.speed_mps, turns=False)
     if b.telemetry_age_s <= c.safety.telemetry_hold_s:

@@ -112,7 +112,7 @@ def descend_level(c: Context) -> Action:
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s = max(0.0, min(RISES_NO_MORE_S, c.t_s - state.t_s))
     age_s = max(1e-3, dt_s, b.attitude_age_s)
-    held = tel.t_s < state.entered_s - ON_THE_SPOT_S
+    held = tel.t_s < state.entry.t_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else b.climb_mps) + descent.under_way_mps
     hover_thrust = hover.in_descent(
         b,
@@ -184,7 +184,7 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
     if b.position_valid and b.dead_reckoned_s is None:
         return clear_contact_below(state, PEELED_M)
     reach_s = b.reach_s
-    if reach_s is not None and b.imu.fell_s > max(reach_s, state.entered_s):
+    if reach_s is not None and b.imu.fell_s > max(reach_s, state.entry.t_s):
         belief = replace(
             b,
             contact_z_m=None,
@@ -206,8 +206,8 @@ def _is_overdue(c: Context) -> bool:
     state, b = c.state, c.belief
     if b.dead_reckoned_s is None and not b.diverged:
         return False
-    way_m = max(0.0, state.entry_m[2] - b.ground_z_m)
-    began_s = max(b.dead_reckoned_s or 0.0, state.entered_s)
+    way_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
+    began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
     heard = b.attitude_age_s <= LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
     if not heard and state.descent.within == hover.UNLEARNED_WITHIN:

@@ -34,7 +34,7 @@ def _moved_with_estimate(state: PlannerState) -> PlannerState:
     if state.phase is Phase.LANDING and state.orders and b.telemetry.thrust >= 1:
         state = replace(
             state,
-            entered_s=b.obs.t_s,
+            entry=replace(state.entry, t_s=b.obs.t_s),
             orders=0,
             ordered_s=None,
             catch_above_m=CATCH_STILL_ABOVE_M,
@@ -42,6 +42,6 @@ def _moved_with_estimate(state: PlannerState) -> PlannerState:
     return replace(
         state,
         setpoint=b.sent.setpoint,
-        entry_m=b.sent.began_m,
+        entry=replace(state.entry, position_m=b.sent.began_m),
         blocked_z_m=None if blocked_z_m is None else blocked_z_m + b.shift_m[2],
     )

@@ -22,7 +22,7 @@ from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.approach import LIFT_ABOVE_M
 from perchctl.mission.setpoints import Action, fly_to, sink_setpoint
-from perchctl.mission.state import PlannerState
+from perchctl.mission.state import PhaseEntry, PlannerState
 from perchctl.mission.table import CONDITIONS, PHASES, TABLE, first_transition
 from perchctl.mission.transition import Transition
 from perchctl.profile import Profile
@@ -78,17 +78,19 @@ def _enter(c: Context, row: Transition) -> PlannerState:
         state,
         belief=forget_evidence(c.belief),
         phase=row.to,
-        entered_s=c.t_s,
-        reason=row.reason_text(c),
-        row=row.name,
-        claims=row.claims,
+        entry=PhaseEntry(
+            t_s=c.t_s,
+            position_m=c.telemetry.position_m,
+            yaw_rad=c.telemetry.yaw_rad,
+            row=row.name,
+            reason=row.reason_text(c),
+            claims=row.claims,
+            stop=row.stop,
+        ),
         severity=state.severity.escalate(row.severity),
-        stop=row.stop,
         outcome=row.new_outcome(state.outcome),
         since={},
         attempts=state.attempts + int(row.severity is Severity.BACK_OFF),
-        entry_m=c.telemetry.position_m,
-        entry_yaw_rad=c.telemetry.yaw_rad,
         waits="",
         waited_s=0.0,
         search_step_s=c.t_s,

@@ -65,7 +65,7 @@ class Event:
                 events.append(cls(obs.t_s, EventKind.NOTE, text, before.phase))
         if state.phase is not before.phase:
             entered = EventKind.PHASE, state.reason, state.phase, state.row, state.severity
-            events.append(cls(obs.t_s, *entered, claims=state.claims))
+            events.append(cls(obs.t_s, *entered, claims=state.entry.claims))
         elif state.pause and not before.pause:
             held = EventKind.HOLD, state.pause, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))

@@ -69,7 +69,7 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     """The state, and a setpoint below the vehicle until it is away from what it pressed against and
     the onboard integrators have come down; None after that, or if nothing was pressed."""
     state, tel = c.state, c.telemetry
-    x, y, z = state.entry_m
+    x, y, z = state.entry.position_m
     if not state.pressed:
         return state, None
     away_m = z - tel.position_m[2]
@@ -80,7 +80,7 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     if tel.velocity_mps[2] < PULLED_MPS:
         below_m = 0.0
     dx, dy = state.integral_m
-    setpoint = PositionSetpoint(x + dx, y + dy, tel.position_m[2] - below_m, state.entry_yaw_rad)
+    setpoint = PositionSetpoint(x + dx, y + dy, tel.position_m[2] - below_m, state.entry.yaw_rad)
     return state, limit_setpoint(c, setpoint)
 
 
@@ -97,7 +97,7 @@ def lower_thrust(c: Context) -> Action:
     setpoint = state.setpoint or hold_here(c)
     assert b.contact_z_m is not None
     slid_m = 0.0 if b.position_valid else c.telemetry.position_m[2] - b.contact_z_m
-    top = state.entry_m[2] + perch.press_m + slid_m
+    top = state.entry.position_m[2] + perch.press_m + slid_m
     low = b.contact_z_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
     sent = limit_setpoint(c, correct_setpoint(c, setpoint, lift=False))
@@ -168,9 +168,9 @@ def catch_slip(c: Context) -> Action | None:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
     if begun or (b.climb_mps < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
-        x, y = _braked_place_m(c) if b.is_displaced else state.entry_m[:2]
+        x, y = _braked_place_m(c) if b.is_displaced else state.entry.position_m[:2]
         setpoint = PositionSetpoint(
-            x, y, tel.position_m[2] + state.catch_above_m, state.entry_yaw_rad
+            x, y, tel.position_m[2] + state.catch_above_m, state.entry.yaw_rad
         )
         return replace(state, setpoint=setpoint), limit_setpoint(c, setpoint)
     return None

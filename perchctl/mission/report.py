@@ -213,5 +213,5 @@ def find_touchdown(c: Context) -> Touchdown | None:
 
 def _reason(state: PlannerState, history: tuple[Event, ...]) -> str:
     why = next((e.reason for e in reversed(history) if e.phase is Phase.LANDING), "")
-    told = why and (state.phase is not Phase.ABORTED or Claim.UNCONFIRMED in state.claims)
+    told = why and (state.phase is not Phase.ABORTED or Claim.UNCONFIRMED in state.entry.claims)
     return f"{why}; {state.reason}" if told else state.reason

@@ -41,8 +41,8 @@ def find_rest_state(c: Context) -> RestState:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
         return _by_falls(c)
-    high = state.entry_m[2] - b.ground_z_m > HIGH_M
-    came_down_m = state.entry_m[2] - b.telemetry.position_m[2]
+    high = state.entry.position_m[2] - b.ground_z_m > HIGH_M
+    came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
     stayed = high and not b.target.is_far_above and came_down_m < STAYED_M
     at_contact = b.contact_z_m is not None and not b.target.is_far_above
     if stayed or (b.height_m > LOW_M and at_contact):
@@ -54,10 +54,10 @@ def _is_held_elsewhere(c: Context) -> bool:
     b, state = c.belief, c.state
     if state.phase is not Phase.LANDING:
         return False
-    if b.position_valid and state.entry_m[2] - b.telemetry.position_m[2] >= STAYED_M:
+    if b.position_valid and state.entry.position_m[2] - b.telemetry.position_m[2] >= STAYED_M:
         return False
-    if Claim.HELD_BY_OTHER in state.claims:
-        return b.imu.fell_s <= state.entered_s
+    if Claim.HELD_BY_OTHER in state.entry.claims:
+        return b.imu.fell_s <= state.entry.t_s
     below = contact_tolerance_m(b) < b.target.error_z_m <= FAR_BELOW_M and b.contact is None
     by_position = b.position_valid and not b.by_target and b.jump_s is None and b.height_m > HIGH_M
     return below and (b.target.is_fresh or by_position)
@@ -89,6 +89,6 @@ def is_still_hanging(c: Context) -> bool:
 def hangs_with_motors_off(c: Context) -> bool:
     """True if the motors were stopped while the vehicle hung, and it still hangs."""
     stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
-    if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
+    if stopped_s is None or (landing and stopped_s >= c.state.entry.t_s and c.state.orders == 0):
         return False
     return is_still_hanging(c)

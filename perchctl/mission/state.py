@@ -37,20 +37,29 @@ class LevelDescent:
     floor_felt_s: float | None = None  # it felt the floor
 
 
+@dataclass(frozen=True, kw_only=True)
+class PhaseEntry:
+    """How the present phase was entered."""
+
+    t_s: float = 0.0
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the vehicle, as estimated
+    yaw_rad: float = 0.0
+    row: str = ""  # name of the transition, for logs and displays
+    reason: str = "start"
+    claims: Claim = Claim.NONE  # what the transition claims
+    stop: EmergencyStop | StopMotors | None = None  # what it sends at once
+
+
 @dataclass(frozen=True, eq=False)
 class PlannerState:
     """The planner's whole memory. Times are on the loop's clock."""
 
     belief: Belief
     phase: Phase = Phase.APPROACH
-    entered_s: float = 0.0  #: begin of the phase
+    entry: PhaseEntry = PhaseEntry()  #: when, where and why the phase began
     started_s: float = 0.0  #: begin of the flight
     t_s: float = 0.0  #: of the last decision
-    reason: str = "start"
-    row: str = ""  #: name of the transition into the phase, for logs and displays
-    claims: Claim = Claim.NONE  #: what that transition claims
     severity: Severity = Severity.CONTINUE
-    stop: EmergencyStop | StopMotors | None = None  #: what aborts the flight sends it
     outcome: Outcome | None = None
     since: dict[Condition[Any], float] = field(default_factory=dict)
     """The phases' own conditions that hold, and from when."""
@@ -58,8 +67,6 @@ class PlannerState:
     confirmed: int = 0  #: frames in a row that measured the target, in this phase
     searches: int = 0
     search_step_s: float = 0.0
-    entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: where the phase began
-    entry_yaw_rad: float = 0.0
     setpoint: PositionSetpoint | None = None
     integral_m: tuple[float, float] = (0.0, 0.0)
     pressed: bool = False  #: the way down begins with full thrust against something
@@ -78,6 +85,16 @@ class PlannerState:
     battery: BatteryOutlook = BatteryOutlook()
 
     @property
+    def row(self) -> str:
+        """Name of the transition into the phase, for logs and displays."""
+        return self.entry.row
+
+    @property
+    def reason(self) -> str:
+        """Why the phase was entered, in words."""
+        return self.entry.reason
+
+    @property
     def pause(self) -> str:
         """Why the mission does not go on, by a hold or by your own row; else empty."""
         return self.hold or self.waits
@@ -91,7 +108,7 @@ class PlannerState:
         """What the belief has to know of the orders until now."""
         return Sent(
             maneuver=maneuver,
-            began_m=self.entry_m,
+            began_m=self.entry.position_m,
             setpoint=self.setpoint,
             raw_thrust=self.raw_order,
             released_s=self.released_s,
@@ -105,10 +122,8 @@ class PlannerState:
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
             belief=Belief.on_ground(obs, profile),
-            entered_s=t_s,
+            entry=PhaseEntry(t_s=t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
             started_s=t_s,
             t_s=t_s,
             search_step_s=t_s,
-            entry_m=tel.position_m,
-            entry_yaw_rad=tel.yaw_rad,
         )

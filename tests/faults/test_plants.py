@@ -78,7 +78,8 @@ def says_landed(patch: Patch) -> None:
     def landed(*given: Any) -> tuple[PlannerState, Command]:
         state, command = step(*given)
         if state.phase.is_over:
-            state = replace(state, phase=Phase.LANDED, row="landed")
+            entry = replace(state.entry, row="landed")
+            state = replace(state, phase=Phase.LANDED, entry=entry)
         return state, command
 
     patch.setattr(loop, "step_mission", landed)

@@ -151,6 +151,15 @@ def note(t_s: float, text: str) -> Event:
 
 _BELIEF = {each.name for each in fields(Belief)} - {"t_s"}
 _DESCENT = {each.name for each in fields(LevelDescent)} - {"hover_thrust"}
+_ENTRY = {
+    "entered_s": "t_s",
+    "entry_m": "position_m",
+    "entry_yaw_rad": "yaw_rad",
+    "row": "row",
+    "reason": "reason",
+    "claims": "claims",
+}
+"""What a test calls it, and the field of the `PhaseEntry`."""
 
 
 def remembering(state: PlannerState, **changes: Any) -> PlannerState:
@@ -163,13 +172,19 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
         state = replace(state, belief=replace(state.belief, since=held))
     belief = {name: value for name, value in changes.items() if name in _BELIEF - {"since"}}
     descent = {name: value for name, value in changes.items() if name in _DESCENT}
-    rest = {name: changes[name] for name in changes.keys() - belief.keys() - descent.keys()}
+    entry = {_ENTRY[name]: value for name, value in changes.items() if name in _ENTRY}
+    rest = {
+        name: value
+        for name, value in changes.items()
+        if name not in belief and name not in descent and name not in _ENTRY
+    }
     if "t_s" in rest:
         belief["t_s"] = rest["t_s"]
     return replace(
         state,
         belief=replace(state.belief, **belief),
         descent=replace(state.descent, **descent),
+        entry=replace(state.entry, **entry),
         **rest,
     )
 

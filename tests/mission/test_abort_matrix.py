@@ -131,7 +131,7 @@ def _begin(phase: Phase, event: str) -> PlannerState:
 def _run(state: PlannerState, event: Event, lasts_s: float) -> tuple[PlannerState, list[object]]:
     commands: list[object] = []
     for t_s in times(lasts_s):
-        obs = event(observation(t_s, state.entry_m[2]))
+        obs = event(observation(t_s, state.entry.position_m[2]))
         state, command = planner.step_mission(state, obs, PROFILE)
         commands.append(command)
         if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row != "":
@@ -157,7 +157,7 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
         assert state.phase is Phase.LANDING
         at_ceiling = phase in (Phase.PERCH, Phase.COMPLETE)  # peeled off first, also blindly
         by_itself = name in BY_ITSELF and not at_ceiling
-        down(commands[-1], state.entry_m[2], by_itself=by_itself, level=name in LEVEL)
+        down(commands[-1], state.entry.position_m[2], by_itself=by_itself, level=name in LEVEL)
     assert state.reason
 
 
@@ -208,7 +208,7 @@ def test_an_undisturbed_phase_neither_climbs_nor_stops(phase: Phase) -> None:
     """Only search, ascent, press and take-off climb; motors stop only on proof, and nothing else
     in the table leads to a stop."""
     begin = _begin(phase, "")
-    flight = fly(begin, at(begin.entry_m[2]), 6.0)
+    flight = fly(begin, at(begin.entry.position_m[2]), 6.0)
     assert not any(isinstance(c, EmergencyStop | StopMotors) for c in flight.commands)
     climbs = {Phase.SEARCH, Phase.ASCEND, Phase.PERCH, Phase.APPROACH, Phase.COMPLETE}
     start_z = begin.setpoint.z_m if begin.setpoint else 0.0
@@ -353,6 +353,6 @@ def test_unknown_is_not_on_the_ground() -> None:
 def test_an_old_tilt_cuts_no_motor(phase: Phase) -> None:
     """A gust tilts it, and then the telemetry stays away: nothing says that it still is."""
     begin = _begin(phase, "")
-    flight = fly(begin, _heard_last(begin.entry_m[2], roll_rad=1.2), 1.6)
+    flight = fly(begin, _heard_last(begin.entry.position_m[2], roll_rad=1.2), 1.6)
     assert not any(isinstance(c, EmergencyStop | StopMotors) for c in flight.commands)
     assert flight.state.phase is not Phase.ABORTED

@@ -273,7 +273,7 @@ def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() ->
     """Though the estimate sinks, and half a second later places nothing any more."""
     state = pressed_past_the_sight()
     assert (state.phase, state.row) == (Phase.COMPLETE, "contact")
-    assert state.entered_s - BEGIN_S > HOLD_S
+    assert state.entry.t_s - BEGIN_S > HOLD_S
     assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
 
 

@@ -165,7 +165,9 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
             assert state.belief.ground_m is not None
             ground_z_m[t_s] = state.belief.ground_m[2]
             if isinstance(command, StopMotors):
-                floor = on_the_floor(seen, ground_z_m, state.entry_m[2] - state.belief.ground_m[2])
+                floor = on_the_floor(
+                    seen, ground_z_m, state.entry.position_m[2] - state.belief.ground_m[2]
+                )
                 assert floor or ((begin or state.released_s) and on_the_ceiling(seen))
                 return
             if state.phase is not Phase.LANDING:
@@ -467,7 +469,9 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
     assert new.belief.ground_m[2] - state.belief.ground_m[2] == pytest.approx(
         -0.98 if moves else 0.0
     )
-    assert not moves or new.entry_m[2] == pytest.approx(0.02)  # it has not moved: held where it is
+    assert not moves or new.entry.position_m[2] == pytest.approx(
+        0.02
+    )  # it has not moved: held where it is
 
 
 def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:

@@ -90,7 +90,8 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
 
     def says_otherwise(state: Any, obs: Any, profile: Any, table: Any) -> Any:
         new, command = step(state, obs, profile, table)
-        return replace(new, reason=new.reason.replace("hovering", "hanging")), command
+        entry = replace(new.entry, reason=new.reason.replace("hovering", "hanging"))
+        return replace(new, entry=entry), command
 
     log, old = logs("hung"), logs("perched")
     at = [turn for turn in log.turns if turn.role == "flown"]

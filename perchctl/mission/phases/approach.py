@@ -38,10 +38,10 @@ def act(c: Context) -> Action:
     planner, state, b = c.planner, c.state, c.belief
     assert b.ground_m is not None
     x, y, z = b.ground_m
-    start = state.setpoint or PositionSetpoint(x, y, z, state.entry_yaw_rad)
+    start = state.setpoint or PositionSetpoint(x, y, z, state.entry.yaw_rad)
     if planner.approach_xy_m is not None and b.height_m > APPROACH_PART * planner.takeoff_height_m:
         x, y = planner.approach_xy_m
-    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
+    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
     setpoint = step_towards(c, start, goal, up_mps=planner.takeoff_speed_mps)
     return fly_to(c, setpoint, lift=b.height_m > LIFT_ABOVE_M)
 

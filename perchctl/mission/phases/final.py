@@ -23,7 +23,7 @@ def abort(c: Context) -> Action:
     if c.state.orders:
         return c.state, Idle()
     ends = StopMotors() if motors_are_still(c) or is_landing_over(c) else Idle()
-    return replace(c.state, orders=1, ordered_s=c.t_s), c.state.stop or ends
+    return replace(c.state, orders=1, ordered_s=c.t_s), c.state.entry.stop or ends
 
 
 PERCHED = PhaseDefinition(phase=Phase.PERCHED, maneuver=Maneuver(), act=rest)

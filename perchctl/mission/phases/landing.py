@@ -22,7 +22,7 @@ LOOKED_S = 2.0
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
     """Begin the way down with what the transition claims of positions, mounting and contact."""
-    claims, b = state.claims, state.belief
+    claims, b = state.entry.claims, state.belief
     # The mounting may be right and the motion capture's axes wrong, by which the landing would
     # speed up until it tilts over.
     capture = b.profile.positioning.source.is_mocap and b.mounting.is_wrong

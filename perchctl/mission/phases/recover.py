@@ -50,7 +50,7 @@ STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
     """Begin with what was touched, and with a catch if the vehicle falls."""
-    old, b, claims = before.state, before.belief, state.claims
+    old, b, claims = before.state, before.belief, state.entry.claims
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or Claim.BLOCKED in claims
     # What the motors carry most of hardly falls.
@@ -97,9 +97,9 @@ def act(c: Context) -> Action:
         return state, away
     if state.catch_above_m is not None:
         x, y, z = c.telemetry.position_m  # from where it sinks no more
-        entry_m = (x, y, z + recover.descend_m)
-        state = replace(state, catch_above_m=None, setpoint=None, entry_m=entry_m)
-    z = state.entry_m[2] - recover.descend_m
+        entry = replace(state.entry, position_m=(x, y, z + recover.descend_m))
+        state = replace(state, catch_above_m=None, setpoint=None, entry=entry)
+    z = state.entry.position_m[2] - recover.descend_m
     setpoint = state.setpoint or hold_here(c)
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)

@@ -27,8 +27,8 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     setpoint = before.state.setpoint
     if setpoint is None:
         return state
-    entry_m = (setpoint.x_m, setpoint.y_m, setpoint.z_m)
-    return replace(state, entry_m=entry_m, entry_yaw_rad=setpoint.yaw_rad)
+    place_m = (setpoint.x_m, setpoint.y_m, setpoint.z_m)
+    return replace(state, entry=replace(state.entry, position_m=place_m, yaw_rad=setpoint.yaw_rad))
 
 
 def act(c: Context) -> Action:
@@ -40,9 +40,9 @@ def act(c: Context) -> Action:
     if c.t_s - state.search_step_s > search.wait_s:
         state = replace(state, searches=state.searches + 1, search_step_s=c.t_s)
         c = Context(state)
-    x, y, z = state.entry_m
+    x, y, z = state.entry.position_m
     if b.target.world_m is not None:
-        there = body_xy_under_target(c, state.entry_yaw_rad)
+        there = body_xy_under_target(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_unconfirmed
         x, y = _not_far(b.mounting, (x, y), there) if unconfirmed else there
         height = min(z, b.target.contact_goal_z_m - c.planner.ascend.near_m)
@@ -51,7 +51,7 @@ def act(c: Context) -> Action:
         if state.blocked_z_m is not None:
             top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
         height = min(z + search.step_m * state.searches, top)
-    yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
+    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searches
     goal = PositionSetpoint(x, y, height, yaw)
     old = state.setpoint or hold_here(c)
     return fly_to(c, step_towards(c, old, goal, up_mps=c.planner.ascend.speed_mps))
