@@ -142,11 +142,16 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
     obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
     state = PlannerState.on_ground(obs, Profile())
     turn = Turn(
-        number, "flown", t_s, t_s, TurnInputs(samples, frame=seen),
-        {name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
-        obs, command, state.phase, "seek", reason="the target is looked for",
+        number=number, role="flown", began_s=t_s, t_s=t_s,
+        taken=TurnInputs(samples, frame=seen),
+        poses={name: UnfilteredPose(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
+        observation=obs, command=command, phase=state.phase, row="seek",
+        reason="the target is looked for",
     )  # fmt: skip
-    return Tick(t_s, samples[-1], output, target, state, command, 0.0, 0.03, 0.01, turn=turn)
+    return Tick(
+        t_s=t_s, telemetry=samples[-1], output=output, target=target, state=state, command=command,
+        loop_late_s=0.0, camera_age_s=0.03, telemetry_age_s=0.01, turn=turn,
+    )  # fmt: skip
 
 
 def percentiles(values: list[float]) -> NDArray[np.float64]:

@@ -148,8 +148,10 @@ class Flight:
             phase=Phase(r["phase"]), attempts=r["attempts"], battery=battery,
             entry=PhaseEntry(t_s=t_s - (since_s - span.start_s), reason=r["reason"]),
         )  # fmt: skip
-        ages = (r["late_s"], r["cam_age_s"], r["tel_age_s"])
-        return Tick(t_s, telemetry, None, target, state, Idle(), *ages)
+        return Tick(
+            t_s=t_s, telemetry=telemetry, output=None, target=target, state=state, command=Idle(),
+            loop_late_s=r["late_s"], camera_age_s=r["cam_age_s"], telemetry_age_s=r["tel_age_s"],
+        )  # fmt: skip
 
 
 # --- the pictures ---------------------------------------------------------------------

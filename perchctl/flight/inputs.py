@@ -348,12 +348,12 @@ class TurnReporter:
         self, inputs: FlightInputs, now_s: float, feed: FeedStatus | None
     ) -> None:
         turn = Turn(
-            self._counted(),
-            "waiting",
-            now_s,
-            now_s,
-            inputs.taken,
-            inputs.poses,
+            number=self._counted(),
+            role="waiting",
+            began_s=now_s,
+            t_s=now_s,
+            taken=inputs.taken,
+            poses=inputs.poses,
             outside=external_positions(feed),
         )
         self._report(turn)
@@ -384,12 +384,12 @@ class TurnReporter:
         elif isinstance(error, Exception):  # else the planner was only interrupted
             self._open = None
             turn = Turn(
-                self._counted(),
-                "failed",
-                self._began_s,
-                obs.t_s,
-                inputs.taken,
-                inputs.poses,
+                number=self._counted(),
+                role="failed",
+                began_s=self._began_s,
+                t_s=obs.t_s,
+                taken=inputs.taken,
+                poses=inputs.poses,
                 observation=obs,
                 error=type(error).__name__,
             )

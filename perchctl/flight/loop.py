@@ -278,19 +278,19 @@ def _mission(
         turn = turns.flown_turn(inputs, obs, state, command, feed)
         newest = inputs.perception.calibration.newest
         tick = Tick(
-            obs.t_s,
-            obs.telemetry,
-            inputs.output,
-            obs.target,
-            state,
-            command,
-            obs.loop_late_s,
-            obs.camera_age_s,
-            obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
-            None if newest is logged else newest,
-            obs.delay_s,
-            turn.outside,
-            turn,
+            t_s=obs.t_s,
+            telemetry=obs.telemetry,
+            output=inputs.output,
+            target=obs.target,
+            state=state,
+            command=command,
+            loop_late_s=obs.loop_late_s,
+            camera_age_s=obs.camera_age_s,
+            telemetry_age_s=obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
+            consistency=None if newest is logged else newest,
+            delay_used_s=obs.delay_s,
+            outside=turn.outside,
+            turn=turn,
         )
         logged = newest
         watchers.tick(tick)

@@ -145,7 +145,7 @@ class UnfilteredPose:
     e_yaw_rad: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Turn:
     """One turn of the loop, whole and exact.
 
@@ -172,7 +172,7 @@ class Turn:
     error: str | None = None  # name of what the planner raised
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Tick:
     """What one flown turn knew and did, for the log and the display."""
 

@@ -38,7 +38,10 @@ def tick(
     )  # fmt: skip
     sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v)
     command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)
-    known = Tick(t_s, sample, None, seen, state, command, 0.001, 0.05, 0.012)
+    known = Tick(
+        t_s=t_s, telemetry=sample, output=None, target=seen, state=state, command=command,
+        loop_late_s=0.001, camera_age_s=0.05, telemetry_age_s=0.012,
+    )  # fmt: skip
     return replace(known, **changes)
 
 

@@ -122,7 +122,18 @@ def tick(
     **more: Any,
 ) -> Tick:
     age_s = t_s - sample.t_s
-    return Tick(t_s, sample, output, target, state, command, 0.0, 0.03, age_s, **more)
+    return Tick(
+        t_s=t_s,
+        telemetry=sample,
+        output=output,
+        target=target,
+        state=state,
+        command=command,
+        loop_late_s=0.0,
+        camera_age_s=0.03,
+        telemetry_age_s=age_s,
+        **more,
+    )
 
 
 def _command(phase: str, z_m: float) -> Command:

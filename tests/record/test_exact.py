@@ -119,14 +119,25 @@ def test_enums_as_keys_and_arrays_and_numbers_of_any_type_come_back(value: Any) 
 
 def whole_turn() -> Turn:
     sample = synthetic.telemetry(1.0, 0.3)
+    frame = FrameRecord(3, 0.9, 0.95, "woven", True, 12)
     return Turn(
-        7, "redone", 1.0, 1.3, TurnInputs((replace(sample, t_s=0.9), sample), look=False,
-        frame=FrameRecord(3, 0.9, 0.95, "woven", True, 12)),
-        {"joint": UnfilteredPose(0.9, np.ones(3), 0.1)},
-        Observation(1.3, sample, synthetic.target(1.0, 1.0)), Land(0.0, 2.0),
-        Phase.LANDING, "fence", True, 2, ExternalPositions(0.1, None, 3, 99.0, None),
-        Outcome.SAFETY, "beyond the fence", "KeyError",
-    )  # fmt: skip
+        number=7,
+        role="redone",
+        began_s=1.0,
+        t_s=1.3,
+        taken=TurnInputs((replace(sample, t_s=0.9), sample), look=False, frame=frame),
+        poses={"joint": UnfilteredPose(0.9, np.ones(3), 0.1)},
+        observation=Observation(1.3, sample, synthetic.target(1.0, 1.0)),
+        command=Land(0.0, 2.0),
+        phase=Phase.LANDING,
+        row="fence",
+        held=True,
+        attempts=2,
+        outside=ExternalPositions(0.1, None, 3, 99.0, None),
+        outcome=Outcome.SAFETY,
+        reason="beyond the fence",
+        error="KeyError",
+    )
 
 
 def test_a_turn_is_one_line_and_comes_back() -> None:
@@ -149,7 +160,10 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
 )  # fmt: skip
 def test_a_command_of_each_kind_comes_back(command: Any) -> None:
     """In a turn, and sent in the loop's place. Three kinds have no field at all."""
-    assert comes_back(Turn, Turn(0, "flown", 0.0, 0.0, TurnInputs(), command=command))
+    assert comes_back(
+        Turn,
+        Turn(number=0, role="flown", began_s=0.0, t_s=0.0, taken=TurnInputs(), command=command),
+    )
     line = sent_line(sent := SentCommand(0.1 + 0.2, "watchdog", command))
     assert bits(parse_exact(SentCommand, decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
