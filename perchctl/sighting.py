@@ -46,7 +46,10 @@ from perchctl.vision import (
     to_grey,
 )
 
-POLL_S, SILENT_S = 0.002, 2.0
+TRACK_POLL_S = 0.002
+"""Time between two looks for a new frame. Larger: each frame is read so much later."""
+FRAME_TIMEOUT_S = 2.0
+"""A live source without a frame for longer is lost. Smaller: a short pause ends the tracking."""
 INTERLACED = "interlaced: each field of a frame is measured separately"
 _NO_POSE = "no pose fits the marker's corners"
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
@@ -192,10 +195,10 @@ def _polled(source: FrameSource, camera: CameraModel) -> Iterator[Named]:
             return
         elif (problem := source.problem(now_s)) is not None:
             raise ConnectionFailed(problem)
-        elif source.live and now_s - heard_s > SILENT_S:
-            raise ConnectionFailed(f"{source.describe()}: no frame for {SILENT_S:g} s")
+        elif source.live and now_s - heard_s > FRAME_TIMEOUT_S:
+            raise ConnectionFailed(f"{source.describe()}: no frame for {FRAME_TIMEOUT_S:g} s")
         else:
-            time.sleep(POLL_S)
+            time.sleep(TRACK_POLL_S)
 
 
 def _numbered(images: Iterable[Any], rate_hz: float) -> Iterator[Named]:

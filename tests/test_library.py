@@ -158,7 +158,7 @@ class Camera:
 def test_a_live_camera_is_mirrored_closed_and_said_to_be_lost(
     by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("perchctl.sighting.SILENT_S", 0.0)
+    monkeypatch.setattr("perchctl.sighting.FRAME_TIMEOUT_S", 0.0)
     mirrored = SIM.with_({"camera.mirrored": True})
     source: Any = f"{__name__}:Camera"
     if by == "object":

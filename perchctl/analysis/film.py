@@ -27,7 +27,7 @@ BESIDE_M, ABOVE_M = 0.25, 0.12
 """The side view shows so much more than the flight needs."""
 LEAST_ASIDE_M = 0.05
 """A start nearer to the target gives the view no direction."""
-LAST_S = 2.0
+LAST_PICTURE_S = 2.0
 """The last picture stays for so long."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
 SIZE_STEP_PX = 32
@@ -57,7 +57,7 @@ def write_film(
     if not flight.log.records:
         raise InvalidValue(f"{flight.log.path}: the log holds no ticks, there is nothing to film")
     period = Fraction(max(2, round(100 / rate_hz)), 100)
-    times_s = np.arange(0.0, flight.log.end_s + LAST_S, float(period))
+    times_s = np.arange(0.0, flight.log.end_s + LAST_PICTURE_S, float(period))
     drawn = _film_pictures(flight, pictures or iter(()), times_s, width_px)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_video
     try:

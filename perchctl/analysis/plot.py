@@ -32,7 +32,13 @@ from perchctl.record import FlightLog
 
 SHADES = ("#EEF3F8", "#FFFFFF")
 TITLE_COLUMNS = 110
-LAST_S, AFTER_S, LEAST_SPAN_MM = 5.0, 0.5, 5.0
+BEFORE_LAST_SIGHT_S = 5.0
+"""Time before the last frame with the target from which on the approach is drawn. Larger: its end
+is drawn smaller."""
+AFTER_LAST_SIGHT_S = 0.5
+"""Time after that frame up to which it is drawn."""
+LEAST_SPAN_MM = 5.0
+"""Least range to each side of zero. Smaller: the noise of a still approach fills the plot."""
 Span = tuple[str, float, float]
 """A phase's name, and from when to when on the axis."""
 NAME_GAP = 0.02
@@ -176,7 +182,10 @@ def _draw_last_seconds(ax: Axes, flight: FlightAnalysis) -> tuple[float, float]:
         if frames.times_with_target_s.size
         else flight.log.end_s
     )
-    low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(flight.log.end_s, 0.1))
+    low_s, high_s = (
+        max(0.0, end_s - BEFORE_LAST_SIGHT_S),
+        min(end_s + AFTER_LAST_SIGHT_S, max(flight.log.end_s, 0.1)),
+    )
     inside = (flight.log.t_s >= low_s) & (flight.log.t_s <= high_s)
     t_s, frame_s = flight.log.t_s[inside], log.to_flight_s(log.column("frame_t_s"))
     near = (frame_s >= low_s) & (frame_s <= high_s)

@@ -226,7 +226,10 @@ def _address(kind: str, content: bytes) -> str:
 # --- What the camera saw when the mission decided: out of the recording beside the log ---
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
-WIDEST_PX, JPEG_QUALITY = 480, 80
+WIDEST_PX = 480
+"""Width to which a wider picture is reduced. Larger: a larger file."""
+REPORT_JPEG_QUALITY = 80
+"""Of 100. Larger: a larger file. Smaller: coarser pictures."""
 LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 
@@ -292,5 +295,5 @@ def _jpeg(record: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
             points = (np.array(record[key], dtype=np.float64).reshape(4, 2) + 0.5) * scale - 0.5
             fixed = np.round(points * 16).astype(np.int32)
             cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)
-    _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, REPORT_JPEG_QUALITY])
     return bytes(data)

@@ -19,11 +19,12 @@ from perchctl.errors import InvalidValue
 LIVE_S = 20.0
 """How long a live camera is watched."""
 LEAST_PICTURES = 20
-MOST_COVERED = 0.6
+MOST_GEAR_SHARE = 0.6
 _LEAST_MOTION_GREY = 8.0  # spread of a pixel that sees the room go by
-_STILL = 0.3  # of that
-_LEAST_SHARE = 5e-4  # of the picture, for a part of the gear
-_CLOSED_PX, _EDGE_PX = 7, 3  # gaps that are gear; blur around it
+_STILL_RATIO = 0.3  # of that
+_LEAST_BLOB_SHARE = 5e-4  # of the picture, for a part of the gear
+_CLOSED_PX = 7  # gaps up to this wide are gear; larger covers pixels between two parts
+_DILATION_PX = 3  # blur around the gear; larger covers more of the picture than it does
 
 
 def learn_gear_mask(
@@ -57,9 +58,9 @@ def learn_gear_mask(
         )
     spread = np.sqrt(np.maximum(squares / count - (total / count) ** 2, 0.0))
     motion = float(np.percentile(spread, 75.0))
-    covered = _connected(spread < _STILL * motion)
+    covered = _connected(spread < _STILL_RATIO * motion)
     share = float(covered.mean())
-    if motion < _LEAST_MOTION_GREY or share > MOST_COVERED:
+    if motion < _LEAST_MOTION_GREY or share > MOST_GEAR_SHARE:
         raise InvalidValue(
             "the pictures hardly change: turn the vehicle about in front of something with strong "
             "patterns all over the picture, not a plain wall"
@@ -81,7 +82,7 @@ def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:
     edge = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
     kept = np.zeros(n, np.uint8)
     kept[np.unique(edge)] = 1
-    kept[stats[:, cv2.CC_STAT_AREA] < _LEAST_SHARE * still.size] = 0
+    kept[stats[:, cv2.CC_STAT_AREA] < _LEAST_BLOB_SHARE * still.size] = 0
     kept[0] = 0
-    wide = np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8)
+    wide = np.ones((2 * _DILATION_PX + 1, 2 * _DILATION_PX + 1), np.uint8)
     return np.asarray(cv2.dilate(kept[label], wide) > 0)

@@ -10,7 +10,7 @@ from perchctl.errors import TimedOut
 from perchctl.geometry import Array
 from perchctl.vision import Frame
 
-POLL_S = 0.005
+CALIBRATION_POLL_S = 0.005
 GONE_AFTER_S = 3.0
 
 
@@ -55,4 +55,4 @@ def poll_frames(
             raise TimedOut(problem)
         yield now_s, frame
         if frame is None:
-            sleep(POLL_S)
+            sleep(CALIBRATION_POLL_S)

@@ -172,10 +172,10 @@ def _header_of(data: bytes, came_s: float) -> _Picture | None:
 # Pixels look through colour filters, two by two, whose pattern is in raw and grey JPEG pictures.
 
 
-LEAST_SHARE = 0.04
+LEAST_MOSAIC_SHARE = 0.04
 """By which the filters' mean greys differ, over their mean: a grey sensor's by less than 1 %, a
 mosaic's by 20 % and more."""
-LEAST_LEVELS = 1.5
+LEAST_MOSAIC_LEVELS = 1.5
 PICTURES_IN_A_ROW = 3
 _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)
 
@@ -183,7 +183,7 @@ _KERNEL = np.array([0.25, 0.5, 0.25], np.float32)
 def has_mosaic(image: NDArray[np.uint8]) -> bool:
     """True if the mean brightness differs between the four pixels of a 2x2 colour mosaic."""
     means = [float(image[row::2, column::2].mean()) for row in (0, 1) for column in (0, 1)]
-    return max(means) - min(means) > max(LEAST_SHARE * sum(means) / 4.0, LEAST_LEVELS)
+    return max(means) - min(means) > max(LEAST_MOSAIC_SHARE * sum(means) / 4.0, LEAST_MOSAIC_LEVELS)
 
 
 def remove_mosaic(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 
 LOST_AFTER_FAILURES = 25
-RETRY_S = 0.04
+READ_RETRY_S = 0.04
 REOPEN_EVERY_S = 1.0
 """Between two attempts to open a camera that was lost: an attempt takes a driver some 0.1 s."""
 
@@ -66,7 +66,7 @@ class DeviceSource(LiveSource):
     unreached_advice = ""
     reconnect_wait_s = REOPEN_EVERY_S
     max_failures = math.inf
-    retry_s = RETRY_S
+    retry_s = READ_RETRY_S
 
     def __init__(
         self, name: str, latency_s: float, clock: Clock, opener: Callable[[], Any]

@@ -130,7 +130,7 @@ class MjpegSource(LiveSource):
 
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
-WINDOW_S = 10.0
+DELAY_WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
 """By which a camera's clock may run slow before its pictures look older than they are."""
 
@@ -170,7 +170,7 @@ class TransferDelay:
         while self._ways and self._ways[-1][1] >= way_s:
             self._ways.pop()  # a window's minimum: none of these will be it any more
         self._ways.append((arrival_s, way_s))
-        while self._ways[0][0] < arrival_s - WINDOW_S:
+        while self._ways[0][0] < arrival_s - DELAY_WINDOW_S:
             self._ways.popleft()
         return way_s - self._ways[0][1]
 

@@ -55,7 +55,7 @@ Clock = Callable[[], float]
 SILENT_AFTER_S = 1.0
 """A live source without a new frame for so long counts as gone."""
 CLOSE_WITHIN_S = 3.0
-_POLL_S = 0.002
+_FRAME_POLL_S = 0.002
 _SILENT = "connected, but it sends nothing"
 
 
@@ -347,7 +347,7 @@ class GuardedSource:
         end_s = time.monotonic() + timeout_s
         while self.live and (frame := self.poll(self._clock())) is None:
             if self._failure is None and time.monotonic() <= end_s:
-                time.sleep(_POLL_S)
+                time.sleep(_FRAME_POLL_S)
                 continue
             self.close()
             if self._failure is not None:

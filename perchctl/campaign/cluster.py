@@ -31,7 +31,7 @@ from perchctl.profile import Profile
 
 R = TypeVar("R")
 
-ANSWER_S = 10.0
+SCHEDULER_TIMEOUT_S = 10.0
 """The scheduler must answer within this time."""
 WORKERS_S = 20.0
 """The first worker must register within this time."""
@@ -144,7 +144,7 @@ def _connected(address: str) -> Client:
     problem: PerchError
     try:
         with defer_interrupts():
-            return Client(address, set_as_default=False, timeout=ANSWER_S)
+            return Client(address, set_as_default=False, timeout=SCHEDULER_TIMEOUT_S)
     except ValueError as error:
         problem = UsageError(
             f"--cluster {address} must be the address of a dask scheduler, as in "
@@ -152,7 +152,7 @@ def _connected(address: str) -> Client:
         )
     except Exception as error:
         problem = ConnectionFailed(
-            f"no dask scheduler answers at {address} within {ANSWER_S:.0f} s "
+            f"no dask scheduler answers at {address} within {SCHEDULER_TIMEOUT_S:.0f} s "
             f"({type(error).__name__}): start dask scheduler there, or mend the address"
         )
     gc.collect()  # a client that did not connect is closed as long as its loop runs

@@ -79,7 +79,7 @@ None where nothing is proven:
 """
 FEWEST_PAIRS = 20
 """Fewer pairs get no interval, since only the mean of many is nearly normal."""
-_SAME = 1e-9
+_ROUNDING_RATIO = 1e-9
 """Values whose relative difference is below this differ by rounding only."""
 NOT_PROVEN = "no difference proven"
 FIGURES = {
@@ -145,7 +145,7 @@ def _difference(key: str, pairs: Sequence[Pair], level: float) -> dict[str, Any]
 
 def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
     """Return Student's confidence interval (low, high) of the mean at `level`."""
-    if np.ptp(values) <= _SAME * np.max(np.abs(values)):
+    if np.ptp(values) <= _ROUNDING_RATIO * np.max(np.abs(values)):
         return float(values[0]), float(values[0])
     found = ttest_1samp(values, 0.0).confidence_interval(level)
     return float(found.low), float(found.high)

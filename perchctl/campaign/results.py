@@ -16,7 +16,7 @@ from perchctl.sim import Scenario
 FlightEnd = Literal["perched", "refused", "landed", "aborted"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
 """The better before the worse."""
-WORST = 5
+WORST_FLIGHTS = 5
 """The number of bad flights that the table names."""
 
 
@@ -78,7 +78,7 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
     """A campaign's figures, ready for JSON.
 
     `rates` are shares with intervals. `miss_m`: median, p95 (interpolated) and max over perched
-    flights, None without any. `worst_seeds` names at most `WORST` bad flights.
+    flights, None without any. `worst_seeds` names at most `WORST_FLIGHTS` bad flights.
     """
     ends: dict[str, int] = {end: sum(r.outcome == end for r in results) for end in ENDS}
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
@@ -89,7 +89,7 @@ def campaign_summary(results: Sequence[FlightResult]) -> dict[str, Any]:
         "locked": sum(r.locked for r in results),
         "fell": sum(r.fell for r in results),
         "miss_m": miss_percentiles(misses) | {"max": round(max(misses), 6) if misses else None},
-        "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
+        "worst_seeds": [r.seed for r in worst_first(results)[:WORST_FLIGHTS]],
     }
 
 
@@ -125,7 +125,7 @@ def campaign_table(results: Sequence[FlightResult]) -> str:
         lines += ["", f"worst flights of {len(bad)}"]
         lines += align_columns(
             [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
-            + [_cells(r) for r in bad[:WORST]]
+            + [_cells(r) for r in bad[:WORST_FLIGHTS]]
         )
     return "\n".join(lines)
 

@@ -48,7 +48,7 @@ from perchctl.vehicle import Telemetry
 
 CAPTURE_S = 3.0
 """In less a body that wanders off at 0.05 m/s does not show."""
-POLL_S = 0.005
+CAPTURE_POLL_S = 0.005
 NOISE_FAIL = 4.0
 """Times `positioning.position_sigma_m`: so much more than the vehicle takes it for."""
 WILD_M = 0.1
@@ -91,7 +91,7 @@ def collect_samples(
         frame = source.poll(now_s)
         if frame is not None:
             frames.append(frame)
-        wait(POLL_S)
+        wait(CAPTURE_POLL_S)
     return CaptureSamples(tuple(telemetry), tuple(frames), source.problem(clock()))
 
 
@@ -182,16 +182,26 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
 HOW_TO_TURN = (
     "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and aside, put it back"
 )
-EVERY_S = 0.1
+POSE_PAIR_PERIOD_S = 0.1
 LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
 """Turns between two moments: smaller ones are noise, larger ones have no certain axis."""
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
-STILL_RAD, STILL_M = math.radians(4.0), 0.03
+BODY_STILL_RAD = math.radians(4.0)
+"""Turn up to which the capture's body stands still. Larger: a body that moves counts as still."""
+BODY_STILL_M = 0.03
+"""The same for its way."""
 MANY_SHARE = 0.9
 """All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`."""
-UPRIGHT_DEG, BODY_WARN_DEG, BODY_FAIL_DEG = 25.0, 5.0, 15.0
-LIFTED_M = 0.12
-REACH_M = 5.0
+WORLD_TILT_DEG = 25.0
+"""Angle between the capture's z and the vertical from which on its world is wrong. Larger: a tilted
+world passes."""
+BODY_WARN_DEG = 5.0
+"""Angle between the axes of rigid body and vehicle from which on there is a warning."""
+BODY_FAIL_DEG = 15.0
+"""The same for a failure. Larger: a body that is defined turned passes with a warning."""
+LEAST_RISE_M = 0.12
+"""Way from which on a lift shows where up is. Larger: a short lift tells nothing."""
+HAND_REACH_M = 5.0
 """A hand lifts no farther: what moved farther is given in another unit."""
 STRANGER = 0.4
 """Share of a turn, on the average, that A and B leave unexplained for another body."""
@@ -241,15 +251,15 @@ class FrameAlignment:
 def pair_motion(
     telemetry: Sequence[Telemetry], capture_poses: Sequence[VehiclePose]
 ) -> PairedMotion | None:
-    """Pair poses of the motion capture, `EVERY_S` apart, with the vehicle's attitudes at their
-    times; None for fewer than three pairs."""
+    """Pair poses of the motion capture, `POSE_PAIR_PERIOD_S` apart, with the vehicle's attitudes at
+    their times; None for fewer than three pairs."""
     if len(telemetry) < 2:
         return None
     history = History(tuple(telemetry))
     own, seen, place_m, last_s = [], [], [], -math.inf
     for placed in capture_poses:
         inside = telemetry[0].t_s <= placed.t_s <= telemetry[-1].t_s
-        if not inside or placed.t_s < last_s + EVERY_S:
+        if not inside or placed.t_s < last_s + POSE_PAIR_PERIOD_S:
             continue
         attitude = attitude_at(history, placed.t_s)
         if attitude is None:
@@ -316,9 +326,9 @@ def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -
         if way_m > MOVED_M or seen_rad > MOVED_RAD:
             return failed(f"the {body} moves, and the vehicle stands still", others)
         return skipped("it was not moved", HOW_TO_TURN)
-    if seen_rad <= STILL_RAD and way_m <= STILL_M:
+    if seen_rad <= BODY_STILL_RAD and way_m <= BODY_STILL_M:
         return failed(f"the vehicle moves, and the {body} stands still", others)
-    if way_m > REACH_M:
+    if way_m > HAND_REACH_M:
         found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
         return failed(found, "set the unit of the capture's stream to metres")
     turns = solve_alignment(motion)
@@ -336,7 +346,7 @@ def _risen_m(turns: FrameAlignment, motion: PairedMotion) -> Array:
     or, where that is too near for a lift, to the farthest of all."""
     displacements_m = motion.displacements_m
     risen_m = displacements_m[int(np.argmax(np.abs(displacements_m @ turns.vertical)))]
-    if float(np.linalg.norm(risen_m)) < LIFTED_M:
+    if float(np.linalg.norm(risen_m)) < LEAST_RISE_M:
         risen_m = displacements_m[int(np.argmax(np.linalg.norm(displacements_m, axis=1)))]
     return np.asarray(risen_m)
 
@@ -345,7 +355,7 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
     """Return what is wrong with the capture's world: tilted, its axes swapped, or mirrored. Its
     places may be in other axes than its attitudes."""
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(turns.vertical[2])))))
-    if off_deg > UPRIGHT_DEG:
+    if off_deg > WORLD_TILT_DEG:
         found, axis = (
             f"the capture's world is tilted by {off_deg:.0f} deg",
             nearest_axis(turns.vertical),
@@ -356,7 +366,7 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
         return failed(found, advice)
     risen_m = _risen_m(turns, motion)
     way_m = float(np.linalg.norm(risen_m))
-    if way_m < LIFTED_M or nearest_axis(risen_m / way_m) == "z":
+    if way_m < LEAST_RISE_M or nearest_axis(risen_m / way_m) == "z":
         return None
     x, y, z = risen_m
     return failed(
@@ -380,7 +390,7 @@ def _body_finding(
         )
     found = f"turns as the vehicle does, within {off_deg:.0f} deg"
     risen_m = float(_risen_m(turns, motion) @ turns.vertical)
-    if risen_m < LIFTED_M:
+    if risen_m < LEAST_RISE_M:
         return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
     return passed(f"{found}; rose by {risen_m:.2f} m")
 

@@ -333,7 +333,14 @@ VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
 LIFTED = "lifted"
 LIFT_S = 20.0
 HOW_TO_LIFT = "lift it by 30 cm, hold it level, put it back"
-LIFTED_M, FOLLOWED_M, BACK_M = 0.15, 0.08, 0.10
+LIFT_CHECK_M = 0.15
+"""Rise of the estimate from which on a lift is judged. Larger: a short lift is skipped."""
+FOLLOWED_M = 0.08
+"""Rise below which the estimate has not followed. Larger: a short lift counts as a positioning that
+does not see it. Smaller: an estimate that drifts counts as one that follows."""
+BACK_M = 0.10
+"""Difference of the last height from the first beyond which the position may drift. Larger: a drift
+passes."""
 MOVED_G = 0.05
 """A hand that lifts shows in the accelerometer; its noise at rest is a tenth of it."""
 
@@ -360,7 +367,7 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
     if rise_m < FOLLOWED_M:
         advice = "the positioning does not see it: light, floor, base stations"
         return failed(f"it moved, and the position {found}", advice)
-    if rise_m < LIFTED_M:
+    if rise_m < LIFT_CHECK_M:
         return skipped(f"{found}: not enough to tell", HOW_TO_LIFT)
     if abs(back_m) > BACK_M:
         return warned(found, "was it put back where it was? else the position drifts")

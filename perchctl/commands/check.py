@@ -32,7 +32,7 @@ from perchctl.errors import (
     SafetyAbort,
 )
 
-WIDTH = 80
+CHECK_COLUMNS = 80
 NAME_WIDTH = 17
 SHOWN = {Verdict.PASS: "pass", Verdict.WARN: "warn", Verdict.FAIL: "FAIL", Verdict.SKIPPED: "skip"}
 EXIT_CODE_OF = {"address": ConnectionFailed.exit_code, "camera": NotFound.exit_code}
@@ -141,7 +141,7 @@ def _lines(row: Row) -> list[str]:
 
 def _wrapped(text: str, first: str, others: str) -> list[str]:
     return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
+        text, CHECK_COLUMNS, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
     )
 
 

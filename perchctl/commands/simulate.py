@@ -43,7 +43,7 @@ from perchctl.errors import (
 )
 from perchctl.profile import Profile, load_profile
 
-AGAIN_S = 0.5
+CAMPAIGN_SAME_PRESS_S = 0.5
 """A second Ctrl-C counts from here on; presses closer together are one."""
 _NO_DIFFERENCE = ("name", "description", "date")
 
@@ -355,14 +355,14 @@ def stop_handler(
     clock: Callable[[], float] = time.monotonic, exit_process: Callable[[int], object] = os._exit
 ) -> Callable[[int, FrameType | None], None]:
     """Return a signal handler: the first signal raises KeyboardInterrupt; a signal at least
-    `AGAIN_S` later exits at once."""
+    `CAMPAIGN_SAME_PRESS_S` later exits at once."""
     first_s: list[float] = []
 
     def press(_number: int, _frame: FrameType | None) -> None:
         if not first_s:
             first_s.append(clock())
             raise KeyboardInterrupt
-        if clock() - first_s[0] >= AGAIN_S:
+        if clock() - first_s[0] >= CAMPAIGN_SAME_PRESS_S:
             exit_process(Interrupted.exit_code)
 
     return press

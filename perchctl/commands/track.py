@@ -45,7 +45,7 @@ from perchctl.errors import ConnectionFailed, Interrupted, NotFound
 from perchctl.geometry import Array, rot_z, yaw_of
 from perchctl.places import is_shipped_example
 from perchctl.profile import find_calibration, load_profile
-from perchctl.sighting import POLL_S, Tracker
+from perchctl.sighting import TRACK_POLL_S, Tracker
 from perchctl.vision import (
     MARKERS,
     Frame,
@@ -162,7 +162,7 @@ def poll_until_stopped(
         if problem is not None and not is_silent:
             say(f"{problem}; waiting for it (Ctrl-C ends)")
             is_silent = True
-        stop.requested.wait(POLL_S)
+        stop.requested.wait(TRACK_POLL_S)
 
 
 # --- Results ---

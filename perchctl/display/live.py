@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput, project
 
-JPEG_QUALITY = 80
-WAIT_S = 0.5
+LIVE_JPEG_QUALITY = 80
+LIVE_WAIT_S = 0.5
 READS_S, LAST_READ_S = 2.5, 1.0
 """A reader that asked so recently is given so long at the end to read the last state."""
 _PICTURE_STALE_S = 1.0
@@ -142,14 +142,14 @@ class LivePage:
         """Wait for a picture newer than `number`; return its number and JPEG, or None on a
         timeout."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number, WAIT_S)
+            self._changed.wait_for(lambda: self.closed or self._number > number, LIVE_WAIT_S)
             newest, sketch = self._number, self._sketch
             if sketch is None or newest <= number:
                 return None
         with self._drawing:  # once, for all readers
             if self._jpeg is None or self._jpeg[0] < newest:
                 picture = draw_sketch(sketch, self.camera)
-                quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+                quality = [cv2.IMWRITE_JPEG_QUALITY, LIVE_JPEG_QUALITY]
                 ok, jpeg = cv2.imencode(".jpg", picture, quality)
                 if not ok:
                     return None
@@ -354,7 +354,7 @@ _OTHER = (255, 255, 255)
 _SUBPIXEL_BITS = 4
 AXES_OF_SIDE = 0.5
 """Length of the drawn axes, in sides of the large marker."""
-_FAR_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
+_DRAWABLE_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,6 +408,6 @@ def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
 def _draw_line(
     picture: NDArray[np.uint8], points_px: Array, colour: tuple[int, int, int], width: int
 ) -> None:
-    if np.abs(points_px).max() < _FAR_PX:  # and so no number is missing
+    if np.abs(points_px).max() < _DRAWABLE_PX:  # and so no number is missing
         fixed = np.rint(points_px * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         cv2.polylines(picture, [fixed], False, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)

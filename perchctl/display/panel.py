@@ -94,10 +94,10 @@ def event_text(event: Event) -> str:
 # still (Ctrl-S, a stalled ssh) reaches the loop.
 
 
-PERIOD_S = 0.1
-CLOSE_TIMEOUT_S = 1.0
+PANEL_PERIOD_S = 0.1
+PANEL_CLOSE_TIMEOUT_S = 1.0
 EVENTS_KEPT = 1000
-WIDTH = 78
+PANEL_COLUMNS = 78
 """Of 80: a terminal echoes ^C behind the panel, which must not wrap."""
 
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
@@ -136,7 +136,7 @@ class FlightPanel:
         is_new = self._tick is None or self._tick.state.phase is not tick.state.phase
         self._tick = tick
         if is_new or tick.t_s >= self._next_s:
-            self._next_s = tick.t_s + PERIOD_S
+            self._next_s = tick.t_s + PANEL_PERIOD_S
             self._wake.set()
 
     def event(self, event: Event) -> None:
@@ -150,7 +150,7 @@ class FlightPanel:
         """Print what is pending and release the terminal; waits at most a second."""
         self._closing.set()
         self._wake.set()
-        self._thread.join(CLOSE_TIMEOUT_S)
+        self._thread.join(PANEL_CLOSE_TIMEOUT_S)
 
     def _draw(self) -> None:
         try:
@@ -159,7 +159,7 @@ class FlightPanel:
                     self._wake.wait()
                     self._wake.clear()
                     self._draw_once()
-                    self._closing.wait(PERIOD_S)  # in lockstep the loop's time runs faster
+                    self._closing.wait(PANEL_PERIOD_S)  # in lockstep the loop's time runs faster
                 self._draw_once()
         except Exception as error:
             self.failure = f"the display fell silent: {error.__class__.__name__}: {error}"
@@ -191,7 +191,7 @@ def _new_live(stream: TextIO) -> Live:
 
 
 def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
-    """The status panel of a tick: at most `WIDTH` columns and eight lines, nine with
+    """The status panel of a tick: at most `PANEL_COLUMNS` columns and eight lines, nine with
     external positions. `below` and `above` are sentences in its frame."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
@@ -206,5 +206,5 @@ def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
         subtitle=Text(below) if below else None,
         title_align="left",
         subtitle_align="left",
-        width=WIDTH,
+        width=PANEL_COLUMNS,
     )

@@ -20,9 +20,11 @@ from perchctl.mission import Phase
 from perchctl.sim import Neighbour, Scenario
 
 P = Phase
-STREAM = 510
-LONGEST_S, EVER_SHARE = 30.0, 0.25
-"""A loss lasts for 0.1 s to `LONGEST_S`, and a part of them for ever."""
+FAULT_STREAM = 510
+LONGEST_LOSS_S = 30.0
+"""A loss lasts for 0.1 s to this. Larger: fewer are short enough to be waited out."""
+EVER_SHARE = 0.25
+"""Share of the losses that last for ever. Larger: fewer end in flight."""
 
 
 # --- Draws ---
@@ -56,10 +58,10 @@ def draw_bool(source: DrawInputs, probability: float) -> bool:
 
 
 def duration_s(low: float = 0.1) -> Draw:
-    """Draw a duration log-uniformly from `low` to `LONGEST_S`; one in four lasts for ever."""
+    """Draw a duration log-uniformly from `low` to `LONGEST_LOSS_S`; one in four lasts for ever."""
 
     def draw(source: DrawInputs) -> float:
-        for_s: float = log_uniform(low, LONGEST_S)(source)
+        for_s: float = log_uniform(low, LONGEST_LOSS_S)(source)
         return e.FOR_EVER if draw_bool(source, EVER_SHARE) else for_s
 
     return draw
@@ -547,7 +549,7 @@ def select_faults(names: str) -> tuple[Fault, ...]:
 
 def draw_case(seed: int, scenario: Scenario, faults: Sequence[Fault] = FAULTS) -> Case:
     """The case of a seed, with one of `faults`; equal arguments give equal cases."""
-    rng = np.random.default_rng([seed, STREAM])
+    rng = np.random.default_rng([seed, FAULT_STREAM])
     fault = faults[int(rng.integers(len(faults)))]
     phase = fault.phases[int(rng.integers(len(fault.phases)))]
     return draw_fault_case(fault, phase, rng, scenario)

@@ -93,7 +93,7 @@ class FaultyRadio(Radio):
 
 
 SNOW_STREAM = 512
-SNOW_SIGMA = 60.0
+INJECTED_SNOW_SIGMA = 60.0
 DARK_GAIN = 0.06
 SHEET_SIGMA = 6.0
 """The camera's own noise."""
@@ -151,7 +151,7 @@ class FaultyCamera(WrappedSource):
             case "frozen":
                 image = (self._last or frame).image
             case "snow":
-                image = self._noise(frame.image, 120.0, SNOW_SIGMA)
+                image = self._noise(frame.image, 120.0, INJECTED_SNOW_SIGMA)
             case "covered":  # by a sheet of the ceiling's grey, under the target
                 image = self._noise(frame.image, float(frame.image.mean()), SHEET_SIGMA)
             case "dark":
@@ -194,7 +194,7 @@ class FaultyCamera(WrappedSource):
 # --- The program: simulated time passes while its loop does not run ---
 
 
-LONGEST_S = 60.0
+USER_PATIENCE_S = 60.0
 """The user kills a hung program after this time."""
 
 
@@ -254,8 +254,8 @@ class FaultyClock:
 
     def hang(self, for_s: float) -> None:
         """Let `for_s` pass while the loop's thread is stuck; the link's threads run on."""
-        self._link.advance_to(self._link.now_s + min(for_s, LONGEST_S))
-        if for_s > LONGEST_S:
+        self._link.advance_to(self._link.now_s + min(for_s, USER_PATIENCE_S))
+        if for_s > USER_PATIENCE_S:
             self.kill()
 
 

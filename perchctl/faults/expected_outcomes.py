@@ -14,8 +14,10 @@ from perchctl.faults.oracle import Flag
 from perchctl.faults.truth import Facts
 
 CATCHABLE_M = 1.0  # lower, a slip reaches the floor (docs/firmware.md, "Catching a slip")
-NOTICED_S, DOWN_MPS = 1.5, 0.4
-"""How long a low battery takes to be believed, and how fast a landing goes at best."""
+NOTICED_S = 1.5
+"""Time that a low battery takes to be believed. Larger: a landing that begins late is excused."""
+FASTEST_LANDING_MPS = 0.4
+"""Speed of a landing at best. Smaller: a landing that takes long is excused."""
 PUSHED_OFF_S = 0.2
 """A blow of 0.04 s has torn it off by then, or not at all."""
 
@@ -67,7 +69,7 @@ def _too_weak(facts: Facts) -> float | None:
 def _sagged_too_fast(facts: Facts) -> float | None:
     if facts.weak_s is None or not facts.has_effect(battery_sags):
         return None
-    down_s = NOTICED_S + facts.battery_low_m / DOWN_MPS
+    down_s = NOTICED_S + facts.battery_low_m / FASTEST_LANDING_MPS
     in_time = facts.battery_low_s is not None and facts.weak_s - facts.battery_low_s >= down_s
     return None if in_time else facts.weak_s
 

@@ -53,7 +53,10 @@ from perchctl.record import LogWatcher, to_exact_json
 from perchctl.sim import Scenario, draw_capture
 from perchctl.vision import make_pipeline
 
-AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
+AFTER_PROGRAM_END_S = 6.0
+"""Time that the vehicle is watched after the program's end. Smaller: what falls later is missed."""
+AFTER_IN_THE_AIR_S = 10.0
+"""The same for a vehicle that is still in the air then, from the program's end."""
 LONGEST_FLIGHT_S = 240.0
 END_OF = {
     Phase.PERCHED: "perched",
@@ -137,7 +140,7 @@ class FaultyFlight:
         self._vehicle.camera = None
         end_s = self._link.now_s
         self._oracle.note_program_end(end_s, crashed=self._crashed, endless=self._clock.endless)
-        self._vehicle.advance_to(end_s + AFTER_S)
+        self._vehicle.advance_to(end_s + AFTER_PROGRAM_END_S)
         if self._oracle.is_airborne:
             self._vehicle.advance_to(end_s + AFTER_IN_THE_AIR_S)
         return self._result(end, reason, report, end_s)

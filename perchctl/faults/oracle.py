@@ -31,15 +31,23 @@ FLAGS: dict[Flag, str] = {
 }
 """What can go wrong, the gravest first, and what it means."""
 
-LOW_M = 0.1
+LEAST_FALL_HEIGHT_M = 0.1
 """Below this height nothing counts as a fall."""
 OFF_S = 0.1
-FREE_FALL_G, FREE_FALL_S = 0.2, 0.15
+WEIGHTLESS_G = 0.2
+"""Specific force below which a vehicle falls freely. Larger: a descent with little thrust counts as
+a fall."""
+WEIGHTLESS_S = 0.15
+"""Time that this must last. Larger: short falls are missed."""
 TOUCHDOWN_MPS, TOUCHDOWN_ASIDE_MPS = 0.8, 0.5
 UNPOWERED_G = 0.5
 FAST_MPS = 0.45
 """A sink rate faster than any order: a fall, until it is slower again."""
-CAUGHT_MPS, SLOW_AGAIN_S = 0.05, 0.3
+FALL_CAUGHT_MPS = 0.05
+"""Sink rate below which a fall is over at once."""
+SLOW_AGAIN_S = 0.3
+"""Time below `FAST_MPS` after which it is over, too. Larger: the drop goes on in the descent that
+follows."""
 FROM_HANGING_S = 1.0
 PRESSED_S, RELEASED_S = 4.0, 0.2
 """A vehicle that bounces off the ceiling for less than `RELEASED_S` still presses."""
@@ -56,9 +64,12 @@ SEEN_S = 6.0
 """A vehicle at rest whose telemetry arrived for this long must have been seen."""
 STOP_S = 0.5
 """The motors must be off this long after the order to cut them."""
-AGAIN_S, KEY_HELD_S, REPEAT_WITHIN_S = 0.3, 1.0, 0.23
-"""A second press counts from the first time on, unless another follows within the third, as a key
-repeats; a key that repeats is one press until the second (docs/safety.md)."""
+SECOND_PRESS_S = 0.3
+"""A second press counts from this long after the first (docs/safety.md)."""
+KEY_HELD_S = 1.0
+"""A key that repeats is one press until this long after the first."""
+REPEAT_WITHIN_S = 0.23
+"""A second press does not count if another follows within this time, as a key repeats."""
 
 
 class Sample(NamedTuple):
@@ -103,7 +114,7 @@ def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
         if after_s >= KEY_HELD_S:
             return press_s
         alone = not later_s or later_s[0] - press_s > REPEAT_WITHIN_S
-        if number == 1 and after_s >= AGAIN_S and alone:
+        if number == 1 and after_s >= SECOND_PRESS_S and alone:
             return press_s + REPEAT_WITHIN_S
         if number >= 2 and not _are_repeats(presses_s[: number + 1]):
             return press_s
@@ -157,7 +168,7 @@ class Oracle:
         self._tilted_up_z = math.cos(math.radians(max_tilt_deg))
         self._tilt_up_z = math.cos(math.radians(max_tilt_deg - TILT_WITHIN_DEG))
         self._hung: Sample | None = None  # last sample that hung
-        self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(FREE_FALL_S)
+        self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(WEIGHTLESS_S)
         self._press_s = -math.inf  # newest sample that pressed
         self._pressed = _Lasting(PRESSED_S)
         self._calm_height_m = 0.0  # where it last did not sink fast
@@ -227,7 +238,7 @@ class Oracle:
     def _watch_unpowered(self, s: Sample) -> None:
         free = _airborne(s) and not s.hanging and not self._from_hanging(s)
         unpowered = self._unpowered.update(free and not s.motors_on, s.t_s)
-        weightless = self._weightless.update(free and s.acc_g < FREE_FALL_G, s.t_s)
+        weightless = self._weightless.update(free and s.acc_g < WEIGHTLESS_G, s.t_s)
         if unpowered or weightless:
             self._raise("fell", s.t_s)
 
@@ -250,7 +261,7 @@ class Oracle:
         if unpowered and (too_deep or s.on_floor):
             self._raise("fell", s.t_s)
         slow_again = fall.slow.update(sinking < FAST_MPS, s.t_s)
-        caught = sinking < CAUGHT_MPS or slow_again
+        caught = sinking < FALL_CAUGHT_MPS or slow_again
         if s.on_floor or caught:
             self._fall = None
             self._calm_height_m = s.height_m
@@ -335,7 +346,7 @@ class Oracle:
 
 
 def _airborne(s: Sample) -> bool:
-    return not s.on_floor and s.height_m > LOW_M
+    return not s.on_floor and s.height_m > LEAST_FALL_HEIGHT_M
 
 
 # --- What the program says at its end, as claims that are true or false of a vehicle ---

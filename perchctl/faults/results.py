@@ -72,7 +72,7 @@ class FaultResult(CampaignFlight):
 # --- A campaign's figures ---
 
 
-WORST = 20
+WORST_CASES = 20
 SHARES = {
     "wrong": "with a flag that counts",
     "not_known": "perchctl says: it hangs or stands",
@@ -95,7 +95,7 @@ def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
         "unavoidable": sum(r.is_excused for r in results),
         "expected_outcomes": dict(Counter(name for r in results for name in r.expected)),
         **{name: rate_record(count, len(results)) for name, count in _counts(results).items()},
-        "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
+        "worst_seeds": [r.seed for r in worst_first(results)[:WORST_CASES]],
     }
 
 
@@ -136,7 +136,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     for each in EXPECTED_OUTCOMES:
         if count := figures["expected_outcomes"].get(each.name):
             lines.append(f"{count:>8}  {_explained(each.name, each.reason)}")
-    worst = worst_first(results)[:WORST]
+    worst = worst_first(results)[:WORST_CASES]
     if worst:
         lines += ["", "worst flights"]
         lines += align_columns([("seed", "fault", "phase", "what", "end"), *map(_line, worst)])

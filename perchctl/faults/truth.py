@@ -24,9 +24,9 @@ from perchctl.sim import (
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
 
-FULL_THRUST = 60000.0
+MAX_RAW_THRUST = 60000.0
 """The largest raw thrust order (docs/firmware.md, "Raw thrust")."""
-PRESSING_RATIO = 1.02
+PRESSING_WEIGHT_RATIO = 1.02
 """Rotors that lift more than this part of the weight press against whatever is in the way."""
 
 
@@ -63,7 +63,7 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
     motors_on = max(firmware.motors) > 0.0
     lift_n = sum(world.powertrain.forces_n)
     pushing = motors_on and (
-        firmware.controller.thrust >= FULL_THRUST or lift_n >= PRESSING_RATIO * weight_n
+        firmware.controller.thrust >= MAX_RAW_THRUST or lift_n >= PRESSING_WEIGHT_RATIO * weight_n
     )
     supervisor = firmware.supervisor
     fx, fy, fz = world.fx_mps2, world.fy_mps2, world.fz_mps2
@@ -237,9 +237,9 @@ REACTION_S = 1.0
 """From the profile's limit to the way down, at most: a turn's delay, thrust that goes down."""
 WATCHED_S, SUNK_M = 2.0, 0.15
 """After so much more time it has come down by this, at less than a third of a landing's speed."""
-SINKING_MPS = 0.1
+COMING_DOWN_MPS = 0.1
 """Or it sinks like that."""
-LOW_M = 0.3
+HANDED_OVER_M = 0.3
 """Where a landing hands over, and slows down."""
 
 
@@ -391,7 +391,9 @@ class DescentBound:
         if self._from_m is None:
             self._from_m = height_m
         late = t_s >= self._due_s + REACTION_S + WATCHED_S
-        comes_down = vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
+        comes_down = vz_mps < -COMING_DOWN_MPS or height_m <= max(
+            HANDED_OVER_M, self._from_m - SUNK_M
+        )
         begins = lands and height_m <= self._from_m + SUNK_M
         return late and not (comes_down or begins)
 

@@ -13,7 +13,7 @@ from perchctl.children import SharedTime
 
 SIM_PATIENCE_S = 5.0
 """Wait for a stopped simulator, on the wall's clock: longer than it waits for the loop."""
-_POLL_S = 0.001
+_CLOCK_POLL_S = 0.001
 
 
 class Clock(Protocol):
@@ -75,7 +75,7 @@ class SimulatedClock:
         if self._waits:
             self._shared.limit_s = t_s - self.zero_s + self._shared.MARGIN_S
         while (left_s := t_s - self.now()) > 0:
-            self._sleep(max(left_s, _POLL_S))
+            self._sleep(max(left_s, _CLOCK_POLL_S))
 
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:

@@ -46,7 +46,7 @@ READING_AGE_S = 1.0  # battery and variances come ten times a second
 REST_ACC_G = 0.15  # at rest the accelerometer reads 1 g, give or take so much
 WITHIN_REACH_M = 0.35  # of the gear: a take-off needs more height, so no target is so near
 ROOM_M = 50.0  # no capture is larger: what is farther off is in another unit
-UPRIGHT_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
+UP_AXIS_AGREE_DEG = 20.0  # between attitude and capture: a rigid body's attitude is defined by eye
 WANDERED_M = 0.1  # far beyond a capture's noise
 REST_S = 1.9
 """For so long the state estimate must have stood still before a take-off: the loop keeps no more. A
@@ -57,7 +57,11 @@ Lighthouse deck, 0.03 m by pictures, 0.035 m by ranging anchors."""
 STANDING_MPS = 0.1
 """The mean of its velocity in that time, at most. By the target alone it is 0.076 m/s on a slope of
 9 deg, since the accelerometer leads it."""
-AGREE_M, AGREE_DEG = 0.1, 15.0  # estimate and capture, once positions and heading are fused
+ESTIMATE_AGREE_M = 0.1
+"""Most that estimate and capture may be apart, once positions are fused. Larger: positions that
+another vehicle gets are taken for this one's."""
+ESTIMATE_AGREE_DEG = 15.0
+"""The same for the heading. Larger: another rigid body is taken for the vehicle's."""
 
 _FORBIDDEN = (
     (LOCKED, "is locked", "inspect it and restart it"),
@@ -413,7 +417,7 @@ def up_axis_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem | 
     R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
     up = rotation_from_quaternion(place.quaternion) @ R_own.T[:, 2]
     off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
-    if off_deg <= UPRIGHT_DEG:
+    if off_deg <= UP_AXIS_AGREE_DEG:
         return None
     axis = nearest_axis(up)
     found = f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its attitude"
@@ -469,7 +473,7 @@ def estimate_problem(place: ExternalPosition, telemetry: Telemetry) -> Problem |
     if place.quaternion is not None:
         yaw_rad = yaw_of(rotation_from_quaternion(place.quaternion))
         turned_deg = abs(math.degrees(wrap_rad(telemetry.yaw_rad - yaw_rad)))
-    if away_m <= AGREE_M and turned_deg <= AGREE_DEG:
+    if away_m <= ESTIMATE_AGREE_M and turned_deg <= ESTIMATE_AGREE_DEG:
         return None
     return Problem(
         f"they are {away_m:.2f} m and {turned_deg:.0f} deg of heading apart",

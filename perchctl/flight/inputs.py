@@ -256,7 +256,7 @@ class FlightInputs:
         if kind != "ok" and self._note is None:
             return VERDICT_TEXTS[kind]
         age_s = now_s - frame.t_s
-        if live and not age_s >= -AHEAD_S:
+        if live and not age_s >= -PICTURE_AHEAD_S:
             return f"the picture's time, {frame.t_s:.3f} s, is not past"
         is_late = live and age_s > self.profile.safety.max_frame_age_s
         return f"the picture is {age_s:.1f} s late" if is_late else None
@@ -268,13 +268,17 @@ class FlightInputs:
 # does not: what falls while it gets the position of a hanging vehicle would look as if it hung.
 
 
-CARRIED_FOR_S = 0.1
-CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06  # turning motors scatter 1 g by 0.04, the mean by 0.013
-SINKING_MPS = -0.15  # more than a bias makes while the place is sent
-FROZEN_S = 0.06
+SUPPORTED_FOR_S = 0.1
+SUPPORTED_SAMPLE_G = 0.25
+"""Most that a sample of a supported vehicle differs from 1 g. Turning motors scatter it by 0.04 g.
+Smaller: their vibration counts as a fall. Larger: the beginning of a fall counts as support."""
+SUPPORTED_MEAN_G = 0.06
+"""The same for the mean of `SUPPORTED_FOR_S`, which turning motors scatter by 0.013 g."""
+SUPPORTED_SINK_MPS = -0.15  # more than a bias makes while the place is sent
+FROZEN_ATTITUDE_S = 0.06
 """An attitude frozen for longer is not the exposure's, and 0.1 rad displaces a vehicle 1.2 m under
 the target by 12 cm."""
-AHEAD_S = 0.1
+PICTURE_AHEAD_S = 0.1
 """A picture may be so much ahead of the loop's clock; else its time is of another clock."""
 
 
@@ -299,7 +303,7 @@ class TargetPositioning:
 
     def add_pose(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
         """Send the position that `pose` gives, if any, unless the vehicle is in contact."""
-        if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
+        if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_ATTITUDE_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
         if then is not None and now is not None:
@@ -315,14 +319,15 @@ class TargetPositioning:
 
 
 def is_supported(history: History, now_s: float) -> bool:
-    """True if fresh samples show that something has carried the weight for `CARRIED_FOR_S`."""
+    """True if fresh samples show that something has carried the weight for `SUPPORTED_FOR_S`."""
     newest = history.newest
-    if newest is None or now_s - newest.t_s + newest.behind_s > CARRIED_FOR_S:
+    if newest is None or now_s - newest.t_s + newest.behind_s > SUPPORTED_FOR_S:
         return False
-    lately = [s for s in history.samples if newest.t_s - s.t_s <= CARRIED_FOR_S]
+    lately = [s for s in history.samples if newest.t_s - s.t_s <= SUPPORTED_FOR_S]
     mean_g = sum(s.acc_z_g for s in lately) / len(lately)
-    return abs(mean_g - 1.0) <= CARRIED_MEAN_G and all(
-        abs(s.acc_z_g - 1.0) <= CARRIED_G and s.velocity_mps[2] > SINKING_MPS for s in lately
+    return abs(mean_g - 1.0) <= SUPPORTED_MEAN_G and all(
+        abs(s.acc_z_g - 1.0) <= SUPPORTED_SAMPLE_G and s.velocity_mps[2] > SUPPORTED_SINK_MPS
+        for s in lately
     )
 
 

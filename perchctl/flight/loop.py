@@ -52,7 +52,7 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle
 from perchctl.vision import Pipeline
 
-HUNG_S = 0.25
+TURN_HANG_S = 0.25
 """A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
 
 
@@ -235,7 +235,7 @@ def _mission(
             drops_sightings=drops_sightings,
         )
         drops_sightings = False
-        if clock.now() - began_s > HUNG_S:  # a setpoint for the time before the hang is stale
+        if clock.now() - began_s > TURN_HANG_S:  # a setpoint for the time before the hang is stale
             now_s = clock.now()
             inputs.catch_up(began_s, now_s)
         late_s = max(0.0, now_s - due_s)
@@ -246,7 +246,7 @@ def _mission(
         new, command = step_mission(before, obs, parts.profile, parts.table)
         turns.note_decision(obs, new, command, feed)
         overruled = new.phase.is_flying and watchdog.overruled_s > late_s
-        if not redone and (overruled or clock.now() - now_s > HUNG_S):
+        if not redone and (overruled or clock.now() - now_s > TURN_HANG_S):
             redone = True  # nothing that was decided before a hang is sent after it
             turns.report_discarded_turn(inputs, obs, new, command)
             continue

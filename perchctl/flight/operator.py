@@ -3,20 +3,20 @@
 Ctrl-C reaches the program as one signal a press, whether a finger presses it again or the keyboard
 repeats a key that is held down. Which of the two it is has to be told from the times alone:
 
-======================================================  ==========================================
-presses                                                 order
-======================================================  ==========================================
-one                                                     land
-two, less than `AGAIN_S` apart                          land
-two, `AGAIN_S` to `LONGEST_DELAY_S` apart, no third     land, and stop `WAIT_S` after the second:
-                                                        it was no key's first repeat
-a second one later than that                            stop at once
-three within a second, not spaced as a key repeats      stop at once
-spaced as a key repeats                                 land for a second after the first; the
-                                                        first press after that stops
-spaced as a key repeats, and let go within that second  land if no hand presses like that
-                                                        (`_is_surely_key`), else stop
-======================================================  ==========================================
+========================================================  ==========================================
+presses                                                   order
+========================================================  ==========================================
+one                                                       land
+two, less than `SAME_PRESS_S` apart                       land
+two, `SAME_PRESS_S` to `LONGEST_DELAY_S` apart, no third  land, and stop `KEY_REPEAT_WAIT_S` after
+                                                          the second: it was no key's first repeat
+a second one later than that                              stop at once
+three within a second, not spaced as a key repeats        stop at once
+spaced as a key repeats                                   land for a second after the first; the
+                                                          first press after that stops
+spaced as a key repeats, and let go within that second    land if no hand presses like that
+                                                          (`_is_surely_key`), else stop
+========================================================  ==========================================
 
 A held key waits 0.25 to 1 s and then repeats 5 to 33 times a second, evenly (terminals on Linux:
 after 250 to 660 ms, every 30 to 92 ms). A hand hammers 3 to 10 times a second, unevenly, and its
@@ -47,7 +47,7 @@ STOP_HELP = "Press Ctrl-C to land. Press it again to cut the motors."
 KEY_HELP = "The space bar cuts the motors at once."
 """Every help, panel, page and document describes the operator's stop in these words."""
 
-AGAIN_S = 0.3
+SAME_PRESS_S = 0.3
 """Two presses less than this apart are one: larger misses a hurried second press."""
 LONGEST_DELAY_S = 1.0
 """No keyboard waits longer before it repeats a key. Until then the second press may be its first
@@ -56,9 +56,9 @@ SHORTEST_DELAY_S = 0.25
 """A keyboard waits at least this long before it repeats; smaller takes more hands for keys."""
 SLOWEST_REPEAT_S = 0.2
 """The longest time between two repeats of a key; larger delays the stop by a second press."""
-JITTER_S = 0.02
+KEY_JITTER_S = 0.02
 """A repeat may be read so much late on a busy computer; larger takes more hands for keys."""
-WAIT_S = SLOWEST_REPEAT_S + JITTER_S + 0.01
+KEY_REPEAT_WAIT_S = SLOWEST_REPEAT_S + KEY_JITTER_S + 0.01
 """A key that is still held has repeated again by then."""
 FASTER_THAN_A_HAND_S = 0.08
 """Repeats faster than this, on average, are a key's; larger takes more hands for keys."""
@@ -68,7 +68,7 @@ LONGER_THAN_REPEATS = 1.2
 """The least ratio of a key's delay to the mean of its repeats; a hand's gaps are alike."""
 SURE_REPEATS, SURELY_LONGER = 4, 2.0
 """So many even repeats after a gap so much longer are a key's, also if a hand could be as fast."""
-HUNG_S = 10.0
+STOP_HANG_S = 10.0
 """A stopped flight that has not ended by then hangs."""
 _EPS_S = 1e-9
 
@@ -81,8 +81,8 @@ class OperatorSwitch:
     end: it lands however often it comes, and never stops the motors. `cut` is for the panel's key
     and Cut motors on the page: it stops them at once. All methods may be called from any thread.
 
-    Until the flight loop listens there is nothing to land, and `HUNG_S` after a stop nothing is
-    left to do: then `interrupt` raises `Interrupted`.
+    Until the flight loop listens there is nothing to land, and `STOP_HANG_S` after a stop nothing
+    is left to do: then `interrupt` raises `Interrupted`.
     """
 
     listening: bool = False
@@ -125,7 +125,7 @@ class OperatorSwitch:
         thread."""
         if not self.listening:
             raise Interrupted("interrupted before take-off: nothing was started")
-        if not self.closing and self.clock() - self._stopped_s >= HUNG_S:
+        if not self.closing and self.clock() - self._stopped_s >= STOP_HANG_S:
             raise Interrupted("the stopped flight hung")
 
     def _decide(self, now_s: float) -> None:
@@ -140,11 +140,11 @@ def _is_stop(presses_s: Sequence[float], now_s: float) -> bool:
     first_s, last_s = presses_s[0], presses_s[-1]
     if last_s - first_s >= LONGEST_DELAY_S - _EPS_S:
         return True
-    if len(presses_s) == 2 and last_s - first_s < AGAIN_S - _EPS_S:
+    if len(presses_s) == 2 and last_s - first_s < SAME_PRESS_S - _EPS_S:
         return False
     if not _may_be_key(presses_s):
         return True
-    return now_s - last_s >= WAIT_S - _EPS_S and not _is_surely_key(presses_s)
+    return now_s - last_s >= KEY_REPEAT_WAIT_S - _EPS_S and not _is_surely_key(presses_s)
 
 
 def _may_be_key(presses_s: Sequence[float]) -> bool:
@@ -152,10 +152,10 @@ def _may_be_key(presses_s: Sequence[float]) -> bool:
     delay_s, repeats_s = presses_s[1] - presses_s[0], presses_s[1:]
     mean_s = _mean_gap_s(repeats_s)
     if len(repeats_s) > 1 and mean_s <= FASTER_THAN_A_HAND_S:
-        return delay_s >= SHORTEST_FAST_DELAY_S - JITTER_S
+        return delay_s >= SHORTEST_FAST_DELAY_S - KEY_JITTER_S
     return (
-        delay_s >= SHORTEST_DELAY_S - JITTER_S - _EPS_S
-        and mean_s <= SLOWEST_REPEAT_S + JITTER_S + _EPS_S
+        delay_s >= SHORTEST_DELAY_S - KEY_JITTER_S - _EPS_S
+        and mean_s <= SLOWEST_REPEAT_S + KEY_JITTER_S + _EPS_S
         and delay_s >= LONGER_THAN_REPEATS * mean_s
         and _are_even(repeats_s)
     )
@@ -176,15 +176,16 @@ def _mean_gap_s(times_s: Sequence[float]) -> float:
 
 
 def _are_even(times_s: Sequence[float]) -> bool:
-    """True if a period exists whose multiples these times follow, each up to `JITTER_S` late:
-    for each pair of them, ``k`` periods apart, it is their distance ``+- JITTER_S`` over ``k``."""
+    """True if a period exists whose multiples these times follow, each up to `KEY_JITTER_S` late:
+    for each pair of them, ``k`` periods apart, it is their distance ``+- KEY_JITTER_S`` over
+    ``k``."""
     pairs = [
         (later_s - earlier_s, k)
         for i, earlier_s in enumerate(times_s)
         for k, later_s in enumerate(times_s[i + 1 :], 1)
     ]
-    least_s = max(((d - JITTER_S) / k for d, k in pairs), default=0.0)
-    most_s = min(((d + JITTER_S) / k for d, k in pairs), default=0.0)
+    least_s = max(((d - KEY_JITTER_S) / k for d, k in pairs), default=0.0)
+    most_s = min(((d + KEY_JITTER_S) / k for d, k in pairs), default=0.0)
     return least_s <= most_s + _EPS_S
 
 

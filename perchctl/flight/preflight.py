@@ -201,7 +201,7 @@ ARMS_WITHIN_S = 5.0
 """From the first request until the supervisor allows flight: the firmware gives up on motors that
 do not start after 2 s. A longer time keeps propellers turning on a vehicle that does not fly."""
 REQUEST_PERIOD_S = 0.25
-PAUSE_S = 0.5
+ARMING_PAUSE_S = 0.5
 """So long something else may be waited for once the vehicle is to be armed, such as a late packet.
 A longer time keeps propellers turning on a vehicle that is picked up, or of which nothing is known;
 a shorter one ends a flight for a moment's disturbance."""
@@ -228,12 +228,12 @@ class Arming:
     def note_waiting(self, waiting: str, began_s: float, now_s: float) -> None:
         """Note what else a turn, begun at `began_s` and now over, has waited for; empty if nothing.
 
-        Raises SafetyAbort if that has lasted for longer than `PAUSE_S` since the vehicle was to be
-        armed. A turn that hangs counts: nothing was seen in it.
+        Raises SafetyAbort if that has lasted for longer than `ARMING_PAUSE_S` since the vehicle was
+        to be armed. A turn that hangs counts: nothing was seen in it.
         """
         if not waiting:
             self._ready_s = began_s
-        elif self.has_begun and now_s - self._ready_s > PAUSE_S:
+        elif self.has_begun and now_s - self._ready_s > ARMING_PAUSE_S:
             raise SafetyAbort(
                 f"after arming, waited {now_s - self._ready_s:.1f} s for {waiting}: disarming, not "
                 f"flying"

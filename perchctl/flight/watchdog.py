@@ -49,8 +49,8 @@ from perchctl.vehicle import (
 REPEAT_AFTER_S = 0.3  # the vehicle levels out by itself at 0.5 s
 STOP_AFTER_S = 0.1  # for so long the operator's stop is left to the loop, which records it
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
-SINKING_MPS = -0.1
-STILL_MPS = 0.06
+RESCUE_SINK_MPS = -0.1
+RESCUE_STILL_MPS = 0.06
 LOOK_S = 0.5  # a rescue leaves a vehicle whose motors have been seen off for so long
 
 
@@ -208,10 +208,10 @@ class Watchdog:
         known = newest if has_fresh_position(newest, now_s) else None
         if self._held is None and known is not None:
             match last.command:
-                case RawThrust(thrust) if abs(known.velocity_mps[2]) < STILL_MPS:
+                case RawThrust(thrust) if abs(known.velocity_mps[2]) < RESCUE_STILL_MPS:
                     return RawThrust(thrust)  # the press, which a change of mode would end
                 case PositionSetpoint(z_m=z_m):
-                    if z_m > known.position_m[2] and known.velocity_mps[2] < SINKING_MPS:
+                    if z_m > known.position_m[2] and known.velocity_mps[2] < RESCUE_SINK_MPS:
                         return last.command
         if not isinstance(last.command, (PositionSetpoint, RawThrust)):
             return None

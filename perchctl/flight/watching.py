@@ -18,7 +18,7 @@ from perchctl.mission import Event, SentCommand, Tick, Turn, Watcher
 
 T = TypeVar("T")
 
-SLOW_S = 0.25
+SLOW_WATCHER_S = 0.25
 """A call that takes longer is reported: meanwhile the watchdog steers."""
 
 
@@ -122,7 +122,7 @@ class Watchers:
                 raise
             self._detach(watcher, error)
         took_s = self._now() - began_s
-        if took_s > SLOW_S and (name := watcher_name(watcher)) not in self._slow:
+        if took_s > SLOW_WATCHER_S and (name := watcher_name(watcher)) not in self._slow:
             self._slow.add(name)
             self._report(f"{name} took {took_s:.1f} s: the flight was not steered meanwhile")
 

@@ -37,7 +37,7 @@ from perchctl.link.protocol import (
     check_uri,
     ignore_sent,
 )
-from perchctl.link.sender import HANGS_S, Sender
+from perchctl.link.sender import LIBRARY_HANG_S, Sender
 from perchctl.link.telemetry import LogBlocks
 from perchctl.mission import SentCommand
 from perchctl.positioning import PositionFeed
@@ -235,8 +235,8 @@ class CflibLink:
             sender.repeat_order(self._lost_since_s - UNHEARD_S)
             self._lost_since_s = None
         if hangs:
-            connection.reopen(f"cflib has held a packet for more than {HANGS_S:g} s")
-        elif stuck_s > HANGS_S and connection.is_dead():
+            connection.reopen(f"cflib has held a packet for more than {LIBRARY_HANG_S:g} s")
+        elif stuck_s > LIBRARY_HANG_S and connection.is_dead():
             connection.reopen(f"the radio has taken nothing for {stuck_s:.1f} s, nor lost anything")
 
     def _may_hear_more(self) -> bool:

@@ -20,7 +20,7 @@ from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_folder
 
 CONNECT_TRIES = 2
-CLOSE_TIMEOUT_S = 3.0
+LINK_CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
 """Lost packets in a row after which cflib gives a radio up: about 200 s, cflib's own 100 are 0.2 s.
 Waiting is the better way back: one that has given up agrees upon safelink anew."""
@@ -163,7 +163,7 @@ class Connection:
 
     def _open_again(self) -> None:
         if self._closer is not None:
-            self._closer.join(CLOSE_TIMEOUT_S)  # two drivers would share one dongle
+            self._closer.join(LINK_CLOSE_TIMEOUT_S)  # two drivers would share one dongle
         while not self._left and not self._is_open_again():
             time.sleep(REOPEN_PAUSE_S)
 
@@ -309,7 +309,7 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
         for call in calls:
             call()
 
-    start_thread("perchctl-close", run).join(CLOSE_TIMEOUT_S)
+    start_thread("perchctl-close", run).join(LINK_CLOSE_TIMEOUT_S)
 
 
 def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:

@@ -35,11 +35,15 @@ RESETS = 3
 RESET_PULSE_S = 0.1
 AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
 """After one reset; the whole is bounded by `RESETS` of them."""
-AGREE_M, AGREE_RAD = 0.05, math.radians(5.0)
-"""Ten times what a capture is trusted for, and what half a metre of climb can bear."""
-STILL_M = 0.05
+RESET_AGREE_M = 0.05
+"""Most that estimate and capture may be apart after a reset: ten times what a capture is trusted
+for."""
+RESET_AGREE_RAD = math.radians(5.0)
+"""The same for the heading: what half a metre of climb can bear."""
+RESET_STILL_M = 0.05
 """From the reset until they agree: a vehicle that moves farther is being carried."""
-POLL_S = 0.02
+ESTIMATE_POLL_S = 0.02
+"""Time between two looks at estimate and capture."""
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
@@ -82,7 +86,7 @@ def settle_estimator(
                 f"no position from outside within {config.connect_timeout_s:g} s: "
                 f"{status.problem or 'none was sent'}"
             )
-        wait(POLL_S)
+        wait(ESTIMATE_POLL_S)
     for _ in range(RESETS):
         if may_be_flying(newest(), clock()):
             raise ConnectionFailed(
@@ -125,14 +129,14 @@ def _agree(
             and placed is not None
             and sample is not None
             and has_fresh_position(sample, now_s)
-            and math.dist(placed.position_m, start.position_m) <= STILL_M
-            and math.dist(placed.position_m, sample.position_m) <= AGREE_M
-            and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= AGREE_RAD
+            and math.dist(placed.position_m, start.position_m) <= RESET_STILL_M
+            and math.dist(placed.position_m, sample.position_m) <= RESET_AGREE_M
+            and abs(wrap_rad(sample.yaw_rad - yaw_of(placed.R))) <= RESET_AGREE_RAD
         )
         since_s = (now_s if since_s is None else since_s) if agree else None
         if since_s is not None and now_s - since_s >= AGREE_FOR_S:
             return True
-        wait(POLL_S)
+        wait(ESTIMATE_POLL_S)
     return False
 
 

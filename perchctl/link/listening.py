@@ -60,7 +60,7 @@ class ReadOnlyLink(CflibLink):
 # --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet ---
 
 
-PERIOD_S = 0.01
+MOTION_PERIOD_S = 0.01
 MOTION_BLOCK = dict.fromkeys(
     (
         "stateEstimate.roll",
@@ -73,7 +73,7 @@ MOTION_BLOCK = dict.fromkeys(
     "float",
 ) | {"supervisor.info": "uint16_t"}
 """All 26 bytes that a log block holds."""
-MOST_SAMPLES = 20_000
+MOST_ATTITUDE_SAMPLES = 20_000
 
 
 class AttitudeLink(ReadOnlyLink):
@@ -82,7 +82,7 @@ class AttitudeLink(ReadOnlyLink):
     def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
         super().__init__(uri, config, clock)
         self._timebase = Timebase()
-        self._samples: deque[AttitudeSample] = deque(maxlen=MOST_SAMPLES)
+        self._samples: deque[AttitudeSample] = deque(maxlen=MOST_ATTITUDE_SAMPLES)
         self._heard = threading.Event()
         self._motors_run = False
 
@@ -99,7 +99,7 @@ class AttitudeLink(ReadOnlyLink):
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
         log = connection.cf.log
-        start_block(log, self._uri, "motion", MOTION_BLOCK, PERIOD_S, self._on_motion)
+        start_block(log, self._uri, "motion", MOTION_BLOCK, MOTION_PERIOD_S, self._on_motion)
         if not self._heard.wait(FIRST_SAMPLE_TIMEOUT_S):
             raise TimedOut(f"{self._uri} is connected but sends no telemetry")
 
@@ -126,7 +126,7 @@ class AttitudeLink(ReadOnlyLink):
 # --- What a vehicle holds, and how good the radio is ---
 
 
-ANSWER_S = 0.5
+LAST_ECHO_WAIT_S = 0.5
 ECHO_PERIOD_S = 0.02
 _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
 _ECHO_MARK = 1  # cflib's own pings begin with 0
@@ -181,7 +181,7 @@ class ProbeLink(ReadOnlyLink):
         return "it was closed" if self.connection is None else self.connection.lost
 
     def round_trips_s(self, duration_s: float) -> list[float]:
-        """Send echo packets for `duration_s`, and wait `ANSWER_S` for the last. Returns the
+        """Send echo packets for `duration_s`, and wait `LAST_ECHO_WAIT_S` for the last. Returns the
         round-trip time of each packet, s; infinite for a lost packet."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
@@ -202,7 +202,7 @@ class ProbeLink(ReadOnlyLink):
                 sent_s.append(time.monotonic())
                 send_packets(self._cf, [Packet(Port.LINK, 0, _ECHO.pack(_ECHO_MARK, number))])
                 time.sleep(max(0.0, start_s + (number + 1) * ECHO_PERIOD_S - time.monotonic()))
-            all_back.wait(ANSWER_S)
+            all_back.wait(LAST_ECHO_WAIT_S)
         finally:
             self._cf.remove_header_callback(on_packet, Port.LINK, 0)
         return [back_s.get(number, math.inf) - at_s for number, at_s in enumerate(sent_s)]

@@ -11,7 +11,7 @@ from perchctl.errors import ConnectionFailed, TimedOut
 from perchctl.extensions import error_at
 from perchctl.link.arming import disarm, warn_of_armed
 from perchctl.link.protocol import LANDING_WAIT_S, Guard, SentCallback, VehicleLink, ignore_sent
-from perchctl.link.sender import HANGS_S, Sender
+from perchctl.link.sender import LIBRARY_HANG_S, Sender
 from perchctl.link.telemetry import FIRST_SAMPLE_TIMEOUT_S
 from perchctl.vehicle import (
     Arm,
@@ -24,7 +24,7 @@ from perchctl.vehicle import (
 )
 
 READ_PERIOD_S = 0.005
-AHEAD_S = 0.1
+SAMPLE_AHEAD_S = 0.1
 """A sample may be so much ahead of the loop's clock; else it is of another clock."""
 
 
@@ -33,8 +33,8 @@ class GuardedLink:
 
     A reader thread asks it for telemetry and problems, and the `Sender`'s threads hand it commands
     and ask the watchdog, so nothing waits for a call of it that hangs. An error that it raises, an
-    invalid sample, or a call longer than `HANGS_S` counts as a lost link, until it works again;
-    errors of `send` do once they last for `HANGS_S`.
+    invalid sample, or a call longer than `LIBRARY_HANG_S` counts as a lost link, until it works
+    again; errors of `send` do once they last for `LIBRARY_HANG_S`.
     """
 
     def __init__(self, inner: VehicleLink, clock: Callable[[], float]) -> None:
@@ -84,7 +84,7 @@ class GuardedLink:
 
     def problem(self, now_s: float) -> str | None:
         silent_s = 0.0 if self._answered_s is None else now_s - self._answered_s
-        hangs = f"telemetry() hangs for {silent_s:.1f} s" if silent_s > HANGS_S else None
+        hangs = f"telemetry() hangs for {silent_s:.1f} s" if silent_s > LIBRARY_HANG_S else None
         return self._sender.trouble() or hangs or self._trouble
 
     def new_notes(self) -> list[str]:
@@ -144,6 +144,6 @@ class GuardedLink:
     def _checked(self, sample: object) -> Telemetry:
         if not isinstance(sample, Telemetry):
             raise TypeError(f"a sample must be a Telemetry, not {type(sample).__name__}")
-        if not sample.t_s <= self._clock() + AHEAD_S:
+        if not sample.t_s <= self._clock() + SAMPLE_AHEAD_S:
             raise ValueError(f"a sample's t_s must be a past time, not {sample.t_s}")
         return sample

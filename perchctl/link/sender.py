@@ -29,12 +29,12 @@ _STREAMED = (PositionSetpoint, RawThrust)
 _EXPIRING = (*_STREAMED, Arm)
 """What is for its own moment only: dropped when it is stale, and never repeated on its own. An
 arming request that comes late would turn the propellers after the session has ended."""
-STALE_S = 0.25
+STALE_COMMAND_S = 0.25
 """What expires and has waited longer, behind a command that hung, is for another moment."""
 GUARD_PERIOD_S = 0.05
-HANGS_S = 0.5
+LIBRARY_HANG_S = 0.5
 """For so long the library may hold one piece, or fail (docs/firmware.md, "Silence")."""
-RETRY_S = 0.002
+SEND_RETRY_S = 0.002
 """Until a piece that found no room is offered again: about what one packet takes by radio."""
 NOTED_EVERY_S = 1.0
 """Errors are noted so often at most."""
@@ -64,8 +64,8 @@ class Sender:
 
     `pieces` splits a command. `tend` looks after the link, and must not block: the guard's thread
     calls it after the guard, with `stuck_s` and with True if the library has held one piece, or
-    raised errors, for longer than `HANGS_S`. `spare` is called by the first thread when no command
-    waits; it may hand over something of its own, and returns True if it did.
+    raised errors, for longer than `LIBRARY_HANG_S`. `spare` is called by the first thread when
+    no command waits; it may hand over something of its own, and returns True if it did.
 
     `errors` counts the attempts to send that failed.
     """
@@ -139,10 +139,10 @@ class Sender:
         since_s = self._failing_since_s
         if since_s == -math.inf:
             return f"a command could not be sent: {self._error}"
-        if since_s is not None and self._clock() - since_s > HANGS_S:
+        if since_s is not None and self._clock() - since_s > LIBRARY_HANG_S:
             failing_s = self._clock() - since_s
             return f"no command could be sent for {failing_s:.1f} s: {self._error}"
-        if self.stuck_s() > HANGS_S:
+        if self.stuck_s() > LIBRARY_HANG_S:
             return f"no command has gone out for {self.stuck_s():.1f} s"
         return None
 
@@ -221,7 +221,7 @@ class Sender:
         """The first command; it stays queued until the library has all of it."""
         while self._queue:
             first = self._queue[0]
-            stale = self._clock() - first.put_s > STALE_S
+            stale = self._clock() - first.put_s > STALE_COMMAND_S
             if not (stale and isinstance(first.command, _EXPIRING)):
                 return first
             self._queue.popleft()
@@ -239,7 +239,7 @@ class Sender:
                 self._failing_since_s = -math.inf
                 raise
         if waiting.rest and self._hand_over(waiting.rest[0]) is False:
-            return RETRY_S
+            return SEND_RETRY_S
         with self._ready:
             if not self._is_mine():
                 return 0.0  # the next thread has begun with the same piece
@@ -293,12 +293,12 @@ class Sender:
 
     def _look_after_worker(self) -> None:
         called_s, stuck_s = self._called_s, self.stuck_s()
-        too_long = called_s is not None and self._clock() - called_s > HANGS_S
+        too_long = called_s is not None and self._clock() - called_s > LIBRARY_HANG_S
         # At two looks: after a suspension of the computer the first finds every call too long.
         hangs = too_long and called_s == self._held_since_s
         self._held_since_s = called_s if too_long else None
         try:
-            self._tend(stuck_s, hangs or (self._raised and stuck_s > HANGS_S))
+            self._tend(stuck_s, hangs or (self._raised and stuck_s > LIBRARY_HANG_S))
         finally:
             with self._ready:
                 if self._running and hangs and self._called_s == called_s:

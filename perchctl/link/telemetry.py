@@ -213,7 +213,7 @@ BLOCKS_DELETED_AFTER_S = 1.0
 """Without radio for so long a vehicle deletes them (docs/firmware.md, "Radio silence")."""
 RESUME_PERIOD_S = 0.25
 """Longer than the slowest block's period: one that was started shows by then."""
-MOST_SAMPLES = 2000
+MOST_TELEMETRY_SAMPLES = 2000
 _SETTINGS, _CREATE, _START = 1, 6, 3  # channel of the log port, and commands
 _PREFIX = "perch_"
 
@@ -228,7 +228,7 @@ class LogBlocks:
         self._clock = clock
         self._timebase = Timebase()
         self._assembler = SampleAssembler()
-        self._samples: deque[Telemetry] = deque(maxlen=MOST_SAMPLES)
+        self._samples: deque[Telemetry] = deque(maxlen=MOST_TELEMETRY_SAMPLES)
         self._first_sample = threading.Event()
         self._awaited: set[str] = set()  # slow blocks without data so far
         self._started_s = 0.0

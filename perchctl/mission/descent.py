@@ -30,7 +30,7 @@ from perchctl.mission.belief.contact import (
     is_pressing,
 )
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.reckoning import REACH_M
+from perchctl.mission.belief.reckoning import MAGNET_REACH_M
 from perchctl.mission.belief.update import (
     STILL_THRUST,
     after_command,
@@ -39,7 +39,7 @@ from perchctl.mission.belief.update import (
 )
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
-    LEAST_PART,
+    LEAST_ORDERED_PART,
     PEELED_M,
     descend_level,
     waits_for_its_own_estimate,
@@ -93,7 +93,7 @@ MAX_ORDERS = 6
 """No more."""
 PLANNED_MPS = 0.35
 """Mean speed of its quintic."""
-SETTLING_S = 1.8
+LANDING_MARGIN_S = 1.8
 """Time that the quintic is given beyond that."""
 PEAK_OF_MEAN = 1.875
 """A quintic's largest speed over its mean."""
@@ -164,7 +164,7 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
     # Where it stands still in the air, what holds it there goes down with it.
     state = anchor_in_wind(Context(state))
     hover_thrust = hover.at_loss(old)
-    within = contact_z_m is not None or b.reckoning.below_m < REACH_M
+    within = contact_z_m is not None or b.reckoning.below_m < MAGNET_REACH_M
     lost = b.has_lost_its_position
     b = replace(
         b,
@@ -233,7 +233,7 @@ def is_landing_over(c: Context) -> bool:
         low = setpoint.z_m <= ground_m[2] + c.planner.landing.handover_m
         if low and Claim.UNCONFIRMED in c.state.entry.claims:
             return True
-    return 0.0 < c.state.descent.thrust <= LEAST_PART * c.belief.hover_thrust + 1.0
+    return 0.0 < c.state.descent.thrust <= LEAST_ORDERED_PART * c.belief.hover_thrust + 1.0
 
 
 # --- A fall, and what stands ---
@@ -325,7 +325,7 @@ def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
-    return Land(aim_m, SETTLING_S + PEAK_OF_MEAN * (z_m - aim_m) / PLANNED_MPS)
+    return Land(aim_m, LANDING_MARGIN_S + PEAK_OF_MEAN * (z_m - aim_m) / PLANNED_MPS)
 
 
 def _own_landing(c: Context) -> Action:
@@ -357,6 +357,6 @@ def _weight_on_magnet(c: Context) -> Action:
     carries most of it: what hangs stays, what has fallen does not rise."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _release(c)
-    part = LEAST_PART * c.belief.hover_thrust
+    part = LEAST_ORDERED_PART * c.belief.hover_thrust
     thrust = int(max(STILL_THRUST, min(LEAST_POSITION_THRUST, part)))
     return replace(c.state, released_s=c.t_s), RawThrust(thrust)

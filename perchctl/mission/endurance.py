@@ -22,7 +22,7 @@ from perchctl.vehicle import FULL_THRUST
 
 UNKNOWN_S = 5.0
 """Without a reading for longer the charge is unknown."""
-SETTLING_S = 3.0
+STANDOFF_SETTLING_S = 3.0
 """Time of settling at the stand-off, as measured in simulated flights."""
 TOUCHING_S = 1.0
 """The same of the touch."""
@@ -80,7 +80,7 @@ def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
     height of the known target."""
     planner = c.planner
     up_m = max(0.0, c.belief.target.contact_goal_z_m - c.telemetry.position_m[2])
-    touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
+    touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
     if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):

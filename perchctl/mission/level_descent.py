@@ -25,7 +25,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
-SINK_MPS = 0.7
+LEVEL_SINK_MPS = 0.7
 """Wanted sink. By the gyroscope's offset the vehicle goes 2 m sideways in 4 s: larger lands harder
 where the floor is unseen, smaller farther aside."""
 LOW_SINK_MPS = 0.4
@@ -47,9 +47,9 @@ ON_THE_SPOT_S = 0.6
 RAMP_PER_S = 0.25
 """Share of the hover thrust by which what does not sink gets less, each second. Larger: the floor
 is met faster. Smaller: a magnet holds it for longer."""
-STILL_MPS = 0.05
+LEAST_SINK_MPS = 0.05
 """Sink below which it does not sink."""
-LEAST_PART = 0.4
+LEAST_ORDERED_PART = 0.4
 """Share of the hover thrust below which no thrust is ordered."""
 LEAST_COSINE = 0.8
 """Bound of the tilt that the thrust makes up for."""
@@ -139,9 +139,9 @@ def descend_level(c: Context) -> Action:
     before = descent.thrust or hover_thrust
     if touched_s < TOUCH_S:
         thrust = TOUCH_PART * hover_thrust
-    elif floor_felt_s is not None or carried or climb_mps > -STILL_MPS or overdue:
+    elif floor_felt_s is not None or carried or climb_mps > -LEAST_SINK_MPS or overdue:
         thrust = min(thrust, before - RAMP_PER_S * hover_thrust * dt_s)
-    thrust = max(LEAST_PART * hover_thrust, min(MOST_RAW, thrust))
+    thrust = max(LEAST_ORDERED_PART * hover_thrust, min(MOST_RAW, thrust))
     # The speed that orders have given since the newest sample.
     shown_s = 0.0 if b.last is None else max(0.0, tel.t_s - descent.sample_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
@@ -171,7 +171,7 @@ def _rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: fl
     b = c.belief
     # Late pictures may show the floor half a metre too far.
     low = height_m <= SLOW_BELOW_M or b.mismatch.later_s != 0.0
-    sink_mps = LOW_SINK_MPS if low else SINK_MPS
+    sink_mps = LOW_SINK_MPS if low else LEVEL_SINK_MPS
     gain = GAIN_AGE_S2_PER_M / max(1e-3, b.attitude_age_s)
     gain = max(LEAST_GAIN_S_PER_M, min(MOST_GAIN_S_PER_M, gain))
     tilt = max(LEAST_COSINE, math.cos(b.tilt_rad))

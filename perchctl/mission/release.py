@@ -21,7 +21,7 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- the end of a press ---
-AWAY_M = 0.08
+CONTACT_LEFT_M = 0.08
 """So far below what it pressed against, the vehicle has left it."""
 PULLED_MPS = -0.3
 """Vertical speed at which it falls off: then the setpoint is where it is."""
@@ -57,7 +57,7 @@ TURNING_PART = 0.5
 CATCH_LEAST_S = 0.1
 """Bounds of a catch's time."""
 CATCH_LIMIT_S = 2.0
-CAUGHT_MPS = -0.1
+CATCH_END_MPS = -0.1
 """Vertical speed from which on the thrust is above the weight."""
 MOST_BRAKED_MPS = 1.0
 """No blow that the vehicle survives leaves more speed."""
@@ -73,10 +73,10 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     if not state.pressed:
         return state, None
     away_m = z - tel.position_m[2]
-    calm = away_m > AWAY_M and not is_strong(c.belief) and tel.velocity_mps[2] > PULLED_MPS
+    calm = away_m > CONTACT_LEFT_M and not is_strong(c.belief) and tel.velocity_mps[2] > PULLED_MPS
     if calm or c.in_phase_s > UNPRESS_LIMIT_S:
         return replace(state, pressed=False), None
-    below_m = UNWIND_M if away_m < AWAY_M else UNWIND_AWAY_M
+    below_m = UNWIND_M if away_m < CONTACT_LEFT_M else UNWIND_AWAY_M
     if tel.velocity_mps[2] < PULLED_MPS:
         below_m = 0.0
     dx, dy = state.integral_m
@@ -167,7 +167,7 @@ def catch_slip(c: Context) -> Action | None:
     if state.catch_above_m is None or not b.imu_proves:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
-    if begun or (b.climb_mps < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
+    if begun or (b.climb_mps < CATCH_END_MPS and c.in_phase_s < CATCH_LIMIT_S):
         x, y = _braked_place_m(c) if b.is_displaced else state.entry.position_m[:2]
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_above_m, state.entry.yaw_rad

@@ -14,7 +14,7 @@ HUNG_WITHIN_M = 0.3
 """A vehicle this little below its contact still hangs there, by an estimate that has drifted."""
 HIGH_M = 0.45
 """A descent that began higher than this can tell hanging from standing by the height."""
-LOW_M = 0.3
+STANDS_BELOW_M = 0.3
 """Height below which the vehicle stands."""
 STAYED_M = 0.15
 """A vehicle that has not come down this far hangs where the descent began. Larger: one on a table
@@ -45,7 +45,7 @@ def find_rest_state(c: Context) -> RestState:
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
     stayed = high and not b.target.is_far_above and came_down_m < STAYED_M
     at_contact = b.contact_z_m is not None and not b.target.is_far_above
-    if stayed or (b.height_m > LOW_M and at_contact):
+    if stayed or (b.height_m > STANDS_BELOW_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
 

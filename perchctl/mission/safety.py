@@ -13,7 +13,7 @@ from perchctl.mission.belief.contact import (
     BLOCKED,
     HANGING,
     HANGING_S,
-    SATURATED,
+    PRESS_SATURATED_PART,
     SATURATED_THRUST,
     contact_error,
     contact_tolerance_m,
@@ -58,12 +58,12 @@ from perchctl.mission.transition import (
 from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
-LIFTED_M = 0.05
+TAKEOFF_LIFTED_M = 0.05
 """Height below which a take-off may run aside by `SIDEWAYS_M` only."""
 SIDEWAYS_M = 0.12
 """The most that a vehicle runs aside before it has lifted. Larger: a wrong mounting tips it
 over."""
-LOW_M = 0.3
+DIVERGED_BELOW_M = 0.3
 """Height below which positions in other axes lead into the floor."""
 DIVERGED_LOW_M = 0.22
 """Distance aside there, and in a climb that should be straight, at which positions have
@@ -109,7 +109,7 @@ def has_diverged(c: Context) -> bool:
         touched = b.contact_z_m is not None or c.state.stopped_s is not None
         return not touched and _away_m(c) > DIVERGED_LANDING_M
     spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if b.by_target else 0.0
-    if phase is Phase.APPROACH and b.height_m < LIFTED_M:
+    if phase is Phase.APPROACH and b.height_m < TAKEOFF_LIFTED_M:
         return _away_m(c) > SIDEWAYS_M + spare_m
     ground = b.ground_m
     above_start = ground is not None and (
@@ -117,7 +117,7 @@ def has_diverged(c: Context) -> bool:
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
     is_pushed = b.imu.t_s - b.imu.pushed_s <= PUSHED_S  # by moving air
-    stays = b.height_m < LOW_M or (only_climbs and not is_pushed)
+    stays = b.height_m < DIVERGED_BELOW_M or (only_climbs and not is_pushed)
     return _away_m(c) > (DIVERGED_LOW_M + spare_m if stays else DIVERGED_M)
 
 
@@ -258,7 +258,7 @@ def lacks_press_thrust(c: Context) -> bool:
     if c.held_s(SATURATED_THRUST) >= WEAK_S:
         return True
     near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
-    return near and c.belief.hover_thrust > SATURATED * max_press_thrust(c.profile)
+    return near and c.belief.hover_thrust > PRESS_SATURATED_PART * max_press_thrust(c.profile)
 
 
 SAFETY_ROWS: tuple[Transition, ...] = (

@@ -40,7 +40,7 @@ STIFF_RANGE_M = 0.4
 """Way over which it grows to its whole."""
 STIFF_LIMIT_M = 0.1
 """The most that it moves a setpoint."""
-FLOOR_M = 0.05
+GROUND_CLEARANCE_M = 0.05
 """No setpoint is lower above the ground, but in a take-off."""
 SMALL_ERROR_M = 0.06
 """An error of the position that the integral counts in motion, too."""
@@ -53,7 +53,7 @@ Smaller: a wind that shakes the vehicle is never balanced."""
 WARY_MPS = 0.25
 """Speed sideways while nothing confirms the camera's mounting. Larger: a turned camera leads it
 farther astray."""
-SINK_MPS = 0.2
+OUT_OF_VIEW_SINK_MPS = 0.2
 """Speed at which a held vehicle sinks whose target is out of view."""
 LOWEST_M = 0.3
 """Height above the ground to which it sinks."""
@@ -205,19 +205,19 @@ def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     if not (b.by_target and b.position_is_stale) or b.ground_m is None:
         return setpoint
     lowest_m = min(setpoint.z_m, b.ground_m[2] + LOWEST_M)
-    z_m = setpoint.z_m - SINK_MPS * max(0.0, c.t_s - c.state.t_s)
+    z_m = setpoint.z_m - OUT_OF_VIEW_SINK_MPS * max(0.0, c.t_s - c.state.t_s)
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The setpoint moved inside the fence, under the height limit and (fault 36) `FLOOR_M` above
-    the ground; in a take-off, down to the ground."""
+    """The setpoint moved inside the fence, under the height limit and (fault 36)
+    `GROUND_CLEARANCE_M` above the ground; in a take-off, down to the ground."""
     ground, safety = c.belief.ground_m, c.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]
     distance = math.hypot(dx, dy)
-    floor_m = ground[2] + (0.0 if c.state.phase is Phase.APPROACH else FLOOR_M)
+    floor_m = ground[2] + (0.0 if c.state.phase is Phase.APPROACH else GROUND_CLEARANCE_M)
     if distance > safety.fence_radius_m:
         dx, dy = dx * safety.fence_radius_m / distance, dy * safety.fence_radius_m / distance
     return replace(

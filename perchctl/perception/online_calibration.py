@@ -143,7 +143,7 @@ ATTITUDE_STEP_S = 0.02
 """Of the difference that stands for a speed."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
 """Of the vehicle's speed and rates of turn: what is not well above it is taken for rest."""
-JITTER_S = 0.008
+PICTURE_JITTER_S = 0.008
 """By which single pictures are early or late."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
@@ -214,11 +214,11 @@ def consistency_rows(
         # Minus the cross products of the body's axes with the way, and the way itself.
         factors = [speed, v * z - w * y, w * x - u * z, u * y - v * x, u * x + v * y]
         rows.append([0.5 * at + delay_s * speed, *factors, 0.0, 0.0])
-        noise.append(aside_m2 + LEAST_SIGMA_M**2 + (JITTER_S * speed) ** 2)
+        noise.append(aside_m2 + LEAST_SIGMA_M**2 + (PICTURE_JITTER_S * speed) ** 2)
     rate = turned / (2.0 * ATTITUDE_STEP_S)
     rate *= _above(abs(rate), NOISE_RADPS)
     rows.append([heading0 + 0.5 * turned + delay_s * rate, rate] + 6 * [0.0])
-    noise.append(float(pose.cov[3, 3]) + LEAST_SIGMA_RAD**2 + (JITTER_S * rate) ** 2)
+    noise.append(float(pose.cov[3, 3]) + LEAST_SIGMA_RAD**2 + (PICTURE_JITTER_S * rate) ** 2)
     return np.array(rows), np.array(noise), z
 
 

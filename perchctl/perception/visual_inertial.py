@@ -20,8 +20,17 @@ from perchctl.vehicle import Telemetry
 
 Vector = tuple[float, float, float]
 
-WINDOW_S, LEAST_S, LEAST_SIGHTS = 1.2, 0.6, 8
-EVERY_S, AGREED = 0.05, 3  # between judgements, and how many in a row have to agree
+MISMATCH_WINDOW_S = 1.2
+"""Older sights are left out."""
+MISMATCH_LEAST_S = 0.6
+"""Time that the sights must span before they are judged. Larger: a mismatch is found later."""
+MISMATCH_LEAST_SIGHTS = 8
+"""Number of sights, and of samples, below which none is judged. Larger: as `MISMATCH_LEAST_S`."""
+MISMATCH_PERIOD_S = 0.05
+"""Time between judgements. Smaller: judgements in a row rest on nearly the same sights."""
+AGREED = 3
+"""Number of judgements in a row that have to agree. Larger: a mismatch is found later. Smaller: one
+that is none is reported."""
 AGREED_MEASURED = 2
 """The same for a latency that the flight measures: what is taken for an error wrongly is taken
 back, and at ten pictures a second a third judgement is a tenth of a second later."""
@@ -59,7 +68,7 @@ class MeasuredLatency:
 
 @dataclass(frozen=True)
 class VisualInertialWindow:
-    """The sights of the last `WINDOW_S`, and the mismatch and motion that they show.
+    """The sights of the last `MISMATCH_WINDOW_S`, and the mismatch and motion that they show.
 
     Times and delays are relative to the profile's latency. `mismatch` is for the planner, None
     while there is none, or one that is corrected; `correction_s` is the delay by which a measured
@@ -114,10 +123,10 @@ def estimate_motion(
         measured: the latency in use, with `camera.latency_s: measured`; without it the latency is
             the profile's, and a mismatch stays.
     """
-    kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
+    kept = tuple(s for s in old.sights if t_s - MISMATCH_WINDOW_S <= s[0] < t_s)
     new = replace(old, sights=(*kept, (t_s, body_to_target_m)))
-    short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
-    if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
+    short = t_s - new.sights[0][0] < MISMATCH_LEAST_S or len(new.sights) < MISMATCH_LEAST_SIGHTS
+    if short or len(samples) < MISMATCH_LEAST_SIGHTS or t_s - old.judged_s < MISMATCH_PERIOD_S:
         return new
     hypotheses_s = delay_hypotheses(0.0 if measured is None else measured.in_use_s)
     wanders_m, upwards_m, velocity_mps, bias_mps2 = fit_hypotheses(
@@ -149,7 +158,7 @@ def estimate_motion(
     i = _best_about(agreed_on or Mismatch(new.in_use_s), wanders_m, hypotheses_s)
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
-        climb_mps = vz if t_s - new.latest_s <= WINDOW_S else None
+        climb_mps = vz if t_s - new.latest_s <= MISMATCH_WINDOW_S else None
         new = replace(
             new, motion=VisualInertialMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps)
         )

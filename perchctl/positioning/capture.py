@@ -26,7 +26,7 @@ from perchctl.extensions import make_extension
 from perchctl.positioning.feed import BodyPose, CaptureFrame, CaptureSource, PositionFeed
 from perchctl.profile import PositioningConfig
 
-SILENT_S = 0.3
+CAPTURE_SILENT_S = 0.3
 LATE_S = 0.5
 """So long after a burst of late frames it still explains that no frame is used."""
 KEPT = 64
@@ -158,9 +158,9 @@ class MotionCapture:
         if self._ended is not None:
             return self._ended
         silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
-        if self._late is not None and now_s - self._late[0] <= LATE_S and silent_s > PAUSE_S:
+        if self._late is not None and now_s - self._late[0] <= LATE_S and silent_s > QUEUE_PAUSE_S:
             return self._late[1].text(self._who)
-        if silent_s <= SILENT_S:
+        if silent_s <= CAPTURE_SILENT_S:
             return None
         what = "no body" if self._setup.skip_empty else "no frame"
         return f"{self._who} has sent {what} for {silent_s:.1f} s"
@@ -250,7 +250,7 @@ class MotionCapture:
 START_TIMEOUT_S = 30.0
 MOST_HZ = 500.0
 """No system is faster; what comes faster is not a measurement, and would keep the parent busy."""
-PAUSE_S = 0.1
+QUEUE_PAUSE_S = 0.1
 """After a pause as long as this the library may hand out what waited in its queue."""
 AT_ONCE_S = 1e-3
 """Frames closer than this waited in the queue: no system sends so fast."""
@@ -295,12 +295,12 @@ def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
         client.waitForNextFrame()
         now_s = time.monotonic()
         waited_s = now_s - asked_s
-        if waited_s > PAUSE_S:
-            is_burst = newest_s - began_s < PAUSE_S
+        if waited_s > QUEUE_PAUSE_S:
+            is_burst = newest_s - began_s < QUEUE_PAUSE_S
             channel.send(LateFrames(count if is_burst else 0, waited_s))
             began_s, count = now_s, 0
         newest_s, count = now_s, count + 1
-        behind = waited_s > PAUSE_S or (behind and waited_s < AT_ONCE_S)
+        behind = waited_s > QUEUE_PAUSE_S or (behind and waited_s < AT_ONCE_S)
         if behind or now_s - sent_s < 1.0 / MOST_HZ:
             continue
         bodies: Bodies = {}

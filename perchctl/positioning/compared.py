@@ -21,7 +21,7 @@ from perchctl.places import user_folder
 from perchctl.profile import PositioningConfig
 
 VALID_S = 24 * 3600.0
-AHEAD_S = 60.0
+CLOCK_ADJUSTMENT_S = 60.0
 """A computer's clock is set by so much, now and then."""
 AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 _TRUE_OF = {"system", "host", "body", "body_rpy_deg", "body_position_m"}
@@ -49,7 +49,7 @@ class CaptureComparison(BaseModel):
         when, age_s = self.text(now), (now - self.at).total_seconds()
         if not self.passed:
             return f"{self.found} ({when})", f"mend that, then {AGAIN}"
-        if age_s < -AHEAD_S:
+        if age_s < -CLOCK_ADJUSTMENT_S:
             return f"{when}, which is yet to come", f"set this computer's clock, then {AGAIN}"
         if age_s > VALID_S:
             return f"{when}, {age_s / 3600.0:.0f} h ago (24 h at most)", AGAIN

@@ -63,7 +63,7 @@ class CaptureSource(Protocol):
 
 QUIET_S = 0.1
 """Without a position for so long, or for two periods, it is said why."""
-HANGS_S = 0.2
+FEED_HANG_S = 0.2
 """The turns come every 10 ms, or as often as a simulated flight's loop turns."""
 RATE_OVER_S = 1.0
 END_TIMEOUT_S = 1.0
@@ -233,7 +233,7 @@ class PositionFeed:
 
     def _why(self, now_s: float) -> str:
         who = self._config.label
-        if self._turned_s is not None and now_s - self._turned_s > HANGS_S:
+        if self._turned_s is not None and now_s - self._turned_s > FEED_HANG_S:
             return (
                 f"the positions of {who} have not been passed on for {now_s - self._turned_s:.1f} s"
             )
@@ -249,15 +249,21 @@ class PositionFeed:
 # Each is refused here, with one sentence that names it.
 
 
-STALE_S = 0.05
+STALE_FRAME_S = 0.05
 """A frame that waited longer after its arrival is for another moment: a vehicle that climbs at
 0.5 m/s is 25 mm from there, five times what the capture is trusted for."""
 UNIT_WITHIN = 0.01
 """Of a quaternion's length; single precision keeps 1e-6."""
 NOISE_M, NOISE_RAD = 0.05, math.radians(20.0)
 """What a pose may move between two frames without the body having moved."""
-FASTEST_MPS, FASTEST_RADPS, AT_FASTEST_S = 5.0, 10.0, 0.02
-"""A vehicle that falls 1.3 m, or is pushed over, for the first moment."""
+FASTEST_FALL_MPS = 5.0
+"""Speed that is allowed for the first moment: of a vehicle that falls 1.3 m. Smaller: its positions
+are refused."""
+FASTEST_TIP_RADPS = 10.0
+"""The same for a vehicle that is pushed over."""
+AT_FASTEST_S = 0.02
+"""The first moment, after which `HELD_MPS` and `HELD_RADPS` count. Larger: a pose that jumped is
+believed."""
 HELD_MPS, HELD_RADPS = 0.5, 1.0
 """After that moment: without a position it is held where it is, and drifts."""
 
@@ -311,7 +317,7 @@ class PoseValidator:
             who, label = self._config.body, self._config.label
             self.problem = f"{label} does not see the rigid body {who!r}; it sees {others}"
             return None
-        if now_s - arrived_s > STALE_S:
+        if now_s - arrived_s > STALE_FRAME_S:
             self.problem = f"{self._who} is {now_s - arrived_s:.3f} s old when it is read"
             return None
         if not _is_pose(pose):
@@ -361,8 +367,8 @@ def _is_pose(pose: BodyPose) -> bool:
 def _jumps(a: VehiclePose, b: VehiclePose) -> bool:
     dt_s = b.t_s - a.t_s
     first_s = min(dt_s, AT_FASTEST_S)
-    far_m = NOISE_M + FASTEST_MPS * first_s + HELD_MPS * (dt_s - first_s)
-    far_rad = NOISE_RAD + FASTEST_RADPS * first_s + HELD_RADPS * (dt_s - first_s)
+    far_m = NOISE_M + FASTEST_FALL_MPS * first_s + HELD_MPS * (dt_s - first_s)
+    far_rad = NOISE_RAD + FASTEST_TIP_RADPS * first_s + HELD_RADPS * (dt_s - first_s)
     return _way_m(a, b) > far_m or _turn_rad(a, b) > far_rad
 
 

@@ -39,8 +39,15 @@ GATE_M, GATE_MPS, GATE_SIGMAS = 0.10, 0.35, 5.0
 vehicle is half a metre aside (docs/firmware.md, "Target as position")."""
 GATE_LONGEST_S = 4.0
 WORST_SIGMA_M = 0.05
-NEAR_M, FAR_M, NEAR_S, FAR_S = 0.3, 1.0, 0.3, 1.0
-"""In so long what the estimate is beside the sights is learned: slowly where a pixel is more."""
+LEARN_NEAR_M = 0.3
+"""Distance to the target up to which the difference of estimate and sights is learned within
+`LEARN_NEAR_S`."""
+LEARN_FAR_M = 1.0
+"""Distance from which on it is learned within `LEARN_FAR_S`: slower, since a pixel is more."""
+LEARN_NEAR_S = 0.3
+"""Time constant near the target. Smaller: the noise of single sights is learned."""
+LEARN_FAR_S = 1.0
+"""The same far from it. Larger: a difference that changes is followed late."""
 NOWHERE = Place(np.zeros(3), 0.0)
 """No difference between two places."""
 
@@ -173,8 +180,8 @@ class TargetFeed:
         self.target = Place(position_m, wrap_rad(first_rad + float(np.median(turns_rad))))
 
     def _learn_off(self, pose: MarkerPose, place: Place, then: Attitude) -> None:
-        away = (float(np.linalg.norm(pose.e_m)) - NEAR_M) / (FAR_M - NEAR_M)
-        lasts_s = NEAR_S + min(max(away, 0.0), 1.0) * (FAR_S - NEAR_S)
+        away = (float(np.linalg.norm(pose.e_m)) - LEARN_NEAR_M) / (LEARN_FAR_M - LEARN_NEAR_M)
+        lasts_s = LEARN_NEAR_S + min(max(away, 0.0), 1.0) * (LEARN_FAR_S - LEARN_NEAR_S)
         share = 1.0 - math.exp(-min(max(pose.t_s - self._seen_s, 0.0), 0.5) / lasts_s)
         off_m, off_rad = self.off.position_m, self.off.yaw_rad
         beside_m = place.position_m - np.asarray(then.position_m)

@@ -131,7 +131,7 @@ def find_calibration(name: str) -> Path:
     return found
 
 
-MOST_COVERED = 0.75
+MOST_MASKED_SHARE = 0.75
 """Of the picture; with more of it covered there is no room for a target."""
 _WHITE = 127
 
@@ -162,8 +162,8 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
         )
     covered = np.asarray(image > _WHITE)
     share = float(covered.mean())
-    if share > MOST_COVERED:
-        covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_COVERED, 0)
+    if share > MOST_MASKED_SHARE:
+        covers, allowed = distinct_texts(100.0 * share, 100.0 * MOST_MASKED_SHARE, 0)
         raise InvalidValue(
             f"camera.mask: {path} covers {covers} % of the picture, at most {allowed} % are "
             f"allowed: white is what the vehicle covers, black is free"

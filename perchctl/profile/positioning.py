@@ -12,7 +12,7 @@ from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 SPARE_S = 0.02
 """Frames do not come to the millisecond."""
-MOST_LATENCY_S = 0.04
+MOST_CAPTURE_LATENCY_S = 0.04
 """The vehicle takes each position for the one of now. 40 ms late it perches within 2 mm, 50 ms late
 it may swing for a minute and be landed (tests/flight/test_capture_flights.py)."""
 _HOST = r"^([^\s:/?#@]+(:[1-9][0-9]{0,4})?)?$"
@@ -86,7 +86,10 @@ class PositioningConfig(Section):
     send: Literal["position", "pose"] = key("position", "position alone, or position and attitude")
     rate_hz: float = key(100.0, "most positions sent a second", ge=10, le=100)
     latency_s: float = key(
-        0.01, "time from the cameras' exposure to arrival, as far as known", ge=0, le=MOST_LATENCY_S
+        0.01,
+        "time from the cameras' exposure to arrival, as far as known",
+        ge=0,
+        le=MOST_CAPTURE_LATENCY_S,
     )
     position_sigma_m: float = key(
         0.005, "standard deviation that the vehicle assumes: `locSrv.extPosStdDev`", gt=0, le=0.2

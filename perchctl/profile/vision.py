@@ -100,7 +100,7 @@ def _eighths(angle: float) -> int:
     )
 
 
-MOST_LATENCY_S = 1.0
+MOST_CAMERA_LATENCY_S = 1.0
 USUAL_LATENCY_S = 0.07
 """Most cameras are 60 to 100 ms late."""
 START_LATENCY_S = 0.1
@@ -122,7 +122,7 @@ class CameraConfig(Section):
         "example_640x480.yaml", "file beside the profile or in `calib/`, or a full path"
     )
     cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
-    latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = key(
+    latency_s: Annotated[float, Field(ge=0, le=MOST_CAMERA_LATENCY_S)] | Literal["measured"] = key(
         USUAL_LATENCY_S, "time from exposure to arrival; `measured`: each flight measures it"
     )
     mount: Mounting = Mounting()
@@ -148,11 +148,11 @@ class CameraConfig(Section):
     def _a_time_or_measured(cls, latency_s: Any) -> Any:
         """Refuse other values than a time or ``measured`` in one sentence."""
         number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
-        if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_LATENCY_S):
+        if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_CAMERA_LATENCY_S):
             return latency_s
         raise ValueError(
-            f"found {latency_s!r}; allowed are 0 to {MOST_LATENCY_S:g} (seconds), or the word "
-            f"measured, to have each flight measure it"
+            f"found {latency_s!r}; allowed are 0 to {MOST_CAMERA_LATENCY_S:g} (seconds), or the "
+            f"word measured, to have each flight measure it"
         )
 
     @property

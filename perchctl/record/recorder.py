@@ -44,7 +44,7 @@ from perchctl.record.summary import RecordingEnd
 from perchctl.vision import Frame
 
 CHUNK_BYTES = 4_000_000
-CLOSE_TIMEOUT_S = 5.0
+RECORDING_CLOSE_TIMEOUT_S = 5.0
 MOST_WAITING_BYTES = 64_000_000
 """What may wait for the disk holds so much memory."""
 TURN_BYTES = 10_000
@@ -121,12 +121,12 @@ class Recorder:
         self._hand_over()
 
     def close(self) -> RecordingEnd:
-        """End the file, once, and return its summary. Waits at most `CLOSE_TIMEOUT_S` for the disk.
-        Never raises."""
+        """End the file, once, and return its summary. Waits at most `RECORDING_CLOSE_TIMEOUT_S` for
+        the disk. Never raises."""
         if not self._closed:
             self._hand_over()
             self._closed = True
-            if self._writer.finish(partial(self._attempt, self._finish), CLOSE_TIMEOUT_S):
+            if self._writer.finish(partial(self._attempt, self._finish), RECORDING_CLOSE_TIMEOUT_S):
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
         return RecordingEnd(self.path.name, kept, self._pictures - kept, self.problem)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from perchctl.record.recorder import Recorder
 
 FSYNC_PERIOD_S = 1.0
-CLOSE_TIMEOUT_S = 3.0
+LOG_CLOSE_TIMEOUT_S = 3.0
 MOST_WAITING = 3000
 """Records that may wait for the disk, half a minute of a flight at 50 Hz; more are dropped."""
 NO_ANSWER = "the disk does not answer: the flight log lacks its end"
@@ -264,12 +264,12 @@ class LogWatcher:
     def end(self, summary: Mapping[str, Any] | None = None) -> None:
         """Append the summary, if any, and close. Never raises; a second call does nothing.
 
-        Waits at most `CLOSE_TIMEOUT_S` for the disk."""
+        Waits at most `LOG_CLOSE_TIMEOUT_S` for the disk."""
         if self._closed:
             return
         self._closed = True
         last = partial(self._end, summary)
-        self._unfinished = self._writer.finish(last, CLOSE_TIMEOUT_S)
+        self._unfinished = self._writer.finish(last, LOG_CLOSE_TIMEOUT_S)
         if self._unfinished:
             self._remember(NO_ANSWER)
 

@@ -14,8 +14,10 @@ from perchctl.sim.optics import Picture
 from perchctl.sim.renderer import Exposure, Renderer
 from perchctl.sim.scenario import Scenario
 
-SCHEDULE_STREAM, STREAM = 411, 412
-"""Numbers of random streams: the schedule's; that of the light and the receiver."""
+SCHEDULE_STREAM = 411
+"""Number of the random stream of the schedule."""
+LIGHT_STREAM = 412
+"""The same for the light and the receiver."""
 
 JITTER_LIMIT_SIGMAS = 2.5
 
@@ -62,7 +64,7 @@ class SimCamera:
         self._last: Picture | None = None
         self._t_s = -np.inf
         self._under_way: deque[DeliveredFrame] = deque()
-        rng = np.random.default_rng([scenario.seed, STREAM])
+        rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
         self._first_output_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._outputs = 0
         self._newest: DeliveredFrame | None = None  # that the receiver gives out again
@@ -165,7 +167,7 @@ class Shutter:
         if scenario.camera_fields != "progressive":
             self._apart_s = 0.5 / scenario.camera_rate_hz
         self.half_frame_s = half_exposure_s + scenario.camera_readout_s / 2.0 + self._apart_s / 2.0
-        rng = np.random.default_rng([scenario.seed, STREAM])
+        rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
         self._lamp_phase, self._hunt_phase = rng.uniform(0.0, 2.0 * math.pi, size=2)
         self._hunt_hz = float(rng.uniform(*PUMPING_HZ))
         # An exposure averages over the lamp's swing.

@@ -29,7 +29,7 @@ from perchctl.sim.scenario import draw_scenario
 if TYPE_CHECKING:
     from perchctl.sim.world import World
 
-_STREAM = 13
+_CAPTURE_STREAM = 13
 _JITTER_LIMIT_SIGMAS = 3.0
 TRUE_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -126,7 +126,7 @@ class SimCapture:
 
     def __init__(self, settings: CaptureSettings) -> None:
         self.settings = settings
-        self._rng = np.random.default_rng([settings.seed, _STREAM])
+        self._rng = np.random.default_rng([settings.seed, _CAPTURE_STREAM])
         self._faults = list(settings.faults)
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
         self._R_capture_world = rot_z(settings.heading_rad)

@@ -217,7 +217,7 @@ PERIOD_UNIT_S = 0.010
 _DELETE, _START, _STOP, _CLEAR, _CREATE_V2, _APPEND_V2 = range(2, 8)
 _LOG_DATA = 2  # channel
 _ENTRY_BYTES = 3
-_EPS_S = 1e-6
+_LOG_DUE_EPS_S = 1e-6
 _EXTENDED, _READ_ONLY = 0x10, 0x40
 _EXTENDED_TYPE_V2 = 7
 _IS_PERSISTENT = 1
@@ -284,7 +284,7 @@ class CrtpServer:
         now_s = self._firmware.t_s
         packets = []
         for ident, block in self._blocks.items():
-            if block.due_s is not None and block.due_s <= now_s + _EPS_S:
+            if block.due_s is not None and block.due_s <= now_s + _LOG_DUE_EPS_S:
                 packets.append(self._data(ident, block))
                 block.due_s = max(block.due_s + block.period_s, now_s)
         return packets

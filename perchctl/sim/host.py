@@ -212,7 +212,7 @@ def serve_parent(
 MAX_LAG_S = 1.0
 """A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
 _IDLE_S = 0.25
-_BATCH = 50  # steps between two polls of the control connection while catching up
+_CATCH_UP_STEPS = 50  # steps between two polls of the control connection while catching up
 
 
 class HostRunner:
@@ -254,7 +254,7 @@ class HostRunner:
         if now_s - self._host.elapsed_s > max_lag_s:
             self._origin_s += now_s - self._host.elapsed_s - max_lag_s
             now_s = self._clock() - self._origin_s
-        for _ in range(_BATCH):
+        for _ in range(_CATCH_UP_STEPS):
             if self._host.elapsed_s + CONTROL_PERIOD_S > now_s:
                 break
             if self._must_wait():
@@ -286,7 +286,7 @@ class HostRunner:
 # One part of a multipart answer is one JPEG; a slow client skips frames, the newest wins.
 
 
-JPEG_QUALITY = 92
+SIMULATED_JPEG_QUALITY = 92
 _BOUNDARY = "perchctlframe"
 _CLIENT_TIMEOUT_S = 5.0
 
@@ -334,7 +334,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.end_headers()
             while True:
                 number, image = self.server.wait_for_newer(number)
-                _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                _, jpeg = cv2.imencode(
+                    ".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, SIMULATED_JPEG_QUALITY]
+                )
                 head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}"
                 self.wfile.write(f"{head}\r\n\r\n".encode() + jpeg.tobytes() + b"\r\n")
 

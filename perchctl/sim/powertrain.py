@@ -80,7 +80,7 @@ STANDSTILL_V = motor_voltage(0.0)
 # - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
 #   state (source: power management) are a discharge curve of the Crazyflie's own cell.
 # - The voltage falls under load by the cell's resistance at once, and in an old or cold cell
-#   by some more within `SLOW_S`: ions that have to come from farther away.
+#   by some more within `ION_DIFFUSION_S`: ions that have to come from farther away.
 # - An old cell holds less charge and has more resistance; `knee` says at which part of the
 #   charge its steep end begins.
 
@@ -88,7 +88,7 @@ STANDSTILL_V = motor_voltage(0.0)
 CHARGE_C = 900.0
 """250 mAh."""
 RESISTANCE_OHM = 0.143
-SLOW_S = 15.0
+ION_DIFFUSION_S = 15.0
 _CELL_CURVE: tuple[tuple[float, float], ...] = (
     (-0.02, 2.5),
     (0.0, 3.0),
@@ -133,7 +133,7 @@ class Cell:
         self._offset_v = rest_v - _resting_v(self._left, knee)
         self._slow_v = 0.0
         self._per_step = CONTROL_PERIOD_S / (CHARGE_C * charge)
-        self._slowly = 1.0 - math.exp(-CONTROL_PERIOD_S / SLOW_S)
+        self._slowly = 1.0 - math.exp(-CONTROL_PERIOD_S / ION_DIFFUSION_S)
         self.rest_v = self.battery_v = rest_v
 
     def set_rest_v(self, rest_v: float) -> None:

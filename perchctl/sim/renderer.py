@@ -165,7 +165,7 @@ class Renderer:
         motion_px = self._paths_px(rows[len(rows) // 2])
         length_px = longest_path_px(motion_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
-        if length_px < STILL_PX and len(rows) == 1:
+        if length_px < STILL_EXPOSURE_PX and len(rows) == 1:
             rows = [round_pose(rows[0][len(rows[0]) // 2])[None]]
             motion_px, length_px = np.zeros((5, 1, 2)), 0.0
         picture = self._projected(rows, motion_px, length_px, sigma)
@@ -328,18 +328,18 @@ def defocus_blocks(picture: Picture, sigma_px: float, box: Box) -> None:
 
 
 # --- A camera that does not move ---
-# Where the picture moves by less than `STILL_PX` within the exposure, its pose is rounded, so that
-# a vehicle at rest sees the same picture again and again but for the noise.
+# Where the picture moves by less than `STILL_EXPOSURE_PX` within the exposure, its pose is rounded,
+# so that a vehicle at rest sees the same picture again and again but for the noise.
 
 
-STILL_PX = 0.005
-STEP = 2.0**-17
+STILL_EXPOSURE_PX = 0.005
+POSE_STEP = 2.0**-17
 """Steps of the directions, and of the place in parts of its distance: below 0.01 px."""
 
 
 def round_pose(T_target_cam: Array) -> Array:
-    """A still camera's pose (4, 4), rounded to steps of `STEP`."""
-    steps = np.full((3, 4), STEP)
+    """A still camera's pose (4, 4), rounded to steps of `POSE_STEP`."""
+    steps = np.full((3, 4), POSE_STEP)
     steps[:, 3] *= 2.0 ** np.floor(np.log2(max(abs(float(T_target_cam[2, 3])), 1e-3)))
     T = np.eye(4)
     T[:3] = np.rint(T_target_cam[:3] / steps) * steps

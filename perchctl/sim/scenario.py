@@ -128,7 +128,10 @@ class Scenario:
 # --- From a profile's ranges and a seed to a scenario ---
 
 
-_STREAM, _GROUPS_STREAM, _IMU_STREAM = 1, 21, 22  # the scenario's own random streams
+# The scenario's own random streams.
+_SCENARIO_STREAM = 1
+_GROUPS_STREAM = 21
+_IMU_BIAS_STREAM = 22
 _DRAWN = ("ceiling_z_m", "mass_kg", "battery_rest_v", "camera_latency_s", "camera_noise_sigma")
 """Keys that each seed draws from their range, in this order."""
 _AS_GIVEN = (
@@ -156,7 +159,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """The seed's scenario. Values are drawn in a fixed order, so a range added at the end
     leaves a seed's earlier values; harder worlds draw from other random streams."""
     sim = profile.simulation
-    rng = np.random.default_rng([seed, _STREAM])
+    rng = np.random.default_rng([seed, _SCENARIO_STREAM])
 
     def between(key: str) -> float:
         return float(rng.uniform(*getattr(sim, key)))
@@ -219,7 +222,7 @@ def _mounting_error(sim: SimulationConfig, rng: np.random.Generator) -> Array:
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     """The biases of gyroscope and accelerometer; none along the accelerometer's z,
     which the firmware's scale corrects."""
-    rng = np.random.default_rng([seed, _IMU_STREAM])
+    rng = np.random.default_rng([seed, _IMU_BIAS_STREAM])
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
     x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
     return {"gyro_bias_radps": (p, q, r), "acc_bias_mps2": (x, y, 0.0)}

@@ -53,10 +53,10 @@ FOUND_RATE = 0.9
 NOISE = 5.0
 """Sigma of the grey levels (0..255)."""
 TRIALS = 24
-STEP = 1.04
+SIDE_STEP_RATIO = 1.04
 """Ratio of neighbouring sides that are tried."""
 SIDE_RANGE_PX = (6.0, 400.0)
-_STREAM = 801
+_READING_STREAM = 801
 _PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
 _MIN_PICTURE_PX = 64
 _PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
@@ -76,11 +76,11 @@ def smallest_side_px(
     drawing = draw_target(target)
     reader = ArucoReader(target)
     side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
-    count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
+    count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(SIDE_STEP_RATIO))
 
     @cache
     def rate(i: int) -> float:
-        side_px = SIDE_RANGE_PX[0] * STEP**i
+        side_px = SIDE_RANGE_PX[0] * SIDE_STEP_RATIO**i
         hits = 0
         for picture in sample_pictures(drawing, side_px / side_m, side_px, blur_px):
             quad = reader.read(picture).get(marker)
@@ -103,7 +103,7 @@ def smallest_side_px(
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if found(middle) else (middle, high)
-    return float(SIDE_RANGE_PX[0] * STEP**high)
+    return float(SIDE_RANGE_PX[0] * SIDE_STEP_RATIO**high)
 
 
 def sample_pictures(
@@ -117,7 +117,7 @@ def sample_pictures(
     ink = drawing.ink_coverage(px_per_m * fine, n)
     sheet = drawing.sheet_coverage(px_per_m * fine, n)
     flat = (_CEILING * (1.0 - sheet) + _PAPER * (sheet - ink) + _INK * ink).astype(np.float32)
-    rng = np.random.default_rng([_STREAM, round(1e3 * side_px)])
+    rng = np.random.default_rng([_READING_STREAM, round(1e3 * side_px)])
     for _ in range(TRIALS):
         shift = rng.uniform(-0.5, 0.5, 2)
         turn = cv2.getRotationMatrix2D(((n - 1) / 2.0, (n - 1) / 2.0), rng.uniform(0.0, 360.0), 1.0)

@@ -15,7 +15,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, rot_z
 from perchctl.profile import Mounting, Profile, TargetConfig
 from perchctl.vision import CameraModel, shows_enough_of_target, square_corners, undistort
 
-MARGIN_PX = 3.0
+ARUCO_MARGIN_PX = 3.0
 """cv2.aruco drops markers nearer than this to the picture's edge."""
 NEAREST_M, FARTHEST_M = 1e-3, 50.0
 _EDGE_POINTS = 200
@@ -24,7 +24,7 @@ _EDGE_POINTS = 200
 class FieldOfView:
     """The picture's edge, as the tangent of its angle from the camera's axis in each direction."""
 
-    def __init__(self, camera: CameraModel, margin_px: float = MARGIN_PX) -> None:
+    def __init__(self, camera: CameraModel, margin_px: float = ARUCO_MARGIN_PX) -> None:
         low = margin_px - 0.5
         right, bottom = (size - 0.5 - margin_px for size in camera.size_px)
         corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])

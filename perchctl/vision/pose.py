@@ -26,7 +26,7 @@ from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
 _CURLED_CHI2 = 3.0  # of both markers' corners on a flat sheet, a degree of freedom
-_EXPLAINED = 0.5  # of that is left where the sheet's curl is what it comes from
+_CURL_LEFT_SHARE = 0.5  # of that is left where the sheet's curl is what it comes from
 _Source = Literal["large", "small", "joint"]
 
 
@@ -109,7 +109,7 @@ def estimate_pose(
     if settled is None:
         return pose
     bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
-    return replace(bent, chi2=pose.chi2) if bent.chi2 < _EXPLAINED * pose.chi2 else pose
+    return replace(bent, chi2=pose.chi2) if bent.chi2 < _CURL_LEFT_SHARE * pose.chi2 else pose
 
 
 def _continued(

@@ -155,7 +155,7 @@ _PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _TURNED_RAD = math.radians(15.0)  # worth a word
 # How a hovering vehicle moves relative to the target while its estimate jumps.
 _CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-_EXPLAINED = 0.25  # most that the better of two explanations may leave, of squared misfits
+_JUMP_LEFT_SHARE = 0.25  # most that the better of two explanations may leave, of squared misfits
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +331,7 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     unclaimed = _unclaimed(range_m)
     seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, off_in_world))
     calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
-    return calm and seen < _EXPLAINED * jumped
+    return calm and seen < _JUMP_LEFT_SHARE * jumped
 
 
 def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup) -> bool:
@@ -342,7 +342,7 @@ def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup)
         return False
     fit, unclaimed = _misfit(lock.before, sight, constants), _unclaimed(_range_m(sight))
     before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.off, off))
-    return fit.squared <= _GATE and before < _EXPLAINED * now
+    return fit.squared <= _GATE and before < _JUMP_LEFT_SHARE * now
 
 
 # --- rivals ---

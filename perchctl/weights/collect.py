@@ -41,10 +41,13 @@ from perchctl.weights.data import HEADER, csv_row
 
 SEEN_SHARE = 0.9
 """Of a position's frames both markers must be in so many."""
-STILL_PX = 1.0
+MOST_WANDER_PX = 1.0
 """The target's picture must not wander farther within a position, nor shake more."""
-FAR_M, FAR_RAD = 0.03, math.radians(10.0)
-"""An actual pose that differs from the camera's by more is a mistake."""
+MOST_MISMATCH_M = 0.03
+"""An actual pose that differs from the camera's by more is a mistake. Larger: it is taken for an
+error of the camera."""
+MOST_MISMATCH_RAD = math.radians(10.0)
+"""The same for the yaw."""
 SAMPLES = 30
 """Frames of motion capture whose median is the actual pose; they must come within `WITHIN_S`."""
 WITHIN_S = 5.0
@@ -109,10 +112,10 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
     thirds = np.array([part.mean(axis=0) for part in np.array_split(centers, 3)])
     drift_px = float(np.linalg.norm(np.ptp(thirds, axis=0)))
     wander_px = max(float(np.linalg.norm(centers.std(axis=0))), drift_px)
-    if wander_px > STILL_PX:
+    if wander_px > MOST_WANDER_PX:
         return (
             f"shaken: the target wandered {wander_px:.1f} px in the picture (allowed is "
-            f"{STILL_PX:g}); fix the camera and hold still"
+            f"{MOST_WANDER_PX:g}); fix the camera and hold still"
         )
     return None
 
@@ -362,7 +365,7 @@ def _mismatch(actual: Array, readings: list[MarkerReading]) -> str | None:
     seen = np.median(poses, axis=0)
     off_m = float(np.linalg.norm(seen[:3] - actual[:3]))
     off_rad = abs(wrap_rad(float(seen[3] - actual[3])))
-    if off_m <= FAR_M and off_rad <= FAR_RAD:
+    if off_m <= MOST_MISMATCH_M and off_rad <= MOST_MISMATCH_RAD:
         return None
     return f"the camera measures {_pose_text(seen)}, but the actual pose is {_pose_text(actual)}"
 

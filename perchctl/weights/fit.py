@@ -139,7 +139,7 @@ LEAST_RUN_ROWS, LEAST_PASSES = 40_000, 3
 """Rows to run through, in as many passes as that takes, so that few rows suffice."""
 MOST_ROWS = 100_000
 """Of more rows an even share is run through."""
-_STREAM = (0, 601)
+_LMS_STREAM = (0, 601)
 
 
 def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]:
@@ -154,7 +154,7 @@ def lms_weights(errors: MarkerErrors, start: float = 0.5) -> tuple[Array, Array]
     share = slice(None, None, 1 + len(errors) // MOST_ROWS)
     power, pull, place = power[share], pull[share], place[share]
     n = len(power)
-    rng = np.random.default_rng(_STREAM)
+    rng = np.random.default_rng(_LMS_STREAM)
     passes = max(LEAST_PASSES, math.ceil(LEAST_RUN_ROWS / n))
     order = np.concatenate([rng.permutation(n) for _ in range(passes)])
     first = np.minimum(START_STEP, 0.5 / np.maximum(power.max(axis=0), 1.0))

@@ -150,7 +150,7 @@ def write_weights(path: Path, result: FitResult, date: str, *, anyway: bool) -> 
 # Lengths are in micrometres and angles in thousandths of a degree.
 
 
-WIDTH = 80
+WEIGHTS_COLUMNS = 80
 _SCALES = np.array([1e6, 1e6, 1e6, 180e3 / math.pi])
 _HEADS = ("x [um]", "y [um]", "z [um]", "yaw [mdeg]")
 
@@ -228,4 +228,4 @@ def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
 
 
 def _wrapped(text: str) -> str:
-    return textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)
+    return textwrap.fill(text, WEIGHTS_COLUMNS, break_long_words=False, break_on_hyphens=False)

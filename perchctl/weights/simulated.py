@@ -21,10 +21,10 @@ from perchctl.vision import CameraModel, Frame, project, square_corners
 from perchctl.weights.collect import SessionFile, position_fault, read_markers, session_rows
 
 NOISE_SIGMA, BLUR_PX = 4.0, 1.0
-MARGIN_PX = 4.0
+CORNER_MARGIN_PX = 4.0
 FRAME_S = 1.0 / 30.0
 _TRIES = 400
-_STREAM = 611
+_SESSION_STREAM = 611
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class SimulatedStand:
         """The camera place of a position, counted from 1. Each position has its own part of
         the range z3 to z2, so even few cover the range. Raises InvalidValue."""
         merge = self._profile.merge
-        rng = np.random.default_rng([self._seed, _STREAM, position])
+        rng = np.random.default_rng([self._seed, _SESSION_STREAM, position])
         share = (position - 1) % self._positions
         step = (merge.z2_m - merge.z3_m) / self._positions
         for _ in range(_TRIES):
@@ -112,5 +112,5 @@ class SimulatedStand:
         T_cam_marker = invert_T(place.T_world_cam) @ T_world_marker
         rvec, tvec = np.asarray(cv2.Rodrigues(T_cam_marker[:3, :3])[0], float), T_cam_marker[:3, 3]
         corners = project(self._corners, rvec, tvec, self._camera)
-        highest = np.array(self._camera.size_px) - 1 - MARGIN_PX
-        return bool((corners > MARGIN_PX).all() and (corners < highest).all())
+        highest = np.array(self._camera.size_px) - 1 - CORNER_MARGIN_PX
+        return bool((corners > CORNER_MARGIN_PX).all() and (corners < highest).all())

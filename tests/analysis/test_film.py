@@ -14,7 +14,7 @@ from PIL import Image
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.analysis import FlightAnalysis, write_film
-from perchctl.analysis.film import LAST_S, side_path_and_target_height
+from perchctl.analysis.film import LAST_PICTURE_S, side_path_and_target_height
 from perchctl.errors import InvalidValue
 from perchctl.flight import fly_lockstep
 from perchctl.record import LogWatcher, read_log, recorded_pictures
@@ -51,7 +51,11 @@ def test_it_lasts_as_long_as_the_flight_and_shows_the_recorded_pictures(
         path = tmp_path / f"{name}.mp4"
         count = write_film(flight, recorded, path, rate_hz=2.0, width_px=WIDTH_PX)
         films.append(pictures_of(path))
-        assert len(films[-1]) == count == pytest.approx(2.0 * (flight.log.end_s + LAST_S), abs=2)
+        assert (
+            len(films[-1])
+            == count
+            == pytest.approx(2.0 * (flight.log.end_s + LAST_PICTURE_S), abs=2)
+        )
         assert films[-1][0].shape == (WIDTH_PX * 9 // 16, WIDTH_PX, 3)
     middle = len(films[0]) // 2
     left = np.s_[30:100, 60:160]  # where the camera's picture is
@@ -82,7 +86,7 @@ def test_the_command_makes_a_gif_at_the_flight_s_pace(flown: Path, tmp_path: Pat
             image.seek(number)
             lasts_ms += image.info["duration"]
     flown_s = read_log(flown).end_s
-    assert lasts_ms == pytest.approx(1000.0 * (flown_s + LAST_S), abs=200.0)
+    assert lasts_ms == pytest.approx(1000.0 * (flown_s + LAST_PICTURE_S), abs=200.0)
     assert run(*words, str(tmp_path / "flight.avi")).code == InvalidValue.exit_code
     assert run(*words, str(out)).code == InvalidValue.exit_code  # it exists
 

@@ -23,7 +23,7 @@ from perchctl.calibration import (
     load_calibration,
     record_mounting,
 )
-from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
+from perchctl.calibration.mounting.capture import LEAST_RECORDING_S, MOST_S
 from perchctl.calibration.mounting.recording import TargetPose
 from perchctl.commands import calibrate_mount
 from perchctl.errors import InvalidValue, NotFound, TimedOut
@@ -183,10 +183,10 @@ def recorded(
 
 
 def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
-    whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
+    whole = seen(hand("carry", seconds=LEAST_RECORDING_S["carry"] + 3.0))
     film, recording = _Film(), MountingRecording("carry")
     moments = recorded(recording, film, _Looks(whole.poses), whole.attitudes)
-    assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
+    assert film.now_s == pytest.approx(LEAST_RECORDING_S["carry"], abs=0.5)
     assert moments[-1].advice.startswith("enough")
     assert ("missing", "nothing", None) in moments[-1].rows
     assert any("turn it about the vertical" in row[1] for m in moments for row in m.rows)

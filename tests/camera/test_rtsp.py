@@ -15,7 +15,7 @@ import pytest
 
 from perchctl.camera import open_camera
 from perchctl.camera.jpeg import MOST_STREAM_PX
-from perchctl.camera.network import WINDOW_S, RtspSource, TransferDelay
+from perchctl.camera.network import DELAY_WINDOW_S, RtspSource, TransferDelay
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound, TimedOut
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
@@ -164,7 +164,7 @@ def test_what_piled_up_is_known_to_be_old() -> None:
 
 
 @pytest.mark.parametrize(("slow", "for_s", "most_s"), [
-    (1e-4, 600, 1e-4 * WINDOW_S + 1e-6), (0.02, 60, 0.05),
+    (1e-4, 600, 1e-4 * DELAY_WINDOW_S + 1e-6), (0.02, 60, 0.05),
 ])  # fmt: skip
 def test_a_clock_of_the_camera_that_runs_slow_or_is_set_back_makes_nothing_old(
     slow: float, for_s: int, most_s: float

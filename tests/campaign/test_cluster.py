@@ -61,7 +61,7 @@ def test_without_the_library_one_sentence_says_what_to_install(
 
 
 def test_an_address_that_nobody_answers_is_told_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "ANSWER_S", 0.3)
+    monkeypatch.setattr(cluster, "SCHEDULER_TIMEOUT_S", 0.3)
     with socket.socket() as deaf:  # is bound, and takes no call
         deaf.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{deaf.getsockname()[1]}"

@@ -22,7 +22,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.campaign import defer_interrupts, flight_processes, fly_all
 from perchctl.campaign.flights import fly_seed
-from perchctl.commands.simulate import AGAIN_S, stop_handler
+from perchctl.commands.simulate import CAMPAIGN_SAME_PRESS_S, stop_handler
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.profile import Profile
 from tests.helpers.ended import ended
@@ -138,10 +138,10 @@ def test_a_second_press_ends_the_program_at_once() -> None:
     press = stop_handler(lambda: now_s[0], left.append)
     with pytest.raises(KeyboardInterrupt):
         press(signal.SIGINT, None)
-    now_s[0] = 0.5 * AGAIN_S
+    now_s[0] = 0.5 * CAMPAIGN_SAME_PRESS_S
     press(signal.SIGINT, None)
     assert left == []
-    now_s[0] = AGAIN_S
+    now_s[0] = CAMPAIGN_SAME_PRESS_S
     press(signal.SIGINT, None)
     assert left == [130]
 

@@ -220,7 +220,7 @@ def test_a_hand_may_drift_aside() -> None:
 
 def truly_moved(way: Stops, from_s: float, to_s: float) -> capture.PairedMotion:
     """Vehicle and capture agree on that way."""
-    times_s = np.arange(from_s, to_s, capture.EVERY_S)
+    times_s = np.arange(from_s, to_s, capture.POSE_PAIR_PERIOD_S)
     places, turns = zip(*(way(HOME, I3, float(t_s)) for t_s in times_s), strict=True)
     R = Rotation.from_matrix(turns)
     return capture.PairedMotion(R, R, np.array(places), 0.2)

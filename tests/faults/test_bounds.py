@@ -10,10 +10,10 @@ import pytest
 
 from perchctl.faults import effects as e
 from perchctl.faults.truth import (
+    COMING_DOWN_MPS,
+    HANDED_OVER_M,
     LASTS_S,
-    LOW_M,
     REACTION_S,
-    SINKING_MPS,
     SUNK_M,
     WATCHED_S,
     DescentBound,
@@ -205,9 +205,9 @@ def test_what_hears_nothing_is_overdue_once_it_hears_again(effect: e.Effect) -> 
         (1.5, 0.0, False, True),
         (1.5 - SUNK_M - 0.01, 0.0, False, False),
         (1.5 - SUNK_M + 0.01, 0.0, False, True),
-        (1.45, -SINKING_MPS - 0.01, False, False),
-        (1.45, -SINKING_MPS + 0.01, False, True),
-        (LOW_M, 0.0, False, False),
+        (1.45, -COMING_DOWN_MPS - 0.01, False, False),
+        (1.45, -COMING_DOWN_MPS + 0.01, False, True),
+        (HANDED_OVER_M, 0.0, False, False),
         (1.5, 0.0, True, False),
         (1.8, 0.2, True, True),
     ],

@@ -415,7 +415,7 @@ def test_suspended_time_passes_without_the_link_and_hung_time_with_it(
     hung.clock.wait_until(0.12)
     assert hung.by_link[-1] == pytest.approx(2.12)
     assert not hung.radio.cut
-    monkeypatch.setattr(edges, "LONGEST_S", 6.0)
+    monkeypatch.setattr(edges, "USER_PATIENCE_S", 6.0)
     ever = begun(partial(e.hung, for_s=e.FOR_EVER))
     with pytest.raises(ProgramKilled):
         ever.clock.wait_until(0.12)

@@ -67,7 +67,7 @@ def lands_fast(patch: Patch) -> None:
 
     patch.setattr(descent, "onboard_landing", fast)
     patch.setattr(descent, "_by_setpoints", by_itself)
-    for name in ("SINK_MPS", "LOW_SINK_MPS"):
+    for name in ("LEVEL_SINK_MPS", "LOW_SINK_MPS"):
         patch.setattr(level_descent, name, 1.5)
 
 

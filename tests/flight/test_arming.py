@@ -27,7 +27,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight import FlyOptions, OperatorSwitch, fly_lockstep, fly_session
-from perchctl.flight.preflight import ARMS_WITHIN_S, PAUSE_S
+from perchctl.flight.preflight import ARMING_PAUSE_S, ARMS_WITHIN_S
 from perchctl.link.crtp import encode
 from perchctl.mission import Operator, Outcome, SentCommand, Turn
 from perchctl.profile import find_calibration, load_profile
@@ -155,7 +155,7 @@ def test_a_vehicle_that_is_reached_for_once_armed_does_not_fly(
         rig.fly()
     assert {type(command) for _, command in link.sent} == {Arm}
     assert link.said(Arm)[-1] < 0.2
-    assert link.now_s == pytest.approx(0.2 + PAUSE_S, abs=0.1)
+    assert link.now_s == pytest.approx(0.2 + ARMING_PAUSE_S, abs=0.1)
 
 
 def test_a_camera_that_falls_silent_once_it_is_armed_ends_it() -> None:

@@ -20,11 +20,11 @@ from hypothesis import strategies as st
 from perchctl.errors import Interrupted, UsageError
 from perchctl.flight import OperatorSwitch, cut_key, operator_signals, session
 from perchctl.flight.operator import (
-    AGAIN_S,
     FASTER_THAN_A_HAND_S,
-    HUNG_S,
-    JITTER_S,
+    KEY_JITTER_S,
     LONGEST_DELAY_S,
+    SAME_PRESS_S,
+    STOP_HANG_S,
 )
 from perchctl.mission import Operator
 from perchctl.profile import load_profile
@@ -60,7 +60,7 @@ ANSWER_S = 0.25
     ([], 0.0, Operator.NONE),
     ([0.0], 0.0, Operator.LAND),
     ([0.0], 100.0, Operator.LAND),
-    ([0.0, AGAIN_S - 0.01], 9.0, Operator.LAND),  # too soon to count
+    ([0.0, SAME_PRESS_S - 0.01], 9.0, Operator.LAND),  # too soon to count
     ([0.0, 0.2, 0.3], 0.3, Operator.STOP),  # but three do
     ([0.0, LONGEST_DELAY_S], LONGEST_DELAY_S, Operator.STOP),  # no keyboard waits so long
     ([0.0, 0.5, 0.53, 0.56], 9.0, Operator.LAND),  # held for half a second
@@ -74,7 +74,7 @@ def test_the_table_of_presses(presses_s: list[float], read_s: float, order: Oper
     assert Pressed(*presses_s).at(read_s) is order
 
 
-@given(again_s=st.floats(AGAIN_S, 60.0))
+@given(again_s=st.floats(SAME_PRESS_S, 60.0))
 def test_a_second_press_stops_within_a_quarter_of_a_second(again_s: float) -> None:
     it = Pressed(0.0, again_s)
     assert it.at(again_s + ANSWER_S) is Operator.STOP
@@ -94,7 +94,7 @@ def hands(draw: st.DrawFn) -> list[float]:
 
 @st.composite
 def keys(
-    draw: st.DrawFn, fastest_s: float = 0.03, slowest_s: float = 0.2, jitter_s: float = JITTER_S
+    draw: st.DrawFn, fastest_s: float = 0.03, slowest_s: float = 0.2, jitter_s: float = KEY_JITTER_S
 ) -> list[float]:
     """When a key presses that is held down for 1.5 s: at once, after a delay, and then evenly, but
     each time up to `jitter_s` late."""
@@ -143,7 +143,7 @@ def test_each_keyboard_between_the_slowest_and_the_fastest_lands(
     assert it.at(for_s) is Operator.LAND
 
 
-@given(keys(slowest_s=FASTER_THAN_A_HAND_S - JITTER_S), st.integers(3, 50))
+@given(keys(slowest_s=FASTER_THAN_A_HAND_S - KEY_JITTER_S), st.integers(3, 50))
 def test_a_key_let_go_is_one_press(presses_s: list[float], count: int) -> None:
     """No hand repeats so fast. After one repeat it cannot be told from two presses."""
     heard = [t for t in presses_s[:count] if t - presses_s[0] < LONGEST_DELAY_S - 1e-9]
@@ -214,14 +214,14 @@ def test_landing_is_never_a_stop_and_cutting_is_one_at_once(acts: list[str]) -> 
 
 
 def test_a_flight_that_hangs_after_its_stop_is_left_by_another_press() -> None:
-    for presses_s in ((), (0.0,), (0.0, AGAIN_S)):
+    for presses_s in ((), (0.0,), (0.0, SAME_PRESS_S)):
         it = Pressed(*presses_s)
         it.at(1.0)
-        it.now_s = 50.0 + HUNG_S
+        it.now_s = 50.0 + STOP_HANG_S
         it.switch.interrupt()  # it may still land, or be stopped
-    it = Pressed(0.0, AGAIN_S)
+    it = Pressed(0.0, SAME_PRESS_S)
     assert it.at(1.0) is Operator.STOP
-    it.now_s = 51.0 + HUNG_S
+    it.now_s = 51.0 + STOP_HANG_S
     with pytest.raises(Interrupted, match="the stopped flight hung"):
         it.switch.interrupt()
     it.switch.closing = True  # the link waits, bounded, for a vehicle that still flies
@@ -302,7 +302,7 @@ def test_ctrl_c_works_while_the_main_thread_hangs_in_a_library() -> None:
     with Hanging(60.0) as flight:
         flight.process.send_signal(signal.SIGINT)
         flight.sends("Land", "LAND")
-        time.sleep(AGAIN_S)
+        time.sleep(SAME_PRESS_S)
         flight.process.send_signal(signal.SIGINT)
         flight.sends("EmergencyStop", "STOP")
 

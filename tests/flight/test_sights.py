@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from perchctl.calibration import profile_camera
 from perchctl.flight import FlightInputs
-from perchctl.flight.inputs import CARRIED_FOR_S, TargetPositioning, is_supported
+from perchctl.flight.inputs import SUPPORTED_FOR_S, TargetPositioning, is_supported
 from perchctl.geometry import Place
 from perchctl.perception import History, add_samples
 from perchctl.profile import SafetyConfig
@@ -69,7 +69,7 @@ def test_the_first_sample_of_a_fall_ends_it(felt_g: float) -> None:
 def test_a_slow_slip_ends_it_within_a_tenth_of_a_second() -> None:
     """On nine tenths of its weight no single sample tells."""
     samples = at_rest()
-    for _ in range(round(CARRIED_FOR_S / SAMPLE_S) - 1):
+    for _ in range(round(SUPPORTED_FOR_S / SAMPLE_S) - 1):
         samples.append(replace(samples[-1], t_s=samples[-1].t_s + SAMPLE_S, acc_z_g=0.9))
     assert not is_supported(history(samples), samples[-1].t_s)
 

@@ -14,7 +14,7 @@ from perchctl.commands.fly import exit_code
 from perchctl.display import FlightPage, FlightPanel
 from perchctl.errors import LogIncomplete, SafetyAbort
 from perchctl.flight import fly
-from perchctl.flight.watching import SLOW_S
+from perchctl.flight.watching import SLOW_WATCHER_S
 from perchctl.mission import (
     Event,
     EventKind,
@@ -240,7 +240,7 @@ def test_a_watcher_that_hangs_is_named_once() -> None:
     def hang(tick: Tick) -> None:
         if tick.t_s > BREAKS_S and len(hung) < 2:
             hung.append(tick.t_s)
-            rig.link.advance_to(rig.link.now_s + SLOW_S + 0.1)
+            rig.link.advance_to(rig.link.now_s + SLOW_WATCHER_S + 0.1)
 
     slow = Watcher(hang)
     report, works = flown(rig=rig, judges=(slow,))

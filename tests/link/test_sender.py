@@ -12,7 +12,13 @@ from typing import Any
 
 import pytest
 
-from perchctl.link.sender import GUARD_PERIOD_S, HANGS_S, NOTED_EVERY_S, STALE_S, Sender
+from perchctl.link.sender import (
+    GUARD_PERIOD_S,
+    LIBRARY_HANG_S,
+    NOTED_EVERY_S,
+    STALE_COMMAND_S,
+    Sender,
+)
 from perchctl.mission import SentCommand
 from perchctl.vehicle import Arm, Command, EmergencyStop, Land, PositionSetpoint, StopMotors
 from tests.helpers.waiting import until
@@ -95,7 +101,7 @@ def test_a_setpoint_that_waited_too_long_is_dropped_an_order_is_not(library: Lib
     sender.put(LAND)
     sender.put(PLACES[0])
     library.now_s += 100.0
-    assert STALE_S < 100.0
+    assert STALE_COMMAND_S < 100.0
     library.room = True
     library.takes(LAND)
 
@@ -186,7 +192,7 @@ def test_a_library_that_never_returns_holds_up_no_order(library: Library) -> Non
     sender = library.sender(tend=tend)
     library.hang_with(LAND)
     sender.put(STOP)
-    library.now_s += HANGS_S + 0.01
+    library.now_s += LIBRARY_HANG_S + 0.01
     library.takes(STOP)
     hung.set()  # what returns now has been given up
     until(lambda: LAND in library.taken)
@@ -199,7 +205,7 @@ def test_a_call_that_the_computer_slept_through_is_no_hang(library: Library) -> 
 
     def tend(stuck_s: float, hangs: bool) -> None:
         blamed.append(hangs)
-        if stuck_s > HANGS_S:
+        if stuck_s > LIBRARY_HANG_S:
             library.free.set()  # awake, it returns
 
     sender = library.sender(tend=tend)
@@ -217,7 +223,7 @@ def test_an_error_that_lasts_is_a_trouble_until_the_order_is_taken(library: Libr
     sender.put(LAND)
     until(lambda: library.offered > 1)
     assert sender.trouble() is None
-    library.now_s += HANGS_S + 0.01
+    library.now_s += LIBRARY_HANG_S + 0.01
     until(lambda: blamed and blamed[-1])
     assert "0.5 s: no radio" in str(sender.trouble())
     library.error = None
@@ -351,7 +357,7 @@ def test_an_arming_request_is_for_its_moment_only(order: Arm, library: Library) 
     library.room = False
     sender = library.sender()
     sender.put(order)
-    library.now_s += STALE_S + 0.01
+    library.now_s += STALE_COMMAND_S + 0.01
     sender.put(LAND)
     library.room = True
     library.takes(LAND)

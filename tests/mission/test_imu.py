@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion
-from perchctl.mission.belief.motion import FROZEN_S, GAP_S, PUSHED_G, UNCORRECTED_S
+from perchctl.mission.belief.motion import FROZEN_READING_S, GAP_S, PUSHED_G, UNCORRECTED_S
 from perchctl.mission.belief.reckoning import (
+    MAGNET_REACH_M,
     MOST_CLIMB_MPS,
-    REACH_M,
     DeadReckoning,
     add_sighting,
     advance_reckoning,
@@ -37,7 +37,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     assert motion.frozen_s == pytest.approx(2.99)
     assert motion.silent_s == pytest.approx(2.99)
     assert motion.fell_s < 0.0
-    assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * FROZEN_S
+    assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * FROZEN_READING_S
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.frozen_s == 0.0
     assert alive.fell_s > 0.0
@@ -127,7 +127,7 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     """However it was last heard to sink. With motors that were off, or started anew, it lies, or
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
-    near = below_m - MOST_CLIMB_MPS * silent_s < REACH_M
+    near = below_m - MOST_CLIMB_MPS * silent_s < MAGNET_REACH_M
     off = {"thrust": 0.0}
     for z_m, before, after, unsure, kept in (
         (below_m, telemetry(1.0, **sinks), telemetry(1.0 + silent_s, **sinks), near, True),

@@ -16,7 +16,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
 from perchctl.mission.belief.belief import CORRECTED_S, DISPLACED_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.level_descent import BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD, SINK_MPS
+from perchctl.mission.level_descent import BRAKE_RAD_PER_MPS, LEVEL_SINK_MPS, MOST_BRAKE_RAD
 from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
 from perchctl.mission.release import MOST_BRAKED_MPS, POSITION_GAIN_PER_S
@@ -121,7 +121,7 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
     assume(math.hypot(vx_mps, vy_mps) > 0.1)
     sinks = {"velocity_mps": (0.0, 0.0, -0.5), "yaw_rad": yaw_rad}
     look = at(obs={"position_age_s": age_s}, **sinks)
-    command = fly(blinded(1.0, (vx_mps, vy_mps, -SINK_MPS)), look, profile=PROFILE).command
+    command = fly(blinded(1.0, (vx_mps, vy_mps, -LEVEL_SINK_MPS)), look, profile=PROFILE).command
     assert isinstance(command, RawThrust)
     # Nose down is forwards, roll to the right is to the right (docs/firmware.md).
     ahead, left = command.pitch_rad, -command.roll_rad
@@ -226,8 +226,8 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
 
     command = fly(state, sinks, profile=PROFILE if blind else DECKS).command
     assert isinstance(command, RawThrust)
-    beside = abs(speed_mps + SINK_MPS) < 0.02
-    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_MPS)
+    beside = abs(speed_mps + LEVEL_SINK_MPS) < 0.02
+    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -LEVEL_SINK_MPS)
     assert command.thrust <= 60000  # more is clipped
     assert blind or (command.roll_rad, command.pitch_rad) == (0.0, 0.0)
 

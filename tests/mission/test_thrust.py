@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
 from perchctl.mission.belief.contact import MAGNET_HOLDS, SATURATED_THRUST
 from perchctl.mission.phase import FLYING_PHASES
-from perchctl.mission.setpoints import FLOOR_M, limit_setpoint
+from perchctl.mission.setpoints import GROUND_CLEARANCE_M, limit_setpoint
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
@@ -194,7 +194,7 @@ GROUND_Z_M = 0.4
 def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     state = remembering(state_in(phase), ground_m=(0.0, 0.0, GROUND_Z_M))
     c = context_at(state, observation(10.02), PROFILE)
-    lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else FLOOR_M)
+    lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else GROUND_CLEARANCE_M)
     sent = limit_setpoint(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
     assert sent >= lowest
     assert sent == z_m or z_m < lowest or z_m > GROUND_Z_M + PROFILE.safety.max_height_m
@@ -222,7 +222,7 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to(phase: Phase) -> None:
     below = target_at(BEGIN_S, (0.0, 0.0, -1.0), tracked=False, measured=False)
     it = Follows(1.0, target=below)
     fly(state_in(phase), it, 8.0)
-    assert min(it.sent_m) >= FLOOR_M
+    assert min(it.sent_m) >= GROUND_CLEARANCE_M
 
 
 @pytest.mark.parametrize("handover_m", [0.1, pytest.param(0.3, marks=pytest.mark.long)])
@@ -233,4 +233,4 @@ def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     flight = fly(state_in(Phase.ALIGN), it, 20.0, profile)
     ordered = next(i for i, c in enumerate(flight.commands) if not isinstance(c, PositionSetpoint))
     assert flight.ticks[ordered].state.orders == 1
-    assert FLOOR_M <= it.sent_m[ordered] < handover_m
+    assert GROUND_CLEARANCE_M <= it.sent_m[ordered] < handover_m

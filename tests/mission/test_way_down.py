@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission import ContactError, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import CONTACT
-from perchctl.mission.descent import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, onboard_landing
+from perchctl.mission.descent import LANDING_MARGIN_S, MOST_DRIFT_M, PLANNED_MPS, onboard_landing
 from perchctl.mission.planner import step_mission
 from perchctl.mission.release import UNREAD_S
 from perchctl.mission.table import TABLE
@@ -539,7 +539,7 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     drift_m = min(MOST_DRIFT_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
-    assert 15 / 8 * way_m / (order.duration_s - SETTLING_S) == pytest.approx(PLANNED_MPS)
+    assert 15 / 8 * way_m / (order.duration_s - LANDING_MARGIN_S) == pytest.approx(PLANNED_MPS)
 
 
 # --- What stays up, or stands still ----------------------------------------------------

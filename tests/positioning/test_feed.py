@@ -20,7 +20,7 @@ from perchctl.geometry import (
 )
 from perchctl.positioning import BodyPose, CaptureFrame, FeedStatus, PositionFeed, VehiclePose
 from perchctl.positioning import feed as feeding
-from perchctl.positioning.feed import QUIET_S, STALE_S
+from perchctl.positioning.feed import QUIET_S, STALE_FRAME_S
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 
@@ -153,7 +153,7 @@ def posed(*position_m: float, q: tuple[float, float, float, float] = LEVEL) -> d
 @pytest.mark.parametrize(("bodies", "late_s", "words"), [
     ({"cf2": BodyPose((3.0, 0.0, 0.0), LEVEL)}, 0.0,
      "motion capture at vicon:lab does not see the rigid body 'cf'; it sees cf2"),
-    (posed(1.2, 0.0, 0.5), STALE_S + 0.005, "old when it is read"),
+    (posed(1.2, 0.0, 0.5), STALE_FRAME_S + 0.005, "old when it is read"),
     (posed(math.nan, 0.0, 0.5), 0.0, "a pose that is none"),
     (posed(1.0, 0.0, 0.5, q=(1.0, 0.3, 0.0, 0.0)), 0.0, "a pose that is none"),
     (posed(1.0, 0.0, 0.5, q=(math.nan, 0.0, 0.0, 0.0)), 0.0, "a pose that is none"),
@@ -169,7 +169,7 @@ def test_what_may_not_be_believed_is_not_sent_and_named(
     assert status.age_s == pytest.approx(0.15 + CONFIG.latency_s)
     assert words in (status.problem or "")
     rig.now_s += 0.1
-    assert rig.at(1.0, age_s=STALE_S - 0.005).problem is None
+    assert rig.at(1.0, age_s=STALE_FRAME_S - 0.005).problem is None
     assert len(rig.places) == 2
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 from perchctl.commands import app
 from perchctl.commands.fly import with_positioning
 from perchctl.profile import PositioningConfig, Profile
-from perchctl.profile.positioning import MOST_LATENCY_S
+from perchctl.profile.positioning import MOST_CAPTURE_LATENCY_S
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 
@@ -83,11 +83,11 @@ def test_other_words_and_a_capture_without_a_computer_are_refused(
 
 
 @pytest.mark.parametrize("late", [
-    {"rate_hz": 10.0, "latency_s": MOST_LATENCY_S}, {"hold_s": 0.03},
+    {"rate_hz": 10.0, "latency_s": MOST_CAPTURE_LATENCY_S}, {"hold_s": 0.03},
 ])  # fmt: skip
 def test_a_hold_that_each_perfect_frame_would_reach_is_refused(late: dict[str, float]) -> None:
     with pytest.raises(ValidationError, match="a position is stale before the next one comes"):
         PositioningConfig(by="mocap", host="lab", **late)
     PositioningConfig(by="mocap", host="lab", **{**late, "hold_s": 0.4})
     with pytest.raises(ValidationError, match="less than or equal to"):
-        PositioningConfig(by="mocap", host="lab", latency_s=MOST_LATENCY_S + 0.01)
+        PositioningConfig(by="mocap", host="lab", latency_s=MOST_CAPTURE_LATENCY_S + 0.01)

@@ -185,7 +185,7 @@ def test_a_log_that_cannot_begin_leaves_nothing(
 @pytest.fixture
 def hung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[LogWatcher, Disk]]:
     """A log in real time with room for 50 records, and its disk, which hangs."""
-    monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(write, "LOG_CLOSE_TIMEOUT_S", 0.2)
     monkeypatch.setattr(write, "MOST_WAITING", 50)
     writer = opened(tmp_path, True)
     disk = Disk()

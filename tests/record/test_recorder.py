@@ -94,7 +94,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_flight(tmp_path: P
 @pytest.fixture
 def hung(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryDisk]:
     """A disk whose gate a test closes; it is opened at the end."""
-    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", WAIT_S)
+    monkeypatch.setattr(recording_module, "RECORDING_CLOSE_TIMEOUT_S", WAIT_S)
     disk = MemoryDisk()
     yield disk
     disk.gate.set()
@@ -203,7 +203,7 @@ def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> Non
 def test_the_log_is_whole_before_the_recording_s_end_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hung: MemoryDisk
 ) -> None:
-    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(recording_module, "RECORDING_CLOSE_TIMEOUT_S", 0.1)
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
     log.recorder = onto(hung, live=True)
     recorded.fly(log.recorder, recorded.flown(10))

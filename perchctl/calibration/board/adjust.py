@@ -230,7 +230,7 @@ def _spread_px(residual: Array) -> float:
 
 SIGMAS_95 = 1.96
 """Standard deviations to each side of a 95 % interval."""
-_LEAST_KNOWN = 1e-10
+_LEAST_INFORMATION_SHARE = 1e-10
 """Share of a parameter's information that keeps one finite which nothing holds."""
 
 
@@ -253,7 +253,7 @@ def jackknife_covariance(
     # Unlike units are brought to one scale.
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(prior + curvature_factor * seen), 1e-300))
     both = np.outer(scale, scale)
-    known = prior + np.diag(_LEAST_KNOWN / scale**2)
+    known = prior + np.diag(_LEAST_INFORMATION_SHARE / scale**2)
     inverted = np.asarray(
         np.linalg.inv((known + curvature_factor * information_factor * seen) * both)
     )

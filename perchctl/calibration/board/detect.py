@@ -277,7 +277,7 @@ REACH = 0.42
 """Half of the window, in squares; the next corner's edges begin at 1."""
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
 GRID = 21  # samples across the largest window
-_STEPS = 6
+_CORNER_ITERATIONS = 6
 _LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 0.5, 0.5])  # step: px, rad, logarithms
 _MIN_SLOPE_PX = 5.0
 _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
@@ -321,7 +321,7 @@ def fit_saddles(
     state[:, 4:] = np.log(np.clip(0.12 * size_px, 0.5, 1.5))[:, None]
     span_px = reach * size_px
     widest = np.log(np.maximum(_MAX_WIDTH_SHARE * span_px, 2 * _MIN_WIDTH_PX))[:, None]
-    for _ in range(_STEPS):
+    for _ in range(_CORNER_ITERATIONS):
         _, residual, J = _model(state, offsets, grey, weight)
         normal = J.transpose(0, 2, 1) @ J
         normal += 1e-3 * normal * np.eye(6) + 1e-9 * np.eye(6)

@@ -19,7 +19,7 @@ from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.vision import Frame
 
-LEAST_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
+LEAST_RECORDING_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
 """For which a part is recorded, also where no turn is missing any more."""
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
@@ -29,7 +29,7 @@ MIRRORED_PICTURES = 60
 """After so many mirrored pictures, and no other, the recording ends."""
 SHARE_OVER = 60
 """Number of the newest pictures whose share with a target is shown."""
-LEAST_SHARE = 0.3
+LEAST_TARGET_SHARE = 0.3
 
 
 def record_mounting(
@@ -77,7 +77,7 @@ def record_mounting(
 class _Progress:
     def __init__(self, recording: MountingRecording) -> None:
         self._recording = recording
-        self._least_s = LEAST_S[recording.part]
+        self._least_s = LEAST_RECORDING_S[recording.part]
         self._start_s: float | None = None
         self._judged_s = -JUDGED_EVERY_S
         self._with_target: deque[bool] = deque(maxlen=SHARE_OVER)
@@ -105,7 +105,7 @@ class _Progress:
             advice = reader.trouble
         elif recording.mirrored_pictures > len(recording.poses):
             advice = MIRRORED
-        elif share < LEAST_SHARE:
+        elif share < LEAST_TARGET_SHARE:
             advice = "no target in view"
         else:
             advice = (*self._missing, "enough; a little longer makes it surer")[0]

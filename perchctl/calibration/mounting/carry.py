@@ -34,9 +34,10 @@ MOST_MISFIT_RAD = math.radians(3.0)
 BIAS_SIGMA_RADPS = math.radians(3.0)  # of a BMI088 that nobody has calibrated
 SCALE_SIGMA = 0.005
 KNOT_S = 2.0
-WALK_RAD = math.radians(0.03)  # of the integrated rotation in the first second; grows as its root
+GYRO_WALK_RAD = math.radians(0.03)
+"""Of the integrated rotation in the first second; grows as its root."""
 FLOOR_RAD = math.radians(0.02)  # of a pose: lens, print and paper
-_STEPS = 15
+_CARRY_ITERATIONS = 15
 
 TURN, TARGET, BIAS, SCALE = (slice(3 * k, 3 * k + 3) for k in range(4))
 LATENCY, KNOTS = 12, 13
@@ -93,7 +94,7 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
     walk = np.zeros((len(knots_s) - 1, 3))
     known = _known(knots_s)
     cov_rad2 = poses.cov[:, :3, :3] + np.eye(3) * FLOOR_RAD**2
-    for _ in range(_STEPS):
+    for _ in range(_CARRY_ITERATIONS):
         at = interpolate_rotation(integrate_gyro(t_s, gyro, bias, scale), poses.t_s - latency_s)
         hats = np.stack([np.interp(at.t_s, knots_s, one) for one in np.eye(len(knots_s))[1:]], 1)
         R_cam_world = (_turns(hats @ walk) @ at.R_world_body @ R_body_cam).transpose(0, 2, 1)
@@ -123,7 +124,7 @@ def solve_rotation(recording: MountingRecording) -> RotationSolution:
 def _known(knots_s: Array) -> Array:
     """The prior information (p, p) on the sensor's errors and the knots' walk."""
     steps = np.diff(np.eye(len(knots_s)), axis=0)[:, 1:]
-    steps /= WALK_RAD * np.sqrt(np.diff(knots_s))[:, None]
+    steps /= GYRO_WALK_RAD * np.sqrt(np.diff(knots_s))[:, None]
     p = KNOTS + 3 * (len(knots_s) - 1)
     known = np.zeros((p, p))
     known[BIAS, BIAS] = np.eye(3) / BIAS_SIGMA_RADPS**2

@@ -25,8 +25,10 @@ from perchctl.geometry import Array
 MOST_TIP_SIGMA_M = 1e-3
 SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
 """Of the misfit; of a tip that stays where it is a jump explains 4 % at most."""
-FLOOR_M = 5e-5  # of the tip on its point
-_STEPS, _SPLITS, _SLIP_STEPS = 12, 19, 4
+TIP_SIGMA_FLOOR_M = 5e-5  # of the tip on its point
+_PIVOT_ITERATIONS = 12  # of the least squares for the tip; more take longer
+_SPLITS = 19  # moments at which a jump of the tip is tried; fewer miss its moment
+_SLIP_ITERATIONS = 4  # of the least squares for each of them; more take longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivo
     design = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -R], axis=2)
     found = np.zeros(6)
     cov = np.broadcast_to(np.eye(3), (n, 3, 3))
-    for _ in range(_STEPS):
+    for _ in range(_PIVOT_ITERATIONS):
         rows = weight_residuals(design, design @ found - p_m, cov, np.zeros((6, 6)))
         found = found + rows.step()
         cov = _misfit_covariance(poses, found[3:])
@@ -91,7 +93,7 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
     way_m = poses.R_cam_target @ point_m
     across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
     J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
-    return np.asarray(J @ poses.cov @ J.transpose(0, 2, 1) + np.eye(3) * FLOOR_M**2)
+    return np.asarray(J @ poses.cov @ J.transpose(0, 2, 1) + np.eye(3) * TIP_SIGMA_FLOOR_M**2)
 
 
 def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
@@ -107,7 +109,7 @@ def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
         design = np.concatenate([rows.jacobian, after], axis=2)
         found = np.zeros(9)
         two = replace(rows, jacobian=design, prior=np.zeros((9, 9)))
-        for _ in range(_SLIP_STEPS):
+        for _ in range(_SLIP_ITERATIONS):
             step = two.step()
             found = found + step
             two = two.after_step(step)

@@ -37,7 +37,7 @@ goes unnoticed. Smaller: an error of the attitude counts as one."""
 SWINGS_BY_LATENCY = 2.0
 """Speed in m/s that the estimate misses for each second of the latency's sigma: by 0.1 s that
 pictures are later than assumed a vehicle swings. Larger: a blow by unknown latency counts less."""
-ANSWER_S = 0.2
+THRUST_REPORT_S = 0.2
 """Time within which the telemetry shows an ordered raw thrust. Smaller: late telemetry counts as an
 unread thrust."""
 
@@ -324,7 +324,7 @@ class Belief:
     @cached_property
     def thrust_is_known(self) -> bool:
         """True if the measured thrust follows the ordered thrust."""
-        return self.unanswered_s is None or self.obs.t_s - self.unanswered_s <= ANSWER_S
+        return self.unanswered_s is None or self.obs.t_s - self.unanswered_s <= THRUST_REPORT_S
 
     # --- The target ---
 

@@ -23,7 +23,7 @@ from perchctl.vehicle import FLYING, FULL_THRUST
 # --- thrust ---
 LEAST_POSITION_THRUST = 20000
 """The least thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
-SATURATED = 0.98
+PRESS_SATURATED_PART = 0.98
 """Share of full thrust above which it is not known how much more the vehicle would take."""
 LITTLE_LEFT = 0.93
 """Share of full thrust: if hovering takes more, more thrust is no sign of a press. Smaller: heavy
@@ -36,13 +36,13 @@ STILL_MOTORS_THRUST = 5000
 """Raw thrust at which the motors stand still, and less."""
 PRESSING_PART = 0.95
 """Share of full thrust from which a still vehicle presses, as an attempt ends."""
-PRESSING_RATIO = 1.05
+PRESSING_HOVER_RATIO = 1.05
 """The same as a multiple of hover thrust."""
 LEAST_HOVER = 1000
 """Thrust below which nothing flies."""
 
 # --- motion and place ---
-STILL_MPS = 0.05
+MOTIONLESS_MPS = 0.05
 """Vertical speed below which the vehicle does not move. Larger: a slow sink counts as hanging."""
 UNPRESSED_MPS = 0.05
 """Vertical speed up to which it may press, as an attempt ends."""
@@ -153,11 +153,15 @@ def is_hover_thrust(b: Belief) -> bool:
     """True if the thrust is hover thrust: nothing carries, presses or accelerates the vehicle."""
     tel, setpoint = b.telemetry, b.sent.setpoint
     vz = tel.velocity_mps[2]
-    stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < STILL_MPS
+    stuck = (
+        setpoint is not None
+        and setpoint.z_m - tel.position_m[2] > PRESSED_M
+        and vz < MOTIONLESS_MPS
+    )
     return (
         b.proves
         and b.position_valid
-        and LEAST_HOVER <= tel.thrust < SATURATED * FULL_THRUST
+        and LEAST_HOVER <= tel.thrust < PRESS_SATURATED_PART * FULL_THRUST
         and b.speed_mps < QUIET_MPS
         and abs(vz) < QUIET_CLIMB_MPS
         and abs(tel.acc_z_g - 1.0) < QUIET_G
@@ -180,7 +184,9 @@ def is_carried_by_other_than_thrust(b: Belief) -> bool:
 def is_strong(b: Belief) -> bool:
     """True if the thrust is at its limit, or above hover thrust."""
     thrust, hover = b.telemetry.thrust, b.hover_thrust
-    return thrust >= PRESSING_PART * FULL_THRUST or (hover > 0 and thrust >= PRESSING_RATIO * hover)
+    return thrust >= PRESSING_PART * FULL_THRUST or (
+        hover > 0 and thrust >= PRESSING_HOVER_RATIO * hover
+    )
 
 
 def is_pressing(b: Belief) -> bool:
@@ -206,7 +212,9 @@ def is_slipping(b: Belief) -> bool:
 
 def is_still(b: Belief) -> bool:
     """True if it does not move, and something carries it: the accelerometer reads one g."""
-    return b.reads_one_g and (abs(b.telemetry.velocity_mps[2]) < STILL_MPS or not b.position_valid)
+    return b.reads_one_g and (
+        abs(b.telemetry.velocity_mps[2]) < MOTIONLESS_MPS or not b.position_valid
+    )
 
 
 def _is_in_contact(b: Belief) -> bool:
@@ -292,7 +300,8 @@ def _is_blocked(b: Belief) -> bool:
     hover = b.hover_thrust
     ratio = b.profile.safety.blocked_thrust_ratio
     pressing = hover < LITTLE_LEFT * FULL_THRUST and (
-        tel.thrust >= SATURATED * FULL_THRUST or (hover > 0 and tel.thrust >= ratio * hover)
+        tel.thrust >= PRESS_SATURATED_PART * FULL_THRUST
+        or (hover > 0 and tel.thrust >= ratio * hover)
     )
     return pressing and b.height_m > OFF_GROUND_M and is_still(b)
 
@@ -302,7 +311,7 @@ def _is_carried_by_feel(b: Belief) -> bool:
     more or much less thrust than hovering takes it would rise or sink in the air."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     apart = (b.profile.safety.blocked_thrust_ratio - 1.0) * hover
-    pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
+    pressed = tel.thrust >= min(hover + apart, PRESS_SATURATED_PART * FULL_THRUST)
     return (
         0 < hover < LITTLE_LEFT * FULL_THRUST
         and b.thrust_is_known
@@ -313,8 +322,8 @@ def _is_carried_by_feel(b: Belief) -> bool:
 
 
 def _is_saturated(b: Belief) -> bool:
-    full = b.telemetry.thrust >= SATURATED * FULL_THRUST
-    return full and SINKING_SLOWLY_MPS < b.climb_mps < STILL_MPS
+    full = b.telemetry.thrust >= PRESS_SATURATED_PART * FULL_THRUST
+    return full and SINKING_SLOWLY_MPS < b.climb_mps < MOTIONLESS_MPS
 
 
 CONTACT = Condition("contact", _is_in_contact, rests_on=Rests.POSITION)

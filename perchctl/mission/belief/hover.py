@@ -34,7 +34,7 @@ LATEST_S = 1.0
 LEAST_FELT_G = 0.7
 """Specific force between which, and `MOST_FELT_G`, thrust divided by it is hover thrust."""
 MOST_FELT_G = 1.3
-LEAST_PART = 0.5
+LEAST_PROPORTIONAL_PART = 0.5
 """Share of the first hover thrust below which thrust is not proportional to force."""
 LEAST_DIVISOR_G = 0.75
 """Bounds of the specific force that a single sample's thrust is divided by."""
@@ -65,7 +65,9 @@ def in_descent(b: Belief, *, first: float, within: float, felt_floor: bool, dt_s
     a magnet may carry a part of the weight, or the telemetry shows nothing of it."""
     tel = b.telemetry
     old = b.hover_thrust
-    shows = LEAST_FELT_G <= tel.acc_z_g <= MOST_FELT_G and tel.thrust >= LEAST_PART * first
+    shows = (
+        LEAST_FELT_G <= tel.acc_z_g <= MOST_FELT_G and tel.thrust >= LEAST_PROPORTIONAL_PART * first
+    )
     if b.attitude_age_s > LATEST_S or not shows:
         return old
     if b.is_in_magnet_reach or felt_floor:

@@ -45,13 +45,13 @@ NO_FALL_M = 0.25
 """Distance across a silence beyond what the speed before it explains. Larger: as `NO_FALL_MPS`."""
 SINKS_MPS = -0.3
 """Reached 5 cm into a fall; what hangs is never faster. Closer to 0: noise counts as a fall."""
-FROZEN_S = 0.2
+FROZEN_READING_S = 0.2
 """The same reading for so long counts as a silence. Smaller: coarse readings freeze by chance."""
 FALL_G = 0.6
 """Specific force below which a vehicle falls, g. Larger: the press's release counts as a fall."""
 FALL_S = 0.1
 """A fall reads light for so long; a rebound is shorter. Larger: 5 cm more of fall."""
-SINK_MPS = -0.25
+IMU_SINK_MPS = -0.25
 """Downward speed, gained within `SINK_MEMORY_S`, at which it comes down whatever the offsets are.
 Closer to 0: vibration counts as a fall."""
 SINK_MEMORY_S = 1.5
@@ -93,7 +93,7 @@ HOVER_MEMORY_S = 0.5
 """Time in which the hover thrust follows. Larger: a sagging battery is noticed later."""
 LEAST_FLYING = 0.4
 """Share of full thrust below which nothing hovers."""
-SATURATED = 0.95
+HOVER_SATURATED_PART = 0.95
 """Share of full thrust from which on the thrust for 1 g is not known."""
 UNCORRECTED_M2PS2_PER_S = 5e-4
 """Half of the growth of the vertical speed's variance while nothing corrects it."""
@@ -176,7 +176,7 @@ class FallDetector:
 
         sink' = min(0, sink + a dt - sink dt / SINK_MEMORY_S)
 
-    is the downward speed that was gained lately. It fell if that is more than `SINK_MPS`, or if it
+    is the downward speed that was gained lately. It fell if that is more than `IMU_SINK_MPS`, or if it
     has read less than `FALL_G` for longer than a rebound does. Wrong for a sink slower than
     `OFFSET_MEMORY_S` learns.
     """
@@ -196,7 +196,7 @@ class FallDetector:
         sink = self.sink_mps + felt_mps2 * dt_s
         sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
         light = min(self.light_since_s, t_s) if reads_g < FALL_G else math.inf
-        fell = sink < SINK_MPS or t_s - light >= FALL_S
+        fell = sink < IMU_SINK_MPS or t_s - light >= FALL_S
         return replace(
             self,
             fell_s=t_s if fell else self.fell_s,
@@ -337,7 +337,7 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
             corrections=self.corrections.update(new),
             off_s=min(self.off_s, new.t_s) if new.thrust < 1 else math.inf,
         )
-        if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_S:
+        if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_READING_S:
             return _after_silence(motion, last, new)
         motion, up_mps2 = _integrate(motion, last, new, dt_s)
         now = Impact(
@@ -390,7 +390,7 @@ def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) ->
     if last is None:
         return replace(motion, sunk_m=0.0)
     sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
-    alive = 0.0 <= motion.place_frozen_s <= FROZEN_S and new.start == last.start
+    alive = 0.0 <= motion.place_frozen_s <= FROZEN_READING_S and new.start == last.start
     if alive and _shows_no_fall(last, new, sunk_m):
         return replace(motion, silent_s=new.t_s, sunk_m=sunk_m)
     return replace(motion, silent_s=new.t_s, gap_s=new.t_s, sunk_m=0.0)
@@ -462,7 +462,7 @@ def _frozen_s(
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    flies = sample.has_bit(FLYING) and sample.thrust < SATURATED * FULL_THRUST
+    flies = sample.has_bit(FLYING) and sample.thrust < HOVER_SATURATED_PART * FULL_THRUST
     if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
         return old
     felt = sample.thrust / sample.acc_z_g

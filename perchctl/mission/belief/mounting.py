@@ -15,8 +15,8 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-WINDOW_S = 3.0  # older sights are left out: the estimate drifts
-LEAST_SIGHTS = 10
+MOUNTING_WINDOW_S = 3.0  # older sights are left out: the estimate drifts
+MOUNTING_LEAST_SIGHTS = 10
 JUDGED_M, PROVEN_M = 0.12, 0.3
 """Motion of the axis from which on the mounting is judged, and beyond which it is proven."""
 STANDS_STILL, MOVES_ALONG = 0.35, 0.6
@@ -28,7 +28,11 @@ LEAST_TURN_RAD = math.radians(65.0)  # a lesser one leads to the target in a bow
 SIGHTS_IN_A_ROW = 4
 JUMPS, SETTLES_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 """Metres, seconds: a target that moves so much farther than twice the vehicle has been moved."""
-ESTIMATE_JUMP_M, FASTEST_MPS = 0.05, 1.5  # farther between two sights is a new world
+ESTIMATE_JUMP_M = 0.05
+"""A vehicle that moves farther between two sights, beyond `ESTIMATE_JUMP_MPS`, is in a new world.
+Larger: sights from before and after a jump of the estimate are compared."""
+ESTIMATE_JUMP_MPS = 1.5
+"""The same for each second between them. Smaller: a fast vehicle drops its sights."""
 _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 
@@ -84,18 +88,18 @@ def update_monitor(old: MountingMonitor, sight: MountSample) -> MountingMonitor:
     """The monitor with one more sight of a measured target."""
     if old.mounting_fits or old.is_wrong:
         return old
-    kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= WINDOW_S)
+    kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= MOUNTING_WINDOW_S)
     if kept and _jumped(kept, sight):
         return MountingMonitor(paused_until_s=sight.t_s + SETTLES_S)
     if sight.t_s < old.paused_until_s:
         return old
     new = replace(old, sights=(*kept, sight), target_still=False, doubts=0)
-    return new if len(new.sights) < LEAST_SIGHTS else _judged(new, old.doubts)
+    return new if len(new.sights) < MOUNTING_LEAST_SIGHTS else _judged(new, old.doubts)
 
 
 def _jumped(before: tuple[MountSample, ...], sight: MountSample) -> bool:
     last = before[-1]
-    far = ESTIMATE_JUMP_M + FASTEST_MPS * (sight.t_s - last.t_s)
+    far = ESTIMATE_JUMP_M + ESTIMATE_JUMP_MPS * (sight.t_s - last.t_s)
     if abs(sight.vehicle_m - last.vehicle_m) > far:
         return True
     for s in reversed(before):

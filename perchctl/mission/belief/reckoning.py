@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
-    FROZEN_S,
+    FROZEN_READING_S,
     GAP_S,
     PUSHED_S,
     REST_MEMORY_S,
@@ -47,7 +47,7 @@ CLIMB_SPARE_MPS = 0.1
 """Speed by which it may climb faster than reckoned. Larger: the magnet seems near too early."""
 MOST_CLIMB_MPS = 1.0
 """Climb in a silence, by the position mode's own limit."""
-REACH_M = 0.04
+MAGNET_REACH_M = 0.04
 """A gear this close below the target may have been caught by its magnet. Larger: a vehicle in the
 air is treated as one that may hang. Smaller: a caught one is treated as flying."""
 BOUNCE_WITHIN_M = 0.1
@@ -135,7 +135,7 @@ def advance_reckoning(
         carried = not old.imu.t_s < imu.silent_s <= blow.t_s
         carried_mps = old.velocity_mps[2] + blow.felt_mps - old.imu.velocity_mps[2]
         old = replace(old, struck_mps=carried_mps if carried else blow.estimated_mps)
-    frozen = imu.attitude_frozen_s > FROZEN_S
+    frozen = imu.attitude_frozen_s > FROZEN_READING_S
     if old.imu is None or imu.silent_s > old.imu.t_s or frozen:
         return _begin_anew(old, imu, estimated, believed=believed, diverged=diverged)
     return _carry_on(
@@ -179,7 +179,7 @@ def _begin_anew(
         if flew:
             climb_m = MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
         nearest_m = old.nearest_m - climb_m
-        near = nearest_m < REACH_M
+        near = nearest_m < MAGNET_REACH_M
         unknown = replace(
             unknown,
             nearest_m=nearest_m,

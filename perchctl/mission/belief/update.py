@@ -37,8 +37,8 @@ from perchctl.mission.belief.motion import ZERO, Vector
 from perchctl.mission.belief.mounting import MountingMonitor, mount_sample, update_monitor
 from perchctl.mission.belief.quality import QUALITY_CONDITIONS, hold_reason
 from perchctl.mission.belief.reckoning import (
+    MAGNET_REACH_M,
     MOST_SILENT_MOVE_S,
-    REACH_M,
     UNSEEN_S,
     DeadReckoning,
     add_position_step,
@@ -242,7 +242,7 @@ def _at_rest_on_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
     """At its contact, a vehicle that was steady for a while does not move."""
     obs = b.obs
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
-    if b.contact_z_m is None or not new.below_m < REACH_M or not rests:
+    if b.contact_z_m is None or not new.below_m < MAGNET_REACH_M or not rests:
         return new
     blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
     x_mps, y_mps, _ = new.velocity_mps
@@ -311,11 +311,11 @@ def _reach_s(b: Belief, new: DeadReckoning) -> float | None:
     if not b.sent.is_motor_borne:  # what is released or stopped moves no more
         return reach_s
     # After the floor was touched nothing climbs, whatever was reckoned since.
-    near = new.below_m < REACH_M and b.sent.floor_felt_s is None
+    near = new.below_m < MAGNET_REACH_M and b.sent.floor_felt_s is None
     if b.contact_z_m is None and not near:
         return None
     # Caught below the magnet it may be drawn to it again: an earlier fall proves nothing then.
-    again = reach_s is not None and b.imu.fell_s > reach_s and new.below_m < REACH_M
+    again = reach_s is not None and b.imu.fell_s > reach_s and new.below_m < MAGNET_REACH_M
     return b.obs.t_s if reach_s is None or again else reach_s
 
 

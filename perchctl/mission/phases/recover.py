@@ -36,13 +36,13 @@ from perchctl.vehicle import PositionSetpoint
 
 CARRIED_RATIO = 0.85
 """Share of the hover thrust with which a vehicle that slips sinks slowly, and needs no catch."""
-AWAY_M = 0.05
+RECOVER_CLEAR_M = 0.05
 """So far below the contact, or half of the way down, it has left."""
 SEEN_LATELY_S = 3.0
 """Age of a target under which the vehicle is still moved."""
 ATTEMPTS_SEEN_S = 0.5
 """Time for which it recovers before the last attempt ends the flight."""
-DOWN_MPS = 10.0
+RECOVER_DOWN_MPS = 10.0
 """A speed limit that limits nothing: the setpoint is where it leads."""
 
 STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
@@ -91,7 +91,7 @@ def act(c: Context) -> Action:
     if (caught := catch_slip(c)) is not None:
         return caught
     recover = c.planner.recover
-    c = Context(clear_contact_below(c.state, min(AWAY_M, 0.5 * recover.descend_m)))
+    c = Context(clear_contact_below(c.state, min(RECOVER_CLEAR_M, 0.5 * recover.descend_m)))
     state, away = leave_press(c)
     if away is not None:
         return state, away
@@ -110,7 +110,7 @@ def act(c: Context) -> Action:
     else:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
-    return fly_to(c, step_towards(c, setpoint, goal, down_mps=DOWN_MPS))
+    return fly_to(c, step_towards(c, setpoint, goal, down_mps=RECOVER_DOWN_MPS))
 
 
 def has_recovered(c: Context) -> bool:

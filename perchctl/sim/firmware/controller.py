@@ -21,16 +21,18 @@ MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
 
 # --- Setpoints: which axes are controlled how ---
 
-DISABLED, ABSOLUTE, VELOCITY = 0, 1, 2
+DISABLED = 0
+ABSOLUTE = 1
+BY_VELOCITY = 2
 
 Mode = tuple[int, int, int, int, int, int]  # x, y, z, roll, pitch, yaw
 
 MODE_OFF: Mode = (DISABLED,) * 6
 MODE_POSITION: Mode = (ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLED, DISABLED, ABSOLUTE)
-MODE_VELOCITY: Mode = (VELOCITY, VELOCITY, VELOCITY, DISABLED, DISABLED, VELOCITY)
-MODE_HOVER: Mode = (VELOCITY, VELOCITY, ABSOLUTE, DISABLED, DISABLED, VELOCITY)
-MODE_Z_DISTANCE: Mode = (DISABLED, DISABLED, ABSOLUTE, ABSOLUTE, ABSOLUTE, VELOCITY)
-MODE_RAW: Mode = (DISABLED, DISABLED, DISABLED, ABSOLUTE, ABSOLUTE, VELOCITY)
+MODE_VELOCITY: Mode = (BY_VELOCITY, BY_VELOCITY, BY_VELOCITY, DISABLED, DISABLED, BY_VELOCITY)
+MODE_HOVER: Mode = (BY_VELOCITY, BY_VELOCITY, ABSOLUTE, DISABLED, DISABLED, BY_VELOCITY)
+MODE_Z_DISTANCE: Mode = (DISABLED, DISABLED, ABSOLUTE, ABSOLUTE, ABSOLUTE, BY_VELOCITY)
+MODE_RAW: Mode = (DISABLED, DISABLED, DISABLED, ABSOLUTE, ABSOLUTE, BY_VELOCITY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,7 @@ class Setpoint:
 
     def level_setpoint(self) -> Setpoint:
         """The setpoint flown while setpoints are missing: level, no yaw rate, same z."""
-        mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, VELOCITY)
+        mode = (DISABLED, DISABLED, self.mode[2], ABSOLUTE, ABSOLUTE, BY_VELOCITY)
         return replace(self, mode=mode, roll_deg=0.0, pitch_deg=0.0, yaw_rate_dps=0.0)
 
 
@@ -171,7 +173,7 @@ class Controller:
         if mode != self._mode:
             self._mode = mode
             self._reset(now)
-        if mode[5] == VELOCITY:
+        if mode[5] == BY_VELOCITY:
             turned_deg = setpoint.yaw_rate_dps * ATTITUDE_DT_S
             self.desired_yaw_deg = wrap_deg(self.desired_yaw_deg + turned_deg)
         elif mode[5] == ABSOLUTE:

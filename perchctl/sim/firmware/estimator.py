@@ -17,8 +17,8 @@ import numpy as np
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, wrap_deg
 from perchctl.sim.firmware.outside import (
-    POSITION,
-    VELOCITY,
+    POSITION_STATE,
+    VELOCITY_STATE,
     ExternalFilter,
     Imu,
     Quaternion,
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from perchctl.sim.world import World
 
 KALMAN = 2
-_STREAM = 2
-_DEG = 180.0 / math.pi
-_BATCH = 2048
+_ESTIMATOR_STREAM = 2
+_DEG_PER_RAD = 180.0 / math.pi
+_NOISE_BATCH = 2048
 _NOISE_EVERY = 5  # coloured noise advances at 100 Hz
 _POSITION_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.3)  # a memory of 0.3 s
 _VELOCITY_KEEP = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / 0.1)
@@ -64,7 +64,7 @@ class Estimator:
 
     def __init__(self, scenario: Scenario, parameters: Mapping[str, float]) -> None:
         self._scenario, self._parameters = scenario, parameters
-        self._rng = np.random.default_rng([scenario.seed, _STREAM])
+        self._rng = np.random.default_rng([scenario.seed, _ESTIMATOR_STREAM])
         self._white: list[float] = []
         self.now = Estimate()
         self.gyro: Quaternion | None = None
@@ -104,7 +104,7 @@ class Estimator:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
-    def variance(self, t_s: float, state: int = POSITION) -> float:
+    def variance(self, t_s: float, state: int = POSITION_STATE) -> float:
         """The variance of a state of position or velocity, in the order of `ExternalFilter`'s.
 
         Zero, as in memory that nothing has written, while another estimator runs. A Flow deck
@@ -116,10 +116,10 @@ class Estimator:
             return float(self.outside.covariance[state, state])
         if t_s - self._reset_s < _FIRST_DECK_S:
             return float(first_covariance()[state, state])
-        is_level = state % VELOCITY < 2  # of x and y
+        is_level = state % VELOCITY_STATE < 2  # of x and y
         if not any(self._parameters[f"deck.{name}"] for name in FLOW_DECKS):
-            return _ABSOLUTE_M2PS2 if state >= VELOCITY else _ABSOLUTE_M2
-        if state < VELOCITY:
+            return _ABSOLUTE_M2PS2 if state >= VELOCITY_STATE else _ABSOLUTE_M2
+        if state < VELOCITY_STATE:
             return float(first_covariance()[state, state]) if is_level else _RANGED_M2
         return _FLOW_M2PS2 * max(self.now.z_m, _FLOW_LEAST_M) ** 1.5 if is_level else _CLIMB_M2PS2
 
@@ -138,7 +138,7 @@ class Estimator:
         `pressed` to the ceiling it is biased; `flying` is the supervisor's state.
         """
         if len(self._white) < 12:
-            self._white = self._rng.standard_normal(_BATCH).tolist()
+            self._white = self._rng.standard_normal(_NOISE_BATCH).tolist()
         if self._steps % _NOISE_EVERY == 0:
             sigma = self._scenario.estimate_noise_m
             self._position_noise = self._walk(self._position_noise, _POSITION_KEEP, sigma)
@@ -159,16 +159,16 @@ class Estimator:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         lift = 2 * (w * y - x * z)
         pitch = math.asin(lift if -1.0 <= lift <= 1.0 else math.copysign(1.0, lift))
-        now.roll_deg = wrap_deg(_DEG * (roll + bias[0]))
-        now.pitch_deg = -_DEG * (pitch + bias[1])  # the firmware's pitch is nose up
-        now.yaw_deg = _DEG * math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+        now.roll_deg = wrap_deg(_DEG_PER_RAD * (roll + bias[0]))
+        now.pitch_deg = -_DEG_PER_RAD * (pitch + bias[1])  # the firmware's pitch is nose up
+        now.yaw_deg = _DEG_PER_RAD * math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
         if len(self._white) < 12:
-            self._white = self._rng.standard_normal(_BATCH).tolist()
+            self._white = self._rng.standard_normal(_NOISE_BATCH).tolist()
         n6, n5, n4, n3, n2, n1 = self._white[-6:]
         del self._white[-6:]
-        now.gyro_x_dps = _DEG * (world.p_radps + gyro_bias[0]) + _GYRO_NOISE_DPS * n1
-        now.gyro_y_dps = _DEG * (world.q_radps + gyro_bias[1]) + _GYRO_NOISE_DPS * n2
-        now.gyro_z_dps = _DEG * (world.r_radps + gyro_bias[2]) + _GYRO_NOISE_DPS * n3
+        now.gyro_x_dps = _DEG_PER_RAD * (world.p_radps + gyro_bias[0]) + _GYRO_NOISE_DPS * n1
+        now.gyro_y_dps = _DEG_PER_RAD * (world.q_radps + gyro_bias[1]) + _GYRO_NOISE_DPS * n2
+        now.gyro_z_dps = _DEG_PER_RAD * (world.r_radps + gyro_bias[2]) + _GYRO_NOISE_DPS * n3
         if self.spoil is not None:
             self.spoil(now)
         ax, ay, az = self.acc_g

@@ -34,7 +34,7 @@ IMU_EVERY = 5
 """Control periods from one mean to the next."""
 IMU_PERIOD_S = IMU_EVERY * CONTROL_PERIOD_S
 
-_IMU_STREAM = 12
+_IMU_NOISE_STREAM = 12
 _IMU_BATCH = 1536
 _SAMPLES = 1000.0 * IMU_PERIOD_S  # of a real one, in each mean
 _GYRO_NOISE_RADPS = math.radians(0.1) / math.sqrt(_SAMPLES)
@@ -55,7 +55,7 @@ class Imu:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._rng = np.random.default_rng([scenario.seed, _IMU_STREAM])
+        self._rng = np.random.default_rng([scenario.seed, _IMU_NOISE_STREAM])
         self._white: list[float] = []
         angle = float(self._rng.uniform(-math.pi, math.pi))
         p, q, r = scenario.gyro_bias_radps
@@ -101,8 +101,12 @@ class Imu:
 # --- The filter ---
 
 
-POSITION, VELOCITY, ATTITUDE = 0, 3, 6
-"""Where each begins among the nine states, x first."""
+POSITION_STATE = 0
+"""Index of the position's x among the nine states; y and z follow."""
+VELOCITY_STATE = 3
+"""The same for the velocity."""
+ATTITUDE_STATE = 6
+"""The same for the attitude."""
 
 _FIRST_M, _FIRST_HEIGHT_M, _FIRST_MPS, _FIRST_RAD = 100.0, 1.0, 0.01, 0.01
 """Standard deviations after a reset (source: `stdDevInitial*`)."""
@@ -177,7 +181,7 @@ class ExternalFilter:
         if all(map(math.isfinite, measured_m)):
             (mx, my, mz), (x, y, z) = measured_m, self.position_m
             sigma_m = self._parameters["locSrv.extPosStdDev"]
-            self._correct(POSITION, (mx - x, my - y, mz - z), sigma_m)
+            self._correct(POSITION_STATE, (mx - x, my - y, mz - z), sigma_m)
 
     def update_attitude(self, measured: Quaternion) -> None:
         """Correct the estimate by an external attitude, body to world."""
@@ -190,15 +194,21 @@ class ExternalFilter:
             return  # half a turn, which has no direction
         twice = 2.0 / left[0]
         wrong = (twice * left[1], twice * left[2], twice * left[3])
-        self._correct(ATTITUDE, wrong, self._parameters["locSrv.extQuatStdDev"])
+        self._correct(ATTITUDE_STATE, wrong, self._parameters["locSrv.extQuatStdDev"])
 
     def _grow(self, force_mps2: Vector) -> None:
         sx, sy, sz = (IMU_PERIOD_S * part for part in force_mps2)
         for rows in (self.covariance, self.covariance.T):
-            rows[POSITION:VELOCITY] += IMU_PERIOD_S * rows[VELOCITY:ATTITUDE]
-            a, b, c = rows[ATTITUDE:]
-            u, v, w = rows[VELOCITY:ATTITUDE]
-            rows[VELOCITY:ATTITUDE] = u + sz * b - sy * c, v + sx * c - sz * a, w + sy * a - sx * b
+            rows[POSITION_STATE:VELOCITY_STATE] += (
+                IMU_PERIOD_S * rows[VELOCITY_STATE:ATTITUDE_STATE]
+            )
+            a, b, c = rows[ATTITUDE_STATE:]
+            u, v, w = rows[VELOCITY_STATE:ATTITUDE_STATE]
+            rows[VELOCITY_STATE:ATTITUDE_STATE] = (
+                u + sz * b - sy * c,
+                v + sx * c - sz * a,
+                w + sy * a - sx * b,
+            )
         self.covariance += IMU_PERIOD_S * np.diag(_NOISE_PER_S)
         self._bound()
 

@@ -8,7 +8,9 @@ from typing import NamedTuple
 from perchctl.geometry import wrap_rad
 from perchctl.sim.firmware.controller import MODE_POSITION, Setpoint
 
-IDLE, FLYING, LANDING = 0, 1, 3
+TRAJECTORY_IDLE = 0
+TRAJECTORY_FLYING = 1
+TRAJECTORY_LANDING = 3
 Place = tuple[float, float, float]
 
 
@@ -56,7 +58,7 @@ class HighLevelPlanner:
     """Plans with states idle, flying and landing; setpoints for the commander at 100 Hz."""
 
     def __init__(self) -> None:
-        self.state = IDLE
+        self.state = TRAJECTORY_IDLE
         self.blocked = False
         self._begin_s = 0.0
         self._duration_s = 0.0
@@ -65,15 +67,15 @@ class HighLevelPlanner:
 
     @property
     def active(self) -> bool:
-        return self.state != IDLE
+        return self.state != TRAJECTORY_IDLE
 
     def finished(self, t_s: float) -> bool:
         """True if the plan is over, by clock, not height (docs/firmware.md, "Setpoint modes")."""
-        return self.state == IDLE or t_s - self._begin_s >= self._duration_s
+        return self.state == TRAJECTORY_IDLE or t_s - self._begin_s >= self._duration_s
 
     def stop(self, t_s: float = 0.0) -> None:
         """End the plan at once."""
-        self.state = IDLE
+        self.state = TRAJECTORY_IDLE
 
     def set_blocked(self, blocked: bool) -> None:
         """Forbid or allow motors. While forbidden, plans end and new ones are refused."""
@@ -92,10 +94,14 @@ class HighLevelPlanner:
         duration_s: float,
         yaw_rad: float | None,
         t_s: float,
-        state: int = FLYING,
+        state: int = TRAJECTORY_FLYING,
     ) -> bool:
         """Plan a vertical flight to a height; False if refused. `yaw_rad` None: same heading."""
-        if self.blocked or self.state not in ((IDLE, FLYING) if state == LANDING else (IDLE,)):
+        if self.blocked or self.state not in (
+            (TRAJECTORY_IDLE, TRAJECTORY_FLYING)
+            if state == TRAJECTORY_LANDING
+            else (TRAJECTORY_IDLE,)
+        ):
             return False
         x, y, z, yaw = (AxisState(axis.value) for axis in self._now)
         self._plan((x, y, z, yaw), (x.value, y.value, height_m), yaw_rad, duration_s, t_s)
@@ -104,7 +110,7 @@ class HighLevelPlanner:
 
     def land(self, height_m: float, duration_s: float, yaw_rad: float | None, t_s: float) -> bool:
         """Plan as for a take-off; the motors stop when the plan ends."""
-        return self.take_off(height_m, duration_s, yaw_rad, t_s, LANDING)
+        return self.take_off(height_m, duration_s, yaw_rad, t_s, TRAJECTORY_LANDING)
 
     def go_to(
         self,
@@ -127,13 +133,13 @@ class HighLevelPlanner:
             yaw_rad += yaw.value
         start = (x, y, z, AxisState(yaw.value, yaw.rate))
         self._plan(start, (x_m, y_m, z_m), yaw_rad, duration_s, t_s)
-        self.state = FLYING
+        self.state = TRAJECTORY_FLYING
 
     def setpoint(self, t_s: float) -> Setpoint:
         """The plan's setpoint at `t_s`; while idle a setpoint with motors off."""
-        if self.state == LANDING and self.finished(t_s):
-            self.state = IDLE
-        if self.state == IDLE:
+        if self.state == TRAJECTORY_LANDING and self.finished(t_s):
+            self.state = TRAJECTORY_IDLE
+        if self.state == TRAJECTORY_IDLE:
             return Setpoint()
         x, y, z, yaw = self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
         return Setpoint(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from perchctl.sim.firmware.outside import POSITION, VELOCITY
+from perchctl.sim.firmware.outside import POSITION_STATE, VELOCITY_STATE
 
 LOG_COUNT = 385
 PARAMETER_COUNT = 257
@@ -107,8 +107,8 @@ for _i, _axis in enumerate("xyz"):
     LOG_VARIABLES |= {
         f"stateEstimate.{_axis}": _field(f"estimator.now.{_axis}_m"),
         f"stateEstimate.v{_axis}": _field(f"estimator.now.v{_axis}_mps"),
-        f"kalman.var{_axis.upper()}": _variance(POSITION + _i),
-        f"kalman.varP{_axis.upper()}": _variance(VELOCITY + _i),
+        f"kalman.var{_axis.upper()}": _variance(POSITION_STATE + _i),
+        f"kalman.varP{_axis.upper()}": _variance(VELOCITY_STATE + _i),
         f"acc.{_axis}": _item("estimator.acc_g", _i),
         f"gyro.{_axis}": _field(f"estimator.now.gyro_{_axis}_dps"),
     }
