@@ -176,9 +176,9 @@ class FallDetector:
 
         sink' = min(0, sink + a dt - sink dt / SINK_MEMORY_S)
 
-    is the downward speed that was gained lately. It fell if that is more than `IMU_SINK_MPS`, or if it
-    has read less than `FALL_G` for longer than a rebound does. Wrong for a sink slower than
-    `OFFSET_MEMORY_S` learns.
+    is the downward speed that was gained lately. The vehicle fell if that is beyond `IMU_SINK_MPS`,
+    or if it has read less than `FALL_G` for longer than a rebound does. A sink that is so slow that
+    the offset learns it goes unnoticed.
     """
 
     fell_s: float = -math.inf  # when it last fell, or came down and met the floor
