@@ -1,12 +1,14 @@
-"""Finding the two markers of the target in a picture: the steps of a frame, in order.
+"""The corners of the target's two markers in a picture.
 
-1. where they are expected, by verification instead of search (`follow_markers`);
-2. where the picture cuts them, by what is left of the drawing (`cut`);
-3. by a search in a window around that place, then in the whole picture (`search`);
-4. where blur may hide them (`blurred`).
+`METHODS` lists the methods that find corners in the order in which they are tried, with what each
+needs, what it costs and when it is used; ``docs/corners.md`` shows each of them at work.
 
-A marker of which a part is hidden is measured by what is seen of it (`partial`). Each step takes
-place within the same frame, and only where the one before saw too little.
+    frame -> Prior -> METHODS, one by one -> Findings -> Detections
+             (expected corners, kinds of search)
+
+Corners are (4, 2) px, top left, top right, bottom right, bottom left as printed; (0, 0) is the
+centre of the top-left pixel. Each marker's corners have one standard deviation (px) or a covariance
+(8, 8) px^2. A marker that no method confirms is None.
 """
 
 from __future__ import annotations
@@ -379,11 +381,9 @@ def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array
 
 
 def _refine_found(picture: Picture, found: FoundMarkers) -> _Found:
-    """Return what the search found with better corners.
-
-    Those without four lines for sides are measured by what of these is seen: a search takes the
-    picture's edge for a side.
-    """
+    """Measure the raw corners of a search: by edge fit, or else by subpixel refinement; markers
+    that are not wholly in view by the partial-view fit, because a search takes the picture's edge
+    for a side; and by the photometric fit where edges do not suffice."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(picture, raw) if setup.fits_lines else {}
@@ -464,7 +464,7 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
     return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
-# --- What lines left vague or unseen, by the drawing ---
+# --- Photometric fits of what the edge fit left vague or unseen ---
 
 
 _GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster
@@ -479,14 +479,16 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """True if a marker's line fits are accurate enough without a photometric fit."""
+    """True if a marker's edge fit is as accurate as a photometric fit would be: with cells of at
+    least 6 px and 6 times the blur."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
-    """The `seen` markers with better corners, and any other visible marker. If
-    `searched`, a lone marker is dropped unless its lines suffice or the drawing confirms it."""
+    """The `seen` markers, those whose edges do not suffice measured by a photometric fit, and any
+    other visible marker, which is derived from the first. If `searched`, a lone marker is dropped
+    unless its edges suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = large_around(picture, better["small"])
@@ -510,7 +512,7 @@ def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """The blur to start with: of the sides, where lines were fitted."""
+    """The first guess of the blur's sigma, px: that of the sides, where lines were fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
@@ -540,7 +542,9 @@ _ANCHOR = 0.12  # of the small marker's side
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """Return the markers near corners `places` (4, 2) px whose sides are straight edges."""
+    """The markers near corners `places` (4, 2) px whose four sides are straight edges, by
+    `refine_lines`: all at once, because they share the shift of all edges. What the cells show is
+    not looked at. `shift`: None to measure it."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -552,7 +556,9 @@ def fit_lines(
 def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """The expected markers whose sides and cells are all confirmed in the picture."""
+    """The expected markers, corners (4, 2) px, whose sides and cells are all confirmed in the
+    picture, by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
+    off or hidden ones, and ones with cells below 2.5 px are left out."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]
