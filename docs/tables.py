@@ -40,6 +40,7 @@ from perchctl.profile import Profile  # noqa: E402
 from perchctl.profile.keys import Key, keys  # noqa: E402
 from perchctl.record.fields import FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
+from perchctl.vision.markers.detect import METHODS  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
@@ -47,6 +48,7 @@ PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
 SEE = {  # of a key: where a page says more
     "camera.mount.rpy_deg": "[Camera mount](conventions.md#camera-mount)",
     "camera.latency_s": "[latency](cameras.md#latency)",
+    "detector.refinement": "[methods](corners.md)",
     "camera.mask": "[what the vehicle covers](calibration.md#what-the-vehicle-covers)",
 }
 
@@ -193,6 +195,16 @@ def expected_outcomes() -> str:
     )
 
 
+def corner_methods() -> str:
+    """A Markdown table of the methods that find corners, in the order in which they are tried."""
+    rows = (
+        f"| [{method.name}](#{method.name.lower().replace(' ', '-')}) | {method.needs} "
+        f"| {method.cost} | {method.used_when} |"
+        for method in METHODS
+    )
+    return "\n".join(["| method | needs | cost | used when |", "|---|---|---|---|", *rows])
+
+
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (AIRBORNE, "in the air"),
     (FLYING_PHASES, "before landing"),
@@ -260,6 +272,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "log-fields": log_fields,
     "exit-codes": exit_codes,
     "expected-outcomes": expected_outcomes,
+    "corner-methods": corner_methods,
 }
 
 

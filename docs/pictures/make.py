@@ -70,6 +70,7 @@ from perchctl.sim import (  # noqa: E402
 )
 from perchctl.vehicle import Idle, Telemetry  # noqa: E402
 from perchctl.vision import Frame, PipelineState, TargetEstimate, make_pipeline, step  # noqa: E402
+from perchctl.vision.markers.detect import METHODS  # noqa: E402
 from perchctl.vision.types import Stage  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1280, 760), (1200, 1250)
@@ -372,6 +373,16 @@ def _save_svg(figure: Figure, file: Path) -> None:
         figure.savefig(file, format="svg", metadata={"Date": None}, bbox_inches="tight")
 
 
+def corner_method(_: Flight, file: Path) -> None:
+    """How one of the methods finds corners, in a view of its own."""
+    from corners import PICTURES as by_name
+
+    by_name[CORNERS[file.name]](file)
+
+
+CORNERS = {
+    f"corners-{method.name.lower().replace(' ', '-')}.png": method.name for method in METHODS
+}
 PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "vehicle.svg": vehicle_drawing,
     "sheet.svg": sheet_drawing,
@@ -382,6 +393,7 @@ PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "panel.svg": terminal,
     "page.png": page,
     "report.png": report,
+    **dict.fromkeys(CORNERS, corner_method),
 }
 
 

@@ -1,7 +1,17 @@
-"""Markers in pictures so blurred that no search decodes them.
+"""Blurred search: markers in pictures so blurred that no search decodes them.
 
-Candidates may come from anywhere, because none is taken that the marker's drawing, laid
-over the picture itself, does not verify.
+A start near an expected marker is where a blurred template T of its drawing correlates best with
+the picture I, by shifts s:
+
+    max of  sum (I(x+s) - mean I) (T(x) - mean T) / (|I - mean I| |T - mean T|)
+
+Without an expectation, starts are the quadrilaterals whose cells correlate best with the drawing.
+They may come from anywhere, because none is taken that the photometric fit does not verify
+(`is_verified`, `is_distinctive`), and it measures the corners.
+
+Wrong where that fit is (`perchctl.vision.markers.photometric_fit`). Empty where another codeword
+would look the same, or where the marker is farther from its expected place than 0.5 sides and
+10 px. Corners are (4, 2) px.
 """
 
 from __future__ import annotations

@@ -137,7 +137,11 @@ class RefinedCorners:
 
 
 def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Corners (4, 2) by `cv2.cornerSubPix`, or raw if that diverges; `cells`: a side's cells."""
+    """Corners (4, 2) px by `cv2.cornerSubPix`, or raw if that moves one out of its window.
+
+    Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over pixels q of a window of half a
+    cell to each side, 1 to 5 px; `cells` is the number of cells along a side. Blur pulls such a
+    corner inwards by 0.15 to 0.3 px, which makes the target look far: `refined` is False."""
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)

@@ -1,8 +1,20 @@
-"""The target so near, or so far aside, that no marker is wholly in the picture.
+"""Cut-view fit: the target so near, or so far aside, that no marker is wholly in the picture.
 
-What is left of the drawing is aligned from where the target is expected, and one marker's
-corners follow, with their covariance. A part of a drawing looks like many things: it is no first
-sight of the target, and counts only if the picture is like it all over, with nearly all edges.
+The edges of the whole drawing, of both markers, are sought across their predicted places. A part of
+a drawing does not determine the eight terms of a homography, so the unknowns are a rigid body's:
+Gauss-Newton finds the rotation w and translation t by the distances r_k, px, from the drawing's
+edges to the picture's, together with the shift d of all edges (white over black):
+
+    min sum v_k (r_k - J_k (w, t, d))^2 / sigma^2 + sum ((w, t, d)_j / sigma_j)^2
+
+with Tukey's weights v. The second sum holds what is not seen at the prediction. One marker's
+corners follow by projection, with their covariance (8, 8) px^2.
+
+Wrong where the predicted tilt is off by much more than its sigma, 2 deg, and no edge shows it. A
+part of a drawing looks like many things: it is no first sight of the target, and counts only if the
+picture is like it all over (correlation above 0.9), with three quarters of the edges in view.
+
+The unit of length is half the large marker's side.
 """
 
 from __future__ import annotations

@@ -1,18 +1,21 @@
-"""Finding the two markers of the target in a picture: the steps of a frame, in order.
+"""The corners of the target's two markers in a picture.
 
-1. where they are expected, by verification instead of search (`follow_markers`);
-2. where the picture cuts them, by what is left of the drawing (`cut`);
-3. by a search in a window around that place, then in the whole picture (`search`);
-4. where blur may hide them (`blurred`).
+`METHODS` lists the methods that find corners in the order in which they are tried, with what each
+needs, what it costs and when it is used; ``docs/corners.md`` shows each of them at work.
 
-A marker of which a part is hidden is measured by what is seen of it (`partial`). Each step takes
-place within the same frame, and only where the one before saw too little.
+    frame -> Prior -> METHODS, one by one -> Findings -> Detections
+             (expected corners, kinds of search)
+
+Corners are (4, 2) px, top left, top right, bottom right, bottom left as printed; (0, 0) is the
+centre of the top-left pixel. Each marker's corners have one standard deviation (px) or a covariance
+(8, 8) px^2. A marker that no method confirms is None.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -65,6 +68,219 @@ _SHIFT_PICTURES = 5  # for which a measured shift of all edges holds: light chan
 _Found = dict[MarkerName, RefinedCorners]
 
 
+# --- The methods that find corners, in the order in which they are tried ---
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known about the target before a frame is looked at.
+
+    Attributes:
+        expected: the markers' predicted corners, each (4, 2) px; empty if no target is expected.
+        both: `expected`, with a missing marker derived from the other one.
+        look: the kinds of search whose turn it is.
+        turn: chooses the first guess of the blur by its parity; None: try all.
+        was_recent: a marker was found at most `MOST_AGE_S` before this frame; False without edge
+            fits.
+        was_cut: so it was, and no marker may have been wholly in that picture.
+        edge_shift: the shift of all edges that the last frames measured; None: measure it.
+        own: chooses among several targets if none is expected; None: by the picture alone.
+    """
+
+    expected: Mapping[MarkerName, Array]
+    both: Mapping[MarkerName, Array]
+    look: Look
+    turn: int | None
+    was_recent: bool
+    was_cut: bool
+    edge_shift: EdgeShift | None
+    own: OwnOffset | None
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the methods up to now have found in a picture: the markers' `corners`, and the result
+    of the last `search`."""
+
+    corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
+    search: FoundMarkers = field(default_factory=FoundMarkers)
+
+
+@dataclass(frozen=True, eq=False)
+class CornerMethod:
+    """One way to find corners: a row of `METHODS`.
+
+    Attributes:
+        name: its heading in ``docs/corners.md``.
+        needs: what it cannot do without.
+        cost: typical time for a picture of 640x480 on one core.
+        used_when: `is_used` in words.
+        is_used: whether it is tried, by the picture, the prior and what was found before.
+        find: the findings that replace those before it.
+    """
+
+    name: str
+    needs: str
+    cost: str
+    used_when: str
+    is_used: Callable[[Picture, Prior, Findings], bool]
+    find: Callable[[Picture, Prior, Findings], Findings]
+
+
+def _is_tracked(picture: Picture, prior: Prior, found: Findings) -> bool:
+    return prior.look != "fits" and bool(prior.both) and picture.setup.fits_lines
+
+
+def _fit_edges(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    return replace(found, corners=follow_markers(picture, prior.both, prior.edge_shift))
+
+
+def _is_off_its_track(picture: Picture, prior: Prior, found: Findings) -> bool:
+    return _is_tracked(picture, prior, found) and not found.corners
+
+
+def _search_halved(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    # Where no side was met, a near target has most often moved farther than a profile reaches.
+    searched = search_halved(picture, prior.both)
+    if searched is None:
+        return found
+    corners = _refine_found(picture, searched)
+    return Findings(corners, searched) if corners else found
+
+
+def _is_on_its_track(picture: Picture, prior: Prior, found: Findings) -> bool:
+    return _is_tracked(picture, prior, found) and not found.search.corners_px
+
+
+def _fit_visible_part(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    corners = add_partly_visible(picture, prior.both, found.corners, prior.edge_shift)
+    return replace(found, corners=corners)
+
+
+def _is_tracked_vaguely(picture: Picture, prior: Prior, found: Findings) -> bool:
+    patterns = picture.setup.patterns
+    return _is_on_its_track(picture, prior, found) and not any(
+        lines_suffice(r, patterns[name]) for name, r in found.corners.items()
+    )
+
+
+def _fit_drawing(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    return replace(found, corners=improve_corners(picture, found.corners))
+
+
+def _may_be_cut(picture: Picture, prior: Prior, found: Findings) -> bool:
+    if found.corners or not prior.was_recent:
+        return False
+    return is_target_cut(prior.both, picture.image.shape, picture.hidden)
+
+
+def _fit_cut_target(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    return replace(found, corners=fit_cut_markers(picture, prior.expected))
+
+
+def _is_searched(picture: Picture, prior: Prior, found: Findings) -> bool:
+    if prior.look in ("blurred", "fits"):
+        return False
+    if not found.corners and (not prior.was_cut or may_be_whole(prior.both, picture.image.shape)):
+        return True
+    return _missing(picture, found.corners, prior.expected)
+
+
+def _search(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    searched = search(picture, prior.expected, prior.look, prior.own)
+    if len(searched.corners_px) < len(found.corners):
+        return replace(found, search=searched)
+    return Findings(_refine_found(picture, searched), searched)
+
+
+def _may_be_blurred(picture: Picture, prior: Prior, found: Findings) -> bool:
+    has_turn = prior.look not in ("sharp", "window")
+    return not found.corners and has_turn and picture.setup.fits_lines
+
+
+def _search_blurred(picture: Picture, prior: Prior, found: Findings) -> Findings:
+    bare = replace(picture, hidden=None)
+    if prior.expected:
+        seen = find_expected_blurred(bare, prior.expected, prior.turn)
+    else:
+        seen = find_blurred(bare)
+    return replace(found, corners=improve_corners(bare, seen))
+
+
+METHODS: tuple[CornerMethod, ...] = (
+    CornerMethod(
+        name="Edge fit",
+        needs="an expected marker, whole, with cells of 2.5 px and straight sides",
+        cost="0.7 ms",
+        used_when="the target is expected; after a loss in three pictures of four",
+        is_used=_is_tracked,
+        find=_fit_edges,
+    ),
+    CornerMethod(
+        name="Half-size search",
+        needs="both markers expected, those in view with sides above 60 px",
+        cost="5 ms, with the measurement of what it finds",
+        used_when="the edge fit was tried and found no marker",
+        is_used=_is_off_its_track,
+        find=_search_halved,
+    ),
+    CornerMethod(
+        name="Partial-view fit",
+        needs="an expected marker with cells of 4 px, 60 % of its cells and four of its edges",
+        cost="3 ms for each marker",
+        used_when="the edge fit was tried, and a marker is missing; "
+        "not if the half-size search found one",
+        is_used=_is_on_its_track,
+        find=_fit_visible_part,
+    ),
+    CornerMethod(
+        name="Photometric fit",
+        needs="a whole marker with sides of 7 px, and corners to within 0.3 sides",
+        cost="1.3 ms for each marker",
+        used_when="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
+        "than 6 px or than six times the blur; not if the half-size search found one",
+        is_used=_is_tracked_vaguely,
+        find=_fit_drawing,
+    ),
+    CornerMethod(
+        name="Cut-view fit",
+        needs="a measurement at most 0.5 s old, and small-marker cells of 8 px",
+        cost="7 ms",
+        used_when="nothing was found, and each expected marker may be cut by the picture or hidden",
+        is_used=_may_be_cut,
+        find=_fit_cut_target,
+    ),
+    CornerMethod(
+        name="Search",
+        needs="a marker whose bits can be read",
+        cost="4 to 9 ms, with the measurement of what it finds",
+        used_when="nothing was found, unless the target was cut and still is; or an expected "
+        "marker with sides above 13 px is missing; after a loss in three pictures of four",
+        is_used=_is_searched,
+        find=_search,
+    ),
+    CornerMethod(
+        name="Blurred search",
+        needs="a whole marker with sides of 7 px that resembles its drawing",
+        cost="5 to 10 ms",
+        used_when="nothing was found; after a loss in one picture of four",
+        is_used=_may_be_blurred,
+        find=_search_blurred,
+    ),
+)
+"""Tried in this order in each picture. With ``detector.refinement: subpix`` only the search is
+used."""
+
+
+def find_corners(picture: Picture, prior: Prior) -> Findings:
+    """What the methods find in a picture: each that is used starts from the findings before it."""
+    found = Findings()
+    for method in METHODS:
+        if method.is_used(picture, prior, found):
+            found = method.find(picture, prior, found)
+    return found
+
+
 def detect_markers(
     frame: Frame,
     previous: Detections | None,
@@ -80,56 +296,63 @@ def detect_markers(
     `previous` detections. `empty_frames`, the number of frames in a row without markers, alternates
     the kinds of search; None: all kinds. If no target is expected, `own` chooses among several. For
     a frame of two fields the result is the fields' mean."""
+    prior = make_prior(frame, previous, setup, camera, expected, empty_frames, own)
+    if frame.fields == "woven":
+        first, second = (_detect(each, setup, camera, prior) for each in field_frames(frame))
+        return add_marker_flow(mean_of_fields(first, second), previous)
+    return add_marker_flow(_detect(frame, setup, camera, prior), previous)
+
+
+def make_prior(
+    frame: Frame,
+    previous: Detections | None,
+    setup: DetectorSetup,
+    camera: CameraModel,
+    expected: Mapping[MarkerName, Array] | None = None,
+    empty_frames: int | None = None,
+    own: OwnOffset | None = None,
+) -> Prior:
+    """What is known before the frame; arguments as of `detect_markers`."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
-    both = with_missing_marker(expected, setup.ratio, camera)
     look = _look(empty_frames, bool(expected), setup.fits_lines)
     turn = None
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
     # A part of the target is known again where it was measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
-    lately = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
-    lately = lately and setup.fits_lines and bool(last)
-    was_cut = lately and not may_be_whole(last, frame.image.shape)
+    was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
+    was_recent = was_recent and setup.fits_lines and bool(last)
     shift = None if previous is None else previous.edge_shift
     if shift is not None:
         age = shift.age + 1
         shift = replace(shift, age=age) if age < _SHIFT_PICTURES else None
+    return Prior(
+        expected=expected,
+        both=with_missing_marker(expected, setup.ratio, camera),
+        look=look,
+        turn=turn,
+        was_recent=was_recent,
+        was_cut=was_recent and not may_be_whole(last, frame.image.shape),
+        edge_shift=shift,
+        own=own,
+    )
 
-    def detected(frame: Frame) -> Detections:
-        hidden = hidden_area(frame, setup.mask)
-        image = frame.image if hidden is None else fill_hidden(frame.image, hidden)
-        picture, found = Picture(image, hidden, setup, camera), FoundMarkers()
-        seen: _Found = {}
-        if look != "fits" and both and setup.fits_lines:
-            seen, found = _followed(picture, both, shift)
-        if not seen and lately and is_target_cut(both, image.shape, hidden):
-            seen = fit_cut_markers(picture, expected)
-        findable = not was_cut or may_be_whole(both, image.shape)
-        if look not in ("blurred", "fits") and (
-            (not seen and findable) or _missing(picture, seen, expected)
-        ):
-            found = search(picture, expected, look, own)
-            if len(found.corners_px) >= len(seen):
-                seen = _refined(picture, found)
-        if not seen and look not in ("sharp", "window") and setup.fits_lines:
-            bare = replace(picture, hidden=None)
-            seen = find_expected_blurred(bare, expected, turn) if expected else find_blurred(bare)
-            seen = improve_corners(bare, seen)
-        shifts = (r.edge_shift for r in seen.values())
-        return Detections(
-            frame_index=frame.index,
-            t_s=frame.t_s,
-            large=_detection("large", seen, frame.fields),
-            small=_detection("small", seen, frame.fields),
-            mirrored=found.mirrored and not seen,
-            targets=found.targets,
-            edge_shift=next((each for each in shifts if each is not None), None),
-        )
 
-    if frame.fields == "woven":
-        return add_marker_flow(mean_of_fields(*map(detected, field_frames(frame))), previous)
-    return add_marker_flow(detected(frame), previous)
+def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prior) -> Detections:
+    hidden = hidden_area(frame, setup.mask)
+    image = frame.image if hidden is None else fill_hidden(frame.image, hidden)
+    found = find_corners(Picture(image, hidden, setup, camera), prior)
+    seen = found.corners
+    shifts = (r.edge_shift for r in seen.values())
+    return Detections(
+        frame_index=frame.index,
+        t_s=frame.t_s,
+        large=_detection("large", seen, frame.fields),
+        small=_detection("small", seen, frame.fields),
+        mirrored=found.search.mirrored and not seen,
+        targets=found.search.targets,
+        edge_shift=next((each for each in shifts if each is not None), None),
+    )
 
 
 def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
@@ -147,23 +370,6 @@ def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
     return "blurred" if empty_frames and empty_frames % every == 0 else "sharp"
 
 
-def _followed(
-    picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None
-) -> tuple[_Found, FoundMarkers]:
-    """Return what is where both are expected, or nearby: where no side was met, a near target has
-    most often moved on further than a side is looked for."""
-    seen = follow_markers(picture, expected, shift)
-    if not seen:
-        found = search_halved(picture, expected)
-        again = {} if found is None else _refined(picture, found)
-        if found is not None and again:
-            return again, found
-    seen = add_partly_visible(picture, expected, seen, shift)
-    if any(lines_suffice(r, picture.setup.patterns[name]) for name, r in seen.items()):
-        return seen, FoundMarkers()
-    return improve_corners(picture, seen), FoundMarkers()
-
-
 def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array]) -> bool:
     return any(
         name not in seen
@@ -174,12 +380,10 @@ def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array
     )
 
 
-def _refined(picture: Picture, found: FoundMarkers) -> _Found:
-    """Return what the search found with better corners.
-
-    Those without four lines for sides are measured by what of these is seen: a search takes the
-    picture's edge for a side.
-    """
+def _refine_found(picture: Picture, found: FoundMarkers) -> _Found:
+    """Measure the raw corners of a search: by edge fit, or else by subpixel refinement; markers
+    that are not wholly in view by the partial-view fit, because a search takes the picture's edge
+    for a side; and by the photometric fit where edges do not suffice."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(picture, raw) if setup.fits_lines else {}
@@ -260,7 +464,7 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
     return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
-# --- What lines left vague or unseen, by the drawing ---
+# --- Photometric fits of what the edge fit left vague or unseen ---
 
 
 _GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster
@@ -275,14 +479,16 @@ _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
 def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
-    """True if a marker's line fits are accurate enough without a photometric fit."""
+    """True if a marker's edge fit is as accurate as a photometric fit would be: with cells of at
+    least 6 px and 6 times the blur."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
     return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
-    """The `seen` markers with better corners, and any other visible marker. If
-    `searched`, a lone marker is dropped unless its lines suffice or the drawing confirms it."""
+    """The `seen` markers, those whose edges do not suffice measured by a photometric fit, and any
+    other visible marker, which is derived from the first. If `searched`, a lone marker is dropped
+    unless its edges suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
         large = large_around(picture, better["small"])
@@ -306,7 +512,7 @@ def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """The blur to start with: of the sides, where lines were fitted."""
+    """The first guess of the blur's sigma, px: that of the sides, where lines were fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
@@ -336,7 +542,9 @@ _ANCHOR = 0.12  # of the small marker's side
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """Return the markers near corners `places` (4, 2) px whose sides are straight edges."""
+    """The markers near corners `places` (4, 2) px whose four sides are straight edges, by
+    `refine_lines`: all at once, because they share the shift of all edges. What the cells show is
+    not looked at. `shift`: None to measure it."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -348,7 +556,9 @@ def fit_lines(
 def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """The expected markers whose sides and cells are all confirmed in the picture."""
+    """The expected markers, corners (4, 2) px, whose sides and cells are all confirmed in the
+    picture, by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
+    off or hidden ones, and ones with cells below 2.5 px are left out."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]

@@ -1,9 +1,19 @@
-"""A marker of which a part cannot be seen: the picture ends in it, light glares on it, or the
-vehicle's own gear is before it.
+"""Partial-view fit: a marker of which a part cannot be seen, because the picture ends in it, light
+glares on it, or the vehicle's own gear is before it.
 
-Four lines need all four sides. Here the whole square is fitted at once, to the edges where they
+Four lines need all four sides. Here the whole square is fitted at once to the edges where they
 are seen: its sides, and the inner edges of its border, which stand in for a side that is gone.
-What is not seen follows from what is, and the corners' covariance says how well.
+Gauss-Newton finds the increment P of the homography H and the shift d of all edges (white over
+black) by the distances r_k, px, from the square's edges to the picture's:
+
+    min sum w_k (r_k - a_k.P - s_k d)^2 + (d - d_0)^2 / sigma_d^2,    H <- H (I + P)
+
+where a_k is an edge's change with P, s_k is -1 for sides and +1 for inner edges, and d_0 the shift
+measured before. What is not seen follows from what is, and the corners' covariance (8, 8) px^2,
+J N^-1 J' times the variance of an edge, says how well.
+
+Wrong where the rim of a glare or of a shadow runs along a side and passes for it. None where the
+edges leave a corner vaguer than 2 % of the side, or where the cells in view are not the marker's.
 """
 
 from __future__ import annotations

@@ -1,10 +1,21 @@
-"""A marker's drawing laid over the picture: for what edges and bits no longer show.
+"""Photometric fit: a marker's drawing laid over the picture, where edges and bits no longer show.
 
-Where blur has run the cells together, or cells are a few pixels wide, the picture of
-the whole marker still is its drawing, blurred and lit. Gauss-Newton finds the
-homography together with the light and the blur. What does not look like the drawing then, cell
-by cell, is not the marker. Coordinates are the marker's own, see
-`perchctl.vision.markers.corners`.
+Where blur has run the cells together, or cells are a few pixels wide, the picture of the whole
+marker still is its drawing D, blurred and lit. Gauss-Newton finds the homography H together with
+the blur's sigma and the light, at the nodes u of a grid over the marker:
+
+    min sum (I(lens(H u)) - [a + b.u + (c + e.u) D + f D (1 - D)])^2,    D blurred by sigma
+
+a, b: black level and its slope; c, e: gain and its slope; f: bend of the tone curve; where the
+sheet ends, the grey beyond it is one more unknown. What does not look like the drawing then, cell
+by cell, is not the marker.
+
+Wrong where the blur differs between directions (fast motion), where something covers a part but
+leaves the cells readable, and where white is clipped; the fit itself does not notice a codeword
+that looks the same under that blur: `Alignment.flip` tells how near one is.
+
+Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to
+255; grids are (n, n) nodes, stored as rows of n * n.
 """
 
 from __future__ import annotations

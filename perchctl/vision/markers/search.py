@@ -1,4 +1,13 @@
-"""The search for both markers: in a window, then in the whole picture; the choice among them."""
+"""The search for both markers: in a window, then in the whole picture; the choice among them.
+
+OpenCV's ArUco detector thresholds the picture adaptively and decodes the quadrilaterals. Its
+corners are raw: off by about 0.5 px, mostly inwards, and the picture's edge passes for a side. A
+pixel p' of a window at half size that begins at pixel o is at
+
+    p = 2 p' + 1/2 + o
+
+Nothing is found where blur or the picture's edge hides the bits. Corners are (4, 2) px.
+"""
 
 from __future__ import annotations
 

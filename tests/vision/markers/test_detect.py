@@ -1,4 +1,4 @@
-"""The steps of a frame, from picture to detections."""
+"""The methods that find corners in a frame, and the table of them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import project, square_corners
+from perchctl.vision.markers import detect
 from perchctl.vision.markers.detect import (
+    METHODS,
     detect_markers,
+    find_corners,
     follow_markers,
     large_around,
     mean_of_fields,
@@ -17,6 +20,7 @@ from perchctl.vision.markers.detect import (
 from perchctl.vision.markers.detector import Picture, make_aruco_detector
 from perchctl.vision.markers.search import nesting_error
 from perchctl.vision.types import Detection, Detections
+from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import POSE, SETUP, both, box, corners, followed, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -139,3 +143,37 @@ def test_nothing_is_between_two_targets() -> None:
     ]
     mean = mean_of_fields(*fields)
     assert mean.large.corners_px[:, 0].mean() == pytest.approx(100.0)
+
+
+# --- The table of methods ----------------------------------------------------------------------
+
+
+EACH_VIEW = pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.method)
+
+
+def test_each_method_has_a_name_and_a_view_of_its_own() -> None:
+    assert [view.method for view in VIEWS] == [method.name for method in METHODS]
+    assert len({method.name for method in METHODS}) == len(METHODS)
+
+
+@EACH_VIEW
+def test_each_method_finds_the_corners_in_its_view(view: View) -> None:
+    found = {method.name: after for method, after in findings(view)}
+    measured = found[view.method].corners[view.marker]
+    in_view = ((view.true_px >= 0.0) & (view.true_px <= (639.0, 479.0))).all(axis=1)
+    assert measured.refined
+    assert np.abs(measured.corners_px - view.true_px)[in_view].max() < view.within_px
+
+
+# Without the half-size search the search in the full picture finds the same, later.
+@pytest.mark.parametrize(
+    "view",
+    [view for view in VIEWS if view.method != "Half-size search"],
+    ids=lambda view: view.method,
+)
+def test_without_its_row_a_method_is_missed(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    with_it = find_corners(view.picture, view.prior).corners[view.marker]
+    rest = tuple(method for method in METHODS if method.name != view.method)
+    monkeypatch.setattr(detect, "METHODS", rest)
+    without = find_corners(view.picture, view.prior).corners.get(view.marker)
+    assert without is None or not np.array_equal(without.corners_px, with_it.corners_px)
