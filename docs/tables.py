@@ -28,11 +28,11 @@ from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.phase import (  # noqa: E402
     AIRBORNE,
-    BEFORE_COMPLETION,
     BEFORE_CONTACT,
     BY_CAMERA,
     FLYING_PHASES,
     IN_THE_OPEN,
+    MAGNET_MAY_CATCH,
 )
 from perchctl.mission.transition import Transition  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
@@ -211,7 +211,7 @@ _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (BEFORE_CONTACT, "before contact"),
     (BY_CAMERA, "by camera"),
     (IN_THE_OPEN, "in the open"),
-    (BEFORE_COMPLETION, "by camera, PERCH"),
+    (MAGNET_MAY_CATCH, "by camera, PERCH"),
     (IN_THE_OPEN | {Phase.LANDING}, "in the open, LANDING"),
 )
 

@@ -39,16 +39,29 @@ class Phase(Enum):
         return self in TERMINALS
 
 
-SEVEN_PHASES = tuple(Phase)[:7]
-FLYING_PHASES = frozenset({*SEVEN_PHASES, Phase.RECOVER})
+# Sets of phases that rows apply in. The first three are defined by what they leave out, so that the
+# gravest rows hold in a new phase before anybody thinks of it.
+TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
+"""Phases that are never left."""
+AIRBORNE = frozenset(Phase) - TERMINALS
+FLYING_PHASES = AIRBORNE - {Phase.LANDING}
 BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
 BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
-"""Phases that are flown by what the camera sees."""
+"""Phases that are flown by what the camera sees: those whose maneuver is `by_camera`."""
 IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
-"""Phases in which nothing but air should touch the vehicle."""
-AIRBORNE = FLYING_PHASES | {Phase.LANDING}
-BEFORE_COMPLETION = BY_CAMERA | {Phase.PERCH}
-TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
+"""Phases in which nothing but air should touch the vehicle: `in_the_open` in their maneuver."""
+MAGNET_MAY_CATCH = BY_CAMERA | {Phase.PERCH}
+"""Phases in which the magnet may catch the vehicle before a contact is proven."""
+SEVEN_PHASES = (
+    Phase.APPROACH,
+    Phase.SEARCH,
+    Phase.ESTIMATE,
+    Phase.ALIGN,
+    Phase.ASCEND,
+    Phase.PERCH,
+    Phase.COMPLETE,
+)
+"""The paper's, in their order."""
 
 
 class Severity(IntEnum):

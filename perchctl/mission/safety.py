@@ -36,11 +36,11 @@ from perchctl.mission.belief.quality import (
 )
 from perchctl.mission.context import Context
 from perchctl.mission.phase import (
-    BEFORE_COMPLETION,
     BEFORE_CONTACT,
     BY_CAMERA,
     FLYING_PHASES,
     IN_THE_OPEN,
+    MAGNET_MAY_CATCH,
     Claim,
     Operator,
     Outcome,
@@ -153,7 +153,8 @@ def divergence_reason(c: Context) -> str:
 
 
 def is_position_lost(c: Context) -> bool:
-    """True if no position came for `positioning.land_s`, or the estimate is useless earlier."""
+    """True if no position came for `positioning.land_s`, or the estimate is useless earlier: after
+    a blow or gust that no sighting has corrected, or by its variance."""
     b = c.belief
     if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
         return True
@@ -405,18 +406,18 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     # --- the magnet may catch early ---
     Transition(
-        "caught", BEFORE_COMPLETION, is_held, Phase.COMPLETE, "hanging on the magnet already"
+        "caught", MAGNET_MAY_CATCH, is_held, Phase.COMPLETE, "hanging on the magnet already"
     ),
     land_row(
         "held",
-        BEFORE_COMPLETION,
+        MAGNET_MAY_CATCH,
         is_held_elsewhere,
         "something holds it where the target is not",
         claims=Claim.HELD_BY_OTHER,
     ),
     land_row(
         "hangs-at-contact",
-        BEFORE_COMPLETION,
+        MAGNET_MAY_CATCH,
         lambda c: c.held_s(HANGING) >= HELD_S,
         lambda c: (
             f"it hangs at the target's height, {newest_contact_error(c.belief).text}: "
@@ -435,7 +436,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     back_off_row(
         "blocked",
-        BEFORE_COMPLETION,
+        MAGNET_MAY_CATCH,
         is_blocked_off_target,
         lambda c: (
             f"pressed against something at {c.belief.height_m:.2f} m"
