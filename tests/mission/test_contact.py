@@ -1,0 +1,71 @@
+"""A contact is proven by every one of its terms: with one of them spoilt there is none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from perchctl.mission import ImuMotion, Observation, Phase
+from perchctl.mission.belief.contact import CONTACT
+from perchctl.profile import Profile
+from tests.helpers.mission import (
+    BY_TARGET,
+    CEILING_M,
+    HANG_Z_M,
+    HOVER_THRUST,
+    MOCAP,
+    PROFILE,
+    observing,
+    remembering,
+    state_in,
+    target_at,
+)
+from tests.mission.rig import BEGIN_S, at
+
+PRESSED = 1.2 * HOVER_THRUST
+
+
+def touching(below_m: float = 0.0, steady_s: float = 5.0, **changes: Any) -> Observation:
+    """A vehicle that presses its gear against the target, `below_m` too low by the target's place,
+    its vertical speed steady since `steady_s`; with changes of its telemetry."""
+    seen = {
+        "target": target_at(BEGIN_S, (0.0, 0.0, CEILING_M + below_m), (0.0, 0.0, HANG_Z_M)),
+        "imu": ImuMotion(t_s=BEGIN_S, steady_s=steady_s),
+    }
+    return at(HANG_Z_M, obs=seen, **{"thrust": PRESSED, **changes})(BEGIN_S)
+
+
+def is_contact(obs: Observation, profile: Profile = PROFILE, **remembered: Any) -> bool:
+    pressing = remembering(state_in(Phase.PERCH, z_m=HANG_Z_M), **remembered)
+    return CONTACT in observing(pressing, obs, profile).belief.since
+
+
+@pytest.mark.parametrize("profile", [PROFILE, MOCAP, BY_TARGET], ids=["deck", "mocap", "target"])
+def test_all_terms_together_are_a_contact(profile: Profile) -> None:
+    assert is_contact(touching(), profile)
+
+
+@pytest.mark.parametrize("profile", [PROFILE, MOCAP, BY_TARGET], ids=["deck", "mocap", "target"])
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        touching(below_m=0.1),  # the gear is not at the target's height
+        touching(below_m=-0.1),
+        touching(velocity_mps=(0.0, 0.0, 0.3), steady_s=BEGIN_S),  # it still moves
+        touching(acc_z_g=1.3),  # it speeds up
+        touching(acc_z_g=0.7),
+        touching(thrust=HOVER_THRUST),  # the motors carry it
+        touching(t_s=BEGIN_S - 0.5),  # all of that was half a second ago
+    ],
+    ids=["too low", "too high", "moves", "speeds up", "slows", "hovers", "old"],
+)
+def test_without_one_of_them_there_is_none(spoilt: Observation, profile: Profile) -> None:
+    assert not is_contact(spoilt, profile)
+
+
+def test_without_a_reference_for_the_thrust_there_is_none() -> None:
+    """No hover thrust was learned, or the thrust that is read is not the one that was ordered."""
+    assert not is_contact(touching(), hover_thrust=0.0)
+    unanswered = {"raw_order": 20000, "unanswered_s": BEGIN_S - 1.0, "setpoint": None}
+    assert not is_contact(touching(), **unanswered)
