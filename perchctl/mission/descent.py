@@ -9,7 +9,7 @@ and by whether the magnet may hold the vehicle (the table of docs/mission.md):
 - by position setpoints, straight down;
 - level, by raw thrust on the vertical speed, without a position;
 - by the vehicle's own landing, near the ground or where height, stream or loop are doubtful;
-- peeled off the magnet by a setpoint below, and released onto it if it does not let go.
+- peeled off the magnet by a setpoint below; if it does not let go, the weight is hung on it.
 
 Nothing here climbs but a catch. The vehicle's own landing follows a trajectory by its clock and
 then stops the motors, wherever it is by then: it is ordered only where a position shows the vehicle
@@ -73,7 +73,8 @@ MANEUVER = Maneuver(descends=True)
 PEEL_BELOW_M = 0.35
 """The most that a setpoint is below the vehicle. Larger: what comes off the magnet falls."""
 PEEL_S = 4.0
-"""Time after which what has not come off is given to the magnet."""
+"""If the vehicle has not come off the magnet by then, it stops pulling and hangs its weight on it.
+Larger: it pulls for longer, and falls if the magnet lets go late."""
 DROPPING_MPS = -0.35
 """Vertical speed of a vehicle that falls off the magnet while it is peeled off."""
 STOP_BELOW_M = 0.05
@@ -201,10 +202,11 @@ def act(c: Context) -> Action:
 def descend(c: Context) -> Action:
     """Come down by one of the four policies.
 
-    In the magnet's reach a setpoint below takes the thrust to its least, and what that does not
-    move is given to the magnet. Else sink by setpoints to the hand-over, and from there by the
-    vehicle's own landing: at once where height, stream or loop are doubtful. By the target it would
-    follow an estimate that rests on pictures, to an unmeasured floor: then it is level from there.
+    In the magnet's reach a setpoint below takes the thrust to its least; if the vehicle does not
+    come off, its weight is hung on the magnet. Else sink by setpoints to the hand-over, and from
+    there by the vehicle's own landing: at once where height, stream or loop are doubtful. By the
+    target it would follow an estimate that rests on pictures, to an unmeasured floor: then it is
+    level from there.
     """
     b = c.belief
     if not b.knows_its_place:

@@ -31,7 +31,7 @@ Smaller: they take seconds."""
 UNWIND_AWAY_M = 0.25
 """The same once it has left. Larger: it falls."""
 UNPRESS_LIMIT_S = 4.0
-"""Time after which it goes on in any case."""
+"""After this time `leave_press` ends, whether or not the vehicle has come away."""
 
 # --- the release ---
 LOWEST_PART = 0.9
@@ -58,7 +58,8 @@ CATCH_LEAST_S = 0.1
 """Bounds of a catch's time."""
 CATCH_LIMIT_S = 2.0
 CATCH_END_MPS = -0.1
-"""Vertical speed from which on the thrust is above the weight."""
+"""The catch ends once the vehicle sinks more slowly than this: the thrust is above the weight
+then."""
 MOST_BRAKED_MPS = 1.0
 """No blow that the vehicle survives leaves more speed."""
 POSITION_GAIN_PER_S = 2.0
@@ -114,7 +115,7 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
     released_s = state.released_s
     if released_s is None:
         released_s, z_m = c.t_s, c.telemetry.position_m[2]
-        b = replace(b, contact_z_m=b.contact_z_m or z_m)
+        b = replace(b, contact_z_m=z_m if b.contact_z_m is None else b.contact_z_m)
         state = replace(state, released_s=released_s, belief=b)
     hung_s = c.held_s(WEIGHT_HANGS)
     unread_s = UNREAD_S if b.unread_s >= c.t_s - hung_s else 0.0

@@ -46,7 +46,8 @@ class PositionSource(Enum):
 
     @property
     def is_deck(self) -> bool:
-        """The vehicle measures its own motion: there is nothing to send, and the place drifts."""
+        """The vehicle's own decks measure it: there is nothing to send, and of a Flow deck the
+        place drifts."""
         return self is PositionSource.DECK
 
     @property

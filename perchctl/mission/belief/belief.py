@@ -44,7 +44,7 @@ unread thrust."""
 
 @dataclass(frozen=True)
 class ContactError:
-    """Gear's distance from the target's axis at proven contact; its sigma, infinite if unknown."""
+    """Gear's distance from the target's axis at a touch; its sigma, infinite if unknown."""
 
     aside_m: float
     sigma_m: float
@@ -216,7 +216,8 @@ class Belief:
 
     @cached_property
     def is_corrected(self) -> bool:
-        """True if positions come, and correct the estimated velocity."""
+        """True while the newest position is young enough, by latency and `CORRECTED_S`, to still
+        correct the estimated velocity."""
         return self.position_age_s <= self.latency_s + CORRECTED_S
 
     @cached_property

@@ -6,9 +6,10 @@ thrust is. So thrust far from hover thrust, at 1 g and at rest, is a contact: wi
 vehicle presses, with less something carries it. Where it is, and what it was flown to do, then tell
 a magnet from the floor, and both from something else.
 
-Three sets of thresholds for "pressing" and "carried" live here side by side, named for what each
-is used for: the proof of contact (`CONTACT`), something in the way (`BLOCKED`), and what is felt
-without a position (`CARRIED`).
+"Pressing" and "carried" have several sets of thresholds, side by side and named for what each is
+used for: the proof of contact (`CONTACT`), something in the way (`BLOCKED`), what is felt without a
+position (`CARRIED`), a press that has to be left (`is_pressing`), and a thrust that cannot be what
+carries the vehicle (`is_carried_by_other_than_thrust`, for `HANGING`, `MAGNET_HOLDS`, `ON_FLOOR`).
 """
 
 from __future__ import annotations
@@ -340,7 +341,7 @@ CARRIED = Condition(
 SATURATED_THRUST = Condition(
     "thrust at its limit", _is_saturated, lasts=True, rests_on=Rests.TELEMETRY
 )
-CONTACT_CONDITIONS = (
+SUPPORT_CONDITIONS = (
     CONTACT,
     MAGNET_HOLDS,
     SLIPPING,

@@ -18,14 +18,19 @@ class Maneuver:
     maneuver; the belief knows no phases.
 
     Attributes:
-        in_the_open: nothing but air should touch the vehicle.
-        by_camera: it is moved by what the camera sees.
-        needs_pictures: it must not go on without them.
-        learns_hover: it flies quietly, so that its thrust is hover thrust.
-        nears_target: it climbs up to the target, in whose ground effect hover is not learned.
-        presses: it is meant to touch the target.
-        retreats: it moves away from where an attempt ended.
-        descends: it comes down.
+        in_the_open: nothing but air should touch the vehicle. The velocity's bias and the mounting
+            are learned, and a stale position holds it (`hold_reason`).
+        by_camera: it is moved by what the camera sees. Old telemetry, a jump of the estimate, a
+            large variance or a late loop hold it.
+        needs_pictures: it must not go on without them: so does an old picture.
+        learns_hover: it flies quietly, so that its thrust teaches the hover thrust.
+        nears_target: it climbs up to the target, near which hover thrust is not learned: the air
+            under the ceiling carries a part of it.
+        presses: it is meant to touch the target. By the target alone a contact may be proven by the
+            place of the last sighting. Nothing holds it: a hold would leave it pressed.
+        retreats: it moves away from where an attempt ended, so that the last touch still counts.
+        descends: it comes down. What carries it may be the floor, and hanging is told from standing
+            by where it began.
     """
 
     in_the_open: bool = False

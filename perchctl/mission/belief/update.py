@@ -24,10 +24,10 @@ from perchctl.mission.belief.battery import read_battery
 from perchctl.mission.belief.belief import POSITION_RETURNS_S, Belief
 from perchctl.mission.belief.contact import (
     CARRIED,
-    CONTACT_CONDITIONS,
     DOWN,
     HANGING_S,
     STANDING_BELOW_M,
+    SUPPORT_CONDITIONS,
     counts,
     is_hover_thrust,
 )
@@ -53,7 +53,7 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawThrust
 
-CONDITIONS = (*CONTACT_CONDITIONS, *QUALITY_CONDITIONS)
+CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions of the belief."""
 CARRIED_WITHIN_M = 0.3
 """What carries the vehicle so near below the target is the target."""

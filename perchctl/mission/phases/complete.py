@@ -20,7 +20,8 @@ from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
 OFF_S = 0.1
-"""Time for which the motors have to be seen off."""
+"""Telemetry must show the motors off for this long before they count as off. Smaller: one wrong
+sample ends the flight. Larger: it ends later."""
 UNSTOPPED_S = 10.0
 """Time beyond the watch after which motors whose thrust still reads are given up."""
 

@@ -15,7 +15,8 @@ from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
 OFF_S = 0.1
-"""Time for which the motors have to be seen off."""
+"""Telemetry must show the motors off for this long before they count as off. Smaller: one wrong
+sample ends the flight. Larger: it ends later."""
 LOOKED_S = 2.0
 """Time in which a target far above shows, after the motors are off."""
 

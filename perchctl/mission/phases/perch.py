@@ -1,8 +1,12 @@
 """Phase 6, PERCH: press the gear against the target until a contact is proven.
 
-Entry: settled at the stand-off. Action: the setpoint rises through the target, or raw thrust.
-Exits: a contact is proven by position, acceleration and thrust together (`CONTACT`), off the magnet
-or on it; else it is pushed aside, flown unseen for too long, or nothing is touched in time.
+The phase begins with nothing of its own, settled at the stand-off. The setpoint rises through the
+target, or raw thrust presses (keys `planner.perch` of the profile). A contact is proven by
+position, acceleration and thrust together (`CONTACT` in `belief/contact.py`): within the magnet's
+radius it leads to COMPLETE, beside it to RECOVER. So do a push from the side, a press that goes on
+unseen for too long, and one that touches nothing in time; each of these counts as a failed attempt.
+The rows of `safety.py` come first, among them those for a magnet that catches early, and for
+something in the way. No hold applies here: a hold would leave the vehicle pressed (`hold_reason`).
 """
 
 from __future__ import annotations
