@@ -118,7 +118,7 @@ def struck(gained_mps: float, rate_hz: float, sinks_mps: float = -0.7) -> Impact
         up_mps2 = gained_mps / (blows * dt_s) if 0 <= k - round(0.5 * rate_hz) < blows else 0.0
         t_s, v_mps = t_s + dt_s, v_mps + up_mps2 * dt_s
         now = Impact(t_s, v_mps, v_mps, 1.0 + up_mps2 / GRAVITY_MPS2, 0.0)
-        impact = impact.watch_impact(now, up_mps2, dt_s)
+        impact = impact.watch_impact(now, 0.0, up_mps2, dt_s)
     return impact
 
 
@@ -146,7 +146,8 @@ def test_full_thrust_is_no_blow(rate_hz: float) -> None:
     impact, t_s, dt_s = ImpactDetector(), 0.0, 1.0 / rate_hz
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
-        impact = impact.watch_impact(Impact(t_s, 0.0, 0.0, 1.2, 1.0), 0.2 * GRAVITY_MPS2, dt_s)
+        now = Impact(t_s, 0.0, 0.0, 1.2)
+        impact = impact.watch_impact(now, 1.0, 0.2 * GRAVITY_MPS2, dt_s)
     assert impact.blow_s == -math.inf
 
 

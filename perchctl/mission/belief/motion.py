@@ -216,9 +216,9 @@ class ImpactDetector:
     last_moment: tuple[Impact, ...] = ()  # what a blow that begins now has ended
     blow: Impact = Impact()  # the newest from below
 
-    def watch_impact(self, now: Impact, up_mps2: float, dt_s: float) -> Self:
+    def watch_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
         """The detector after `dt_s` of vertical acceleration `up_mps2`; `now` is this moment, which
-        a blow may have ended."""
+        a blow may have ended, `z_m` where the state estimate has the vehicle."""
         gained_mps = max(0.0, self.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
         recent = (m for m in self.last_moment if now.t_s - m.t_s <= BEFORE_BLOW_S)
         last_moment = (*recent, now)
@@ -227,12 +227,12 @@ class ImpactDetector:
             blow_mps=gained_mps,
             blow_s=now.t_s if gained_mps > BLOW_MPS else self.blow_s,
             last_moment=last_moment,
-            blow=_newest_impact(self.blow, now, last_moment, gained_mps),
+            blow=_newest_impact(self.blow, now, z_m, last_moment, gained_mps),
         )
 
 
 def _newest_impact(
-    old: Impact, now: Impact, last_moment: tuple[Impact, ...], gained_mps: float
+    old: Impact, now: Impact, z_m: float, last_moment: tuple[Impact, ...], gained_mps: float
 ) -> Impact:
     """The newest blow, which has gained `gained_mps` by now; of its bounces the hardest counts. The
     onboard estimate has the whole of a blow before its second sample arrives."""
@@ -243,7 +243,7 @@ def _newest_impact(
             min(moment.estimated_mps for moment in last_moment),
             min(moment.felt_mps for moment in last_moment),
             max(moment.peak_g for moment in last_moment),
-            now.z_m,
+            z_m,
         )
         if not follows:
             return begun
@@ -340,12 +340,10 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_READING_S:
             return _after_silence(motion, last, new)
         motion, up_mps2 = _integrate(motion, last, new, dt_s)
-        now = Impact(
-            new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g, new.position_m[2]
-        )
+        now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
         motion = (
             motion.watch_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
-            .watch_impact(now, up_mps2, dt_s)
+            .watch_impact(now, new.position_m[2], up_mps2, dt_s)
             .watch_speed(new.t_s, motion.velocity_mps, dt_s)
             .watch_push(new, motion.offset_g, dt_s)
         )
