@@ -209,6 +209,8 @@ def main() -> int:
         return 0
     if options.against is None:
         parser.error("--against names the other checkout")
+    if len(options.n) not in (1, len(SETTINGS)):
+        parser.error(f"-n takes one number, or one for each of {', '.join(SETTINGS)}")
     homes = ROOT, options.against.resolve()
     differences, flights, count = [], 0, 0
     with tempfile.TemporaryDirectory() as place:
