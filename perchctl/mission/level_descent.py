@@ -38,8 +38,6 @@ LEAST_GAIN_S_PER_M = 0.2
 """The least of it, by old telemetry."""
 GAIN_AGE_S2_PER_M = 0.06
 """Gain times age of the telemetry, between the two."""
-LATEST_S = hover.LATEST_S
-"""Later telemetry no longer tells the speed."""
 UNHEARD_PART = 0.98
 """Share of the thrust that lets it come down then."""
 ON_THE_SPOT_S = 0.6
@@ -90,14 +88,26 @@ OWN_ESTIMATE_S = 1.5
 by its own estimate."""
 LEVEL_MEAN_MPS = 0.35
 """Mean speed of the way down, at least."""
-RISES_NO_MORE_S = 0.1
+PEELED_M = 0.1
+"""The magnet has let go of a vehicle that is this far below its contact. Larger: one that has come
+off still seems to hang. Smaller: a drifting estimate lets one go that hangs."""
+MOST_STEP_S = 0.1
 """Longest step between two ticks that the ramp counts."""
 
 
 def is_unheard(c: Context) -> bool:
     """True if the telemetry is too old to tell the vertical speed."""
-    dt_s = max(0.0, min(RISES_NO_MORE_S, c.t_s - c.state.t_s))
-    return max(1e-3, dt_s, c.belief.attitude_age_s) > LATEST_S
+    return _age_s(c) > hover.LATEST_S
+
+
+def _step_s(c: Context) -> float:
+    """Time since the tick before, as far as it counts."""
+    return max(0.0, min(MOST_STEP_S, c.t_s - c.state.t_s))
+
+
+def _age_s(c: Context) -> float:
+    """Age of the vertical speed: of the telemetry, and a tick at least."""
+    return max(1e-3, _step_s(c), c.belief.attitude_age_s)
 
 
 def waits_for_its_own_estimate(c: Context) -> bool:
@@ -110,8 +120,7 @@ def waits_for_its_own_estimate(c: Context) -> bool:
 def descend_level(c: Context) -> Action:
     """Sink level by raw thrust on the vertical speed, tilted against the sideways speed."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
-    dt_s = max(0.0, min(RISES_NO_MORE_S, c.t_s - state.t_s))
-    age_s = max(1e-3, dt_s, b.attitude_age_s)
+    dt_s, age_s = _step_s(c), _age_s(c)
     held = tel.t_s < state.entry.t_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else b.climb_mps) + descent.under_way_mps
     hover_thrust = hover.in_descent(
@@ -127,7 +136,7 @@ def descend_level(c: Context) -> Action:
     floor_felt_s = descent.floor_felt_s
     if floor_felt_s is None and c.t_s - b.imu.blow_s < TOUCH_S and height_m < TOUCH_BELOW_M:
         floor_felt_s = c.t_s
-    if age_s > LATEST_S:
+    if age_s > hover.LATEST_S:
         thrust *= UNHEARD_PART
     touched_s = math.inf if floor_felt_s is None else c.t_s - floor_felt_s
     # In the air the accelerometer reads what the thrust gives, on the floor one g.
@@ -196,11 +205,6 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
     return state
 
 
-PEELED_M = 0.1
-"""Below the contact by so much, the magnet has let go. Larger: a peeled vehicle is still held to
-hang. Smaller: a drifting estimate lets one go that hangs."""
-
-
 def _is_overdue(c: Context) -> bool:
     """True if it was without a position for so long that it has come down, or hangs."""
     state, b = c.state, c.belief
@@ -208,7 +212,7 @@ def _is_overdue(c: Context) -> bool:
         return False
     way_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
-    heard = b.attitude_age_s <= LATEST_S
+    heard = b.attitude_age_s <= hover.LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
     if not heard and state.descent.within == hover.UNLEARNED_WITHIN:
         spare_s += OWN_ESTIMATE_S

@@ -32,7 +32,8 @@ UNLEARNED_WITHIN = 0.35
 LATEST_S = 1.0
 """Older telemetry shows nothing of the present thrust."""
 LEAST_FELT_G = 0.7
-"""Specific force between which, and `MOST_FELT_G`, thrust divided by it is hover thrust."""
+"""Thrust divided by the specific force is hover thrust while the force is between this and
+`MOST_FELT_G`. Smaller: a blow or a fall teaches it."""
 MOST_FELT_G = 1.3
 LEAST_PROPORTIONAL_PART = 0.5
 """Share of the first hover thrust below which thrust is not proportional to force."""

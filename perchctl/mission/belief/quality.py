@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.evidence import Condition, Rests
+from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
@@ -49,7 +49,6 @@ TARGET_BELOW = Condition[Belief](
 BATTERY_LOW = Condition("battery low", _battery_is_low, lasts=True)
 MOVES_OTHERWISE = Condition("moves otherwise than its positions", _moves_otherwise, lasts=True)
 QUALITY_CONDITIONS = (TILTED, KNOCKED, UNSURE, TARGET_BELOW, BATTERY_LOW, MOVES_OTHERWISE)
-assert all(each.rests_on is Rests.NOTHING for each in QUALITY_CONDITIONS)
 
 
 def hold_reason(b: Belief, maneuver: Maneuver) -> str:
