@@ -30,7 +30,6 @@ from common import CAMERA, setup_with, table
 from numpy.typing import NDArray
 from speed import RATE_HZ, sequence
 
-from perchctl.camera import FrameSource, WrappedSource
 from perchctl.mission import (
     FrameRecord,
     Observation,
@@ -56,7 +55,7 @@ JUDGED = PARTS[:2]
 Times = dict[tuple[str, bool], list[float]]
 
 
-class Camera(WrappedSource):
+class Camera:
     """Gives the sequence's frames at their rate, over and over."""
 
     def __init__(self, frames: list[Frame], began_s: float) -> None:
@@ -83,8 +82,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         for record in (False, True)
     }
     began_s = time.monotonic()
-    camera: FrameSource = Camera(frames, began_s)
-    sources = {record: log.watch_source(camera) for record, log in logs.items()}
+    camera = Camera(frames, began_s)
     setup, state = setup_with(), PipelineState()
     took: Times = {(part, record): [] for part in PARTS for record in logs}
     due_s, number = began_s, 0
@@ -93,7 +91,9 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         before = preempted()
         start = time.perf_counter()
         now_s = time.monotonic()
-        frame = sources[record].poll(now_s)
+        frame = camera.poll(now_s)
+        if frame is not None:
+            logs[record].frame(frame)
         given, mid = time.perf_counter(), preempted()
         output: PipelineOutput | None = None
         if frame is not None:

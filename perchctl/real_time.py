@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from perchctl.camera import FrameSource, WrappedSource
 from perchctl.check import warnings_before_flight
 from perchctl.errors import Note, require_type
 from perchctl.extensions import error_at
@@ -25,7 +24,6 @@ from perchctl.flight import (
 from perchctl.mission import Event, FlightReport, Phase, Tick, Transition, Watcher
 from perchctl.profile import Profile, load_profile
 from perchctl.record import LogWatcher
-from perchctl.vision import Frame
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def fly(
                 options,
                 (log, _OnTick(on_tick), _OnEvent(on_event)),
                 switch,
-                lambda camera: log.watch_source(_Stoppable(camera, stopper)),
+                stopper.ask,
                 lambda: [*log.remarks(), *stopper.remarks()],
                 rows=rows,
             )
@@ -138,8 +136,9 @@ class _OnEvent(Watcher):
 
 
 class _Stopper:
-    """Asks whether to stop, and orders the landing. What raises instead of answering is not asked
-    again: it may have meant yes."""
+    """Asks whether to stop, and orders the landing: in the loop's own thread, since the watchdog's
+    must not hang in it. What raises instead of answering is not asked again: it may have meant
+    yes."""
 
     def __init__(self, should_stop: Callable[[], bool], switch: OperatorSwitch) -> None:
         self._should_stop, self._switch = should_stop, switch
@@ -162,15 +161,3 @@ class _Stopper:
     def warn(self) -> None:
         if self._error is not None:
             warnings.warn(f"{self._error}: the flight was ended", Note, stacklevel=3)
-
-
-class _Stoppable(WrappedSource):
-    """Asks whether to stop in the loop's own thread: the watchdog's must not hang in it."""
-
-    def __init__(self, source: FrameSource, stopper: _Stopper) -> None:
-        super().__init__(source)
-        self._stopper = stopper
-
-    def poll(self, now_s: float) -> Frame | None:
-        self._stopper.ask()
-        return super().poll(now_s)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from perchctl.camera import FrameSource, WrappedSource
+from perchctl.camera import FrameSource
 from perchctl.flight import FlightInputs, GroundCriteria, WallClock
 from perchctl.geometry import Array
 from perchctl.profile import Profile
@@ -84,14 +84,6 @@ class Rehearsal:
         return (end_s - begin_s) / (last - first) if last > first else None
 
 
-class _Noted(WrappedSource):
-    newest: Frame | None = None
-
-    def poll(self, now_s: float) -> Frame | None:
-        self.newest = super().poll(now_s)
-        return self.newest
-
-
 @dataclass(frozen=True)
 class _TelemetryOnly:
     """With `feet_m` the vehicle stands there, since without positions its estimate runs away."""
@@ -126,19 +118,21 @@ def rehearse(
 
     `stopwatch` measures processing times, as `clock` may be simulated.
     """
-    noted = _Noted(source)
-    senses = FlightInputs(rehearsal_telemetry(take, profile), noted, pipeline, profile)
+    polled: list[Frame] = []  # in this turn: one at most
+    telemetry = rehearsal_telemetry(take, profile)
+    senses = FlightInputs(telemetry, source, pipeline, profile, on_frame=polled.append)
     done = Rehearsal(source.live)
     prints = PrintCheck(pipeline.camera, profile.target)
     period_s = 1.0 / profile.link.loop_hz
     due_s = start_s = clock.now()
     while due_s < start_s + duration_s and not source.finished:
         began_s, mark_s = clock.now(), stopwatch()
+        polled.clear()
         senses.poll_inputs(began_s)
         work_s = stopwatch() - mark_s
         done.tick_delays_s.append(max(0.0, began_s - due_s))
-        if noted.newest is not None:
-            _note(done, noted.newest, senses, prints, work_s, began_s)
+        for frame in polled:
+            _note(done, frame, senses, prints, work_s, began_s)
         due_s += period_s
         if due_s < clock.now():
             due_s = clock.now()  # as the loop: no burst of old turns

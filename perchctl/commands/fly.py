@@ -283,10 +283,8 @@ def _session(
     asks: bool,
 ) -> tuple[FlightReport, float | None]:
     watchers: tuple[Watcher, ...] = (log, panel)
-    watched = log.watch_source
     if page is not None:
         watchers = (*watchers, page)
-        watched = lambda source: page.watch_source(log.watch_source(source))  # noqa: E731
     with operator_signals(switch, say), contextlib.ExitStack() as stack:
 
         def before_arming() -> None:
@@ -296,7 +294,9 @@ def _session(
             panel.help = STOP_HELP, KEY_HELP if has_key else ""
             print_lines("\n".join(filter(None, panel.help)))
 
-        return fly_session(options, watchers, switch, watched, log.remarks, before_arming)
+        return fly_session(
+            options, watchers, switch, remarks=log.remarks, before_arming=before_arming
+        )
 
 
 @contextlib.contextmanager

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from perchctl.camera import FrameSource, WrappedSource
 from perchctl.display.live import LivePage, Sketch, make_sketch
 from perchctl.display.panel import status_rows
 from perchctl.mission import Event, Phase, Tick
@@ -21,7 +20,7 @@ STEPS = [phase.value for phase in Phase if phase.is_flying and phase is not Phas
 
 
 class FlightPage:
-    """Watcher of the flight loop for the live page; pictures come by `watch_source`.
+    """Watcher of the flight loop for the live page.
 
     A failing page does not land the vehicle: `problem` stays None, `page.problem` has the error.
     """
@@ -39,9 +38,13 @@ class FlightPage:
         waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
         page.set_state(lambda: waiting, live=False)
 
-    def watch_source(self, source: FrameSource) -> FrameSource:
-        """Wrap a frame source so that the page shows its frames."""
-        return WrappedSource(source, self._seen)
+    def frame(self, frame: Frame) -> None:
+        self._frame = frame
+        try:
+            if not self._flying:  # no ticks yet that would show it
+                self.page.show(Sketch(frame.image))
+        except Exception as error:
+            self.page.store_error(error)
 
     def tick(self, tick: Tick) -> None:
         try:
@@ -78,14 +81,6 @@ class FlightPage:
             rows = [*rows, ["log", str(path)], ["report", command]]
         good = outcome == GOOD
         self.page.end({"outcome": outcome.upper(), "good": good, "reason": reason, "rows": rows})
-
-    def _seen(self, frame: Frame) -> None:
-        self._frame = frame
-        try:
-            if not self._flying:  # no ticks yet that would show it
-                self.page.show(Sketch(frame.image))
-        except Exception as error:  # the frame goes on to the flight
-            self.page.store_error(error)
 
 
 def flight_state(tick: Tick, drawing_sizes: dict[str, float]) -> dict[str, Any]:

@@ -102,10 +102,9 @@ class FaultyFlight:
             log.truth = self._for_log
             watchers = (log,)
         pipeline = make_pipeline(profile, camera)
-        seen = source if log is None else log.watch_source(source)
         self._parts = FlightParts(
             self._link,
-            seen,
+            source,
             clock,
             profile,
             pipeline,

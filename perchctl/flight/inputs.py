@@ -76,6 +76,9 @@ class FlightInputs:
     profile: Profile
     send: SendPosition = lambda place: True
     is_logged: bool = False  # then with the pictures' checksums and the present's spread
+    on_frame: Callable[[Frame], None] = lambda frame: (
+        None
+    )  # called with each, as its source gave it
     perception: Perception = field(init=False)
     # Hands the vehicle's places to `send`, where the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
@@ -127,6 +130,7 @@ class FlightInputs:
         problem = self.source.problem(now_s)
         seen: FrameRecord | None = None
         if frame is not None:
+            self.on_frame(frame)
             times_s = frame.t_s, frame.t_arrival_s
             seen = FrameRecord(frame.index, *times_s, frame.fields, frame.repeated)
         self.taken = TurnInputs(

@@ -200,7 +200,6 @@ def fly_lockstep(
     if log is not None:
         log.truth = truth.position_and_miss
         watchers = (*watchers, log)
-        source = log.watch_source(source)
     parts = FlightParts(
         link,
         source,

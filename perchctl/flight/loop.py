@@ -71,7 +71,8 @@ class FlightParts:
     `watchers` look on, and end no flight (`perchctl.flight.watching`); `judges` are those of a
     simulation, whose errors do. `positions` sends the external positions, None where decks measure
     them; `remarks` returns new notes on things that do not matter to safety, such as a recording;
-    `table` is flown instead of the profile's. What a `simulated` flight shows of latency and
+    `table` is flown instead of the profile's. `begin_turn` is called in the loop's own thread at
+    the beginning of each turn, also before take-off. What a `simulated` flight shows of latency and
     mounting is no advice for a profile."""
 
     link: Link
@@ -85,6 +86,7 @@ class FlightParts:
     remarks: Callable[[], Sequence[str]] = tuple
     table: tuple[Transition, ...] = table_of(None)
     judges: tuple[Watcher, ...] = ()
+    begin_turn: Callable[[], None] = lambda: None
     simulated: bool = False
 
     def position_age_s(self, now_s: float) -> float:
@@ -118,6 +120,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         parts.profile,
         send=parts.link.send_external,
         is_logged=watchers.have_log,
+        on_frame=watchers.frame,
     )
     parts.link.set_guard(disarm_on_word(parts.operator), watchers.sent)
     _wait_until_ready(parts, inputs, turns, watchers)  # nothing flies before it returns
@@ -154,6 +157,7 @@ def _wait_until_ready(
     while True:
         now_s = parts.clock.now()
         _end_on_word(parts.operator(), arming)
+        parts.begin_turn()
         inputs.poll_inputs(now_s)
         newest = inputs.history.newest
         refuse_unfit_vehicle(newest, parts.profile)
@@ -227,6 +231,7 @@ def _mission(
     while True:
         began_s = now_s = clock.now()
         turns.begin_turn(began_s)
+        parts.begin_turn()
         inputs.poll_inputs(
             began_s,
             # Against the ceiling the picture shows no target and steers nothing.

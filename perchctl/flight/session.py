@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from perchctl.calibration import profile_camera
-from perchctl.camera import FrameSource, open_camera, parse_source
+from perchctl.camera import open_camera, parse_source
 from perchctl.errors import (
     ConnectionFailed,
     InvalidValue,
@@ -103,7 +103,7 @@ def fly_session(
     options: FlyOptions,
     watchers: tuple[Watcher, ...] = (),
     switch: OperatorSwitch | None = None,
-    watch_source: Callable[[FrameSource], FrameSource] = lambda source: source,
+    begin_turn: Callable[[], None] = lambda: None,
     remarks: Callable[[], Sequence[str]] = tuple,
     before_arming: Callable[[], None] | None = None,
     rows: Sequence[Transition] = (),
@@ -113,10 +113,9 @@ def fly_session(
     Returns the report, and the gear's distance from the target's centre, m, where a simulator
     measures it.
 
-    `switch` carries the operator's commands. `watch_source` may wrap the camera's source.
-    `remarks`: as in `FlightParts`. `before_arming` is called once vehicle and camera have
-    answered; what it raises ends the session on the ground. `rows` are added to the profile's
-    table.
+    `switch` carries the operator's commands. `begin_turn`, `remarks`: as in `FlightParts`.
+    `before_arming` is called once vehicle and camera have answered; what it raises ends the session
+    on the ground. `rows` are added to the profile's table.
     """
     options.require_lift_check()
     profile, switch = options.profile, switch or OperatorSwitch()
@@ -135,7 +134,6 @@ def fly_session(
         stack.callback(source.close)
         if not (options.simulated or source.live):
             raise UsageError(f"{source.describe()} is no live camera: a real vehicle needs one")
-        source = watch_source(source)
         positioning = profile.positioning
         if simulated is not None and simulated.capture is not None:
             system, host = simulated.capture
@@ -167,6 +165,7 @@ def fly_session(
                 positions,
                 lambda: [*remarks(), *link.new_notes()],
                 table,
+                begin_turn=begin_turn,
                 simulated=options.simulated,
             )
             with contextlib.ExitStack() as waiting:

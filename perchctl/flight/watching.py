@@ -15,11 +15,19 @@ from typing import Protocol, TypeGuard, TypeVar
 
 from perchctl.extensions import error_at
 from perchctl.mission import Event, SentCommand, Tick, Turn, Watcher
+from perchctl.vision import Frame
 
 T = TypeVar("T")
 
 SLOW_WATCHER_S = 0.25
 """A call that takes longer is reported: meanwhile the watchdog steers."""
+
+
+class FrameWatcher(Watcher, Protocol):
+    """A watcher of the pictures, too."""
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame as the camera gave it, before it is searched; also before take-off."""
 
 
 class TurnWatcher(Watcher, Protocol):
@@ -36,7 +44,7 @@ class TurnWatcher(Watcher, Protocol):
 
 
 class Watchers:
-    """Hands a flight's events, ticks, turns and sent commands to each watcher.
+    """Hands a flight's frames, events, ticks, turns and sent commands to each watcher.
 
     `judges` are never detached. `now` is the loop's clock, `remarks` returns new notes.
 
@@ -77,6 +85,11 @@ class Watchers:
                     raise
                 self._detach(watcher, error)
         return self._log_problem
+
+    def frame(self, frame: Frame) -> None:
+        for watcher in self._active:
+            if takes_frames(watcher):
+                self._call(watcher, watcher.frame, frame)
 
     def event(self, event: Event) -> None:
         for watcher in self._active:
@@ -143,6 +156,11 @@ class Watchers:
     def _report(self, note: str) -> None:
         with self._lock:
             self._notes.append(note)
+
+
+def takes_frames(watcher: Watcher) -> TypeGuard[FrameWatcher]:
+    """True for a `FrameWatcher`."""
+    return callable(getattr(watcher, "frame", None))
 
 
 def takes_turns(watcher: Watcher) -> TypeGuard[TurnWatcher]:

@@ -19,7 +19,6 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from perchctl.camera import FrameSource, WrappedSource
 from perchctl.errors import InvalidValue
 from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
@@ -29,6 +28,7 @@ from perchctl.record.fields import event_record, tick_record
 from perchctl.record.header import make_header
 from perchctl.record.summary import FlightSummary, RecordingEnd, is_simulated
 from perchctl.vehicle import NO_BATTERY_READING_V
+from perchctl.vision import Frame
 
 if TYPE_CHECKING:
     from perchctl.record.recorder import Recorder
@@ -155,9 +155,10 @@ class LogWatcher:
                 raise
         return log
 
-    def watch_source(self, source: FrameSource) -> FrameSource:
-        """The source, wrapped so that its frames are recorded if there is a recorder."""
-        return source if self.recorder is None else WrappedSource(source, self.recorder.write_frame)
+    def frame(self, frame: Frame) -> None:
+        """Record a frame of the camera, if there is a recorder. Never raises."""
+        if self.recorder is not None:
+            self.recorder.write_frame(frame)
 
     def remarks(self) -> list[str]:
         """The recording's problem, one sentence, once; else an empty list."""

@@ -6,7 +6,6 @@ import json
 import threading
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -53,25 +52,14 @@ def seen_in(frame: Frame) -> PipelineOutput:
     return PipelineOutput(detections, {"large": pose}, None, Stage.LARGE)
 
 
-def one_frame(frame: Frame) -> Any:
-    """A source that gives this frame and is then silent."""
-    left = [frame]
-    return SimpleNamespace(
-        poll=lambda now_s: left.pop() if left else None, problem=lambda now_s: "silent"
-    )
-
-
 # --- what it shows ---------------------------------------------------------------------------
 
 
 def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
     flight = FlightPage(page, 0.15, 0.03)
     frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
-    source = flight.watch_source(one_frame(frame))
     assert state_of(page)["phase"] == "WAITING"
-    assert source.poll(1.0) is frame
-    assert source.poll(1.1) is None
-    assert source.problem(1.1) == "silent"
+    flight.frame(frame)
     assert page.jpeg_after(0) is not None  # before the first tick too
     flight.tick(tick(START_S + 1.5, entered_s=START_S, output=seen_in(frame)))
     state = state_of(page)
@@ -95,12 +83,11 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
 
 def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     flight = FlightPage(page, 0.15, 0.03)
-    flight.watch_source(one_frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
+    flight.frame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))
     flight.tick(None)  # type: ignore[arg-type]
     flight.event(note(0.0, "something"))
-    torn = Frame(0, 0.0, None)  # type: ignore[arg-type]
     page._changed = None  # type: ignore[assignment]
-    assert FlightPage(page, 0.15, 0.03).watch_source(one_frame(torn)).poll(0.0) is torn
+    FlightPage(page, 0.15, 0.03).frame(Frame(0, 0.0, None))  # type: ignore[arg-type]
     page._changed = threading.Condition()
     assert flight.problem is None
     flight.tick(tick(1.0, output="no output"))

@@ -28,6 +28,7 @@ from perchctl.mission import (
 from perchctl.perception import perception
 from perchctl.record import LogWatcher, read_log
 from perchctl.vehicle import PositionSetpoint
+from perchctl.vision import Frame
 from tests.helpers.loop_rig import Broken, Rig, Vehicle, Watcher, hung_rig
 
 BREAKS_S = 1.2
@@ -48,6 +49,9 @@ class Breaks:
         if part == self.part and self.now() >= BREAKS_S:
             self.calls += 1
             raise self.error
+
+    def frame(self, frame: Frame) -> None:
+        self._called("frame")
 
     def tick(self, tick: Tick) -> None:
         self._called("tick")
@@ -94,7 +98,9 @@ def notes(watcher: Watcher) -> list[str]:
     return [event.reason for event in watcher.events if event.kind is EventKind.NOTE]
 
 
-@pytest.mark.parametrize("part", ["tick", "event", pytest.param("problem", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "part", ["frame", "tick", "event", pytest.param("problem", marks=pytest.mark.long)]
+)
 def test_a_watcher_that_raises_is_left_out_and_named(part: str) -> None:
     breaks = Breaks(part)
     report, works = flown(breaks)
@@ -206,7 +212,7 @@ def test_an_exit_of_a_watcher_lands_first_and_is_raised(error: type[BaseExceptio
     assert not rig.link.motors
 
 
-@pytest.mark.parametrize("part", ["tick", "event", "problem"])
+@pytest.mark.parametrize("part", ["frame", "tick", "event", "problem"])
 def test_a_judge_that_raises_lands_and_is_raised(part: str) -> None:
     """A simulated flight without its judge proves nothing."""
     rig = Rig()

@@ -20,8 +20,8 @@ from perchctl.sim import draw_capture, draw_scenario
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from perchctl.camera import FrameSource
     from perchctl.mission import Tick, Turn
+    from perchctl.vision import Frame
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = str(Path(__file__).with_name("short.yaml"))
@@ -54,8 +54,8 @@ class _Heights(LogWatcher):
         self.truth: Callable[[], Truth] | None = None
         self.z_m = 0.0
 
-    def watch_source(self, source: FrameSource) -> FrameSource:
-        return source
+    def frame(self, frame: Frame) -> None:
+        return None
 
     def remarks(self) -> list[str]:
         return []
