@@ -143,9 +143,6 @@ class FlightInputs:
             sends_sights=sends_sights,
             drops_sightings=drops_sightings,
         )
-        used_s = perception.calibration.applied_delay_s
-        if frame is not None and used_s:
-            frame = replace(frame, t_s=frame.t_s - used_s)
         if frame is None:
             if problem is None and self.source.finished:
                 problem = f"{self.source.describe()}{self.ENDED_TEXT}"
@@ -163,7 +160,7 @@ class FlightInputs:
         self.last_good_frame_s = now_s
         self.frames += 1
         if search:
-            for _, self.output in perception.process_fields(frame, used_s):
+            for _, self.output in perception.process_fields(frame):
                 if positioning is not None and self._is_heard(now_s):
                     positioning.add_pose(perception.state.measured.surest, self.history, now_s)
         mirrored = perception.is_mirrored
@@ -259,9 +256,10 @@ class FlightInputs:
         self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
         if kind != "ok" and self._note is None:
             return VERDICT_TEXTS[kind]
-        age_s = now_s - frame.t_s
+        age_s = now_s - self.perception.exposure_s(frame)
         if live and not age_s >= -PICTURE_AHEAD_S:
-            return f"the picture's time, {frame.t_s:.3f} s, is not past"
+            t_s = self.perception.exposure_s(frame)
+            return f"the picture's time, {t_s:.3f} s, is not past"
         is_late = live and age_s > self.profile.safety.max_frame_age_s
         return f"the picture is {age_s:.1f} s late" if is_late else None
 

@@ -26,6 +26,7 @@ from perchctl.perception.visual_inertial import (
     estimate_motion,
 )
 from perchctl.profile import USED_LATENCY_S, Profile
+from perchctl.values import replace
 from perchctl.vision import (
     Attitude,
     CameraErrors,
@@ -69,11 +70,18 @@ class Perception:
     attitude: Callable[[float], Attitude | None] | None = None
     _mirrored: int = 0  # frames with the target's mirror image since one showed the target
 
-    def process_fields(
-        self, frame: Frame, applied_delay_s: float = 0.0
-    ) -> Iterator[tuple[Frame, PipelineOutput]]:
-        """Yield each field of an interlaced frame, or the whole frame, with the pipeline's output.
-        `applied_delay_s`: the measured latency that was taken off the frame's time."""
+    def exposure_s(self, frame: Frame) -> float:
+        """When a frame was exposed, s on the loop's clock, as well as the flight knows by now.
+
+        The source stamps a frame with its arrival less the latency that the profile gives; what the
+        flight has measured beyond that is taken off here, and nowhere else."""
+        return frame.t_s - self.calibration.applied_delay_s
+
+    def process_fields(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput]]:
+        """Yield each field of an interlaced frame, or the whole frame, with its time of exposure,
+        and the pipeline's output. `frame` is as its source gave it."""
+        used_s = self.calibration.applied_delay_s
+        frame = replace(frame, t_s=self.exposure_s(frame)) if used_s else frame
         if self.stills:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()
@@ -90,7 +98,7 @@ class Perception:
                 self._mirrored = 0
             if output.refused:
                 self.refused = output.lock_note
-            self._calibrate(output, applied_delay_s)
+            self._calibrate(output, used_s)
             yield picture, output
 
     @property
@@ -118,8 +126,9 @@ class Perception:
         """Forget the sights from which the vehicle's motion is estimated."""
         self.motion = drop_sightings(self.motion)
 
-    def _calibrate(self, output: PipelineOutput, applied_delay_s: float) -> None:
-        pose, t_s = self.state.measured.surest, output.detections.t_s + applied_delay_s
+    def _calibrate(self, output: PipelineOutput, used_s: float) -> None:
+        # By the source's stamp: a latency that is being corrected must not move it.
+        pose, t_s = self.state.measured.surest, output.detections.t_s + used_s
         if pose is None:
             return
         measured = self._measured_latency

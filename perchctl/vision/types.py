@@ -84,8 +84,9 @@ def check_camera_matrix(K: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture. `t_s` is the time of exposure on the loop's clock, as far as
-    known: time of arrival less the profile's `camera.latency_s`.
+    """One picture. `t_s` is its time of exposure on the loop's clock. A source knows it as the time
+    of arrival, `t_arrival_s`, less the profile's `camera.latency_s`; what a flight measures beyond
+    that, and half a field's time, are taken off by `perchctl.perception` alone.
 
     `image` is grey, uint8, shape (height, width); `step` also takes BGR, (height, width, 3).
 
