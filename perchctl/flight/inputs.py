@@ -149,7 +149,7 @@ class FlightInputs:
             if problem is not None:
                 self.camera_problem = problem
             return
-        if self.frames == 0:
+        if self.frames == 0:  # a source of another size; a single such picture is only torn
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         rejection = problem or self._rejection(frame, now_s)
         self.repeated = rejection == VERDICT_TEXTS["repeated"]

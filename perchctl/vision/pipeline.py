@@ -152,7 +152,8 @@ def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """The new state, and the frames to give to `step` one by one: the frame itself, or its two
-    fields in time order if the camera is interlaced. Errors: as `step`."""
+    fields in time order if the camera is interlaced. Each says in `fields` which it is, by which
+    `step` knows that size and colour were looked at here. Errors: as `step`."""
     fields, found = separate_fields(state.fields, _grey_frame(frame, pipeline.camera))
     return replace(state, fields=fields), found
 
@@ -160,25 +161,26 @@ def pictures(
 def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Process a frame, in grey or colour; return the new state and the frame's output. Raises
-    InvalidValue for an image that is none, or not of the calibration's size.
+    """Process a frame, in grey or colour, or one that `pictures` gave; return the new state and the
+    frame's output. Raises InvalidValue for an image that is none, or not of the calibration's size.
 
     If `attitude`, the vehicle's at the frame's time, is None, the vehicle counts as level and at
     rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
-    frame = classify_fields(_grey_frame(frame, pipeline.camera))
-    if pipeline.own_detector is not None:
-        _, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
-        detections = _own_detections(frame, pipeline.own_detector)
-        return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
+    if frame.fields is None:  # not from `pictures`
+        frame = classify_fields(_grey_frame(frame, pipeline.camera))
     expected, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
-    # A first picture is searched by all means.
-    first = state.last is None and state.rival is None and state.empty_frames == 0
-    empty = None if first else state.empty_frames
-    own = partial(marker_offset_m, pipeline.tracks.own_place, frame.t_s, attitude, pipeline.pose)
-    detections = detect_markers(
-        frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
-    )
+    if pipeline.own_detector is not None:
+        detections = _own_detections(frame, pipeline.own_detector)
+    else:
+        # A first picture is searched by all means.
+        first = state.last is None and state.rival is None and state.empty_frames == 0
+        empty = None if first else state.empty_frames
+        place = pipeline.tracks.own_place
+        own = partial(marker_offset_m, place, frame.t_s, attitude, pipeline.pose)
+        detections = detect_markers(
+            frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
+        )
     return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
 
 
