@@ -148,10 +148,7 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
         observation=obs, command=command, phase=state.phase, row="seek",
         reason="the target is looked for",
     )  # fmt: skip
-    return Tick(
-        t_s=t_s, telemetry=samples[-1], output=output, target=target, state=state, command=command,
-        loop_late_s=0.0, camera_age_s=0.03, telemetry_age_s=0.01, turn=turn,
-    )  # fmt: skip
+    return Tick(turn=turn, state=state, output=output)
 
 
 def percentiles(values: list[float]) -> NDArray[np.float64]:

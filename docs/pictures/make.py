@@ -48,7 +48,7 @@ from perchctl.display.page import flight_state  # noqa: E402
 from perchctl.display.panel import status_panel  # noqa: E402
 from perchctl.flight import KEY_HELP, STOP_HELP, FlyOptions  # noqa: E402
 from perchctl.geometry import make_T, rotation_from_rpy  # noqa: E402
-from perchctl.mission import Observation, Phase, PlannerState, Tick  # noqa: E402
+from perchctl.mission import Observation, Phase, PlannerState, Tick, Turn, TurnInputs  # noqa: E402
 from perchctl.mission.state import BatteryOutlook, PhaseEntry  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -149,10 +149,15 @@ class Flight:
             phase=Phase(r["phase"]), attempts=r["attempts"], battery=battery,
             entry=PhaseEntry(t_s=t_s - (since_s - span.start_s), reason=r["reason"]),
         )  # fmt: skip
-        return Tick(
-            t_s=t_s, telemetry=telemetry, output=None, target=target, state=state, command=Idle(),
-            loop_late_s=r["late_s"], camera_age_s=r["cam_age_s"], telemetry_age_s=r["tel_age_s"],
+        obs = Observation(
+            t_s, replace(telemetry, behind_s=r["tel_age_s"]), target,
+            camera_age_s=r["cam_age_s"], loop_late_s=r["late_s"],
         )  # fmt: skip
+        turn = Turn(
+            number=index, role="flown", began_s=t_s, t_s=t_s, taken=TurnInputs(),
+            observation=obs, command=Idle(),
+        )  # fmt: skip
+        return Tick(turn=turn, state=state)
 
 
 # --- the pictures ---------------------------------------------------------------------

@@ -280,22 +280,12 @@ def _mission(
             if event.kind is EventKind.PHASE:
                 passed.append(event)
             watchers.event(event)
-        turn = turns.flown_turn(inputs, obs, state, command, feed)
         newest = inputs.perception.calibration.newest
         tick = Tick(
-            t_s=obs.t_s,
-            telemetry=obs.telemetry,
-            output=inputs.output,
-            target=obs.target,
+            turn=turns.flown_turn(inputs, obs, state, command, feed),
             state=state,
-            command=command,
-            loop_late_s=obs.loop_late_s,
-            camera_age_s=obs.camera_age_s,
-            telemetry_age_s=obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
+            output=inputs.output,
             consistency=None if newest is logged else newest,
-            delay_used_s=obs.delay_s,
-            outside=turn.outside,
-            turn=turn,
         )
         logged = newest
         watchers.tick(tick)

@@ -174,21 +174,63 @@ class Turn:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tick:
-    """What one flown turn knew and did, for the log and the display."""
+    """A turn that was flown, with what the log keeps only in part: the planner's whole state, and
+    the pipeline's output.
 
-    t_s: float
-    telemetry: Telemetry
-    output: PipelineOutput | None  # of this tick's new frame
-    target: TargetEstimate | None  # the estimate that the planner steered by
+    `output` is None where no new frame was searched; `consistency`: errors of latency and mounting,
+    if worked out in this turn.
+    """
+
+    turn: Turn
     state: PlannerState
-    command: Command
-    loop_late_s: float
-    camera_age_s: float
-    telemetry_age_s: float
-    consistency: CameraErrors | None = None  # of latency and mounting, if worked out in this tick
-    delay_used_s: float = 0.0  # off the frames' times
-    outside: ExternalPositions | None = None  # None where decks measure the position
-    turn: Turn | None = None
+    output: PipelineOutput | None = None
+    consistency: CameraErrors | None = None
+
+    @property
+    def observation(self) -> Observation:
+        assert self.turn.observation is not None, "a turn that was flown has one"
+        return self.turn.observation
+
+    @property
+    def command(self) -> Command:
+        assert self.turn.command is not None, "a turn that was flown has one"
+        return self.turn.command
+
+    @property
+    def t_s(self) -> float:
+        return self.observation.t_s
+
+    @property
+    def telemetry(self) -> Telemetry:
+        return self.observation.telemetry
+
+    @property
+    def target(self) -> TargetEstimate | None:
+        """The estimate that the planner steered by."""
+        return self.observation.target
+
+    @property
+    def loop_late_s(self) -> float:
+        return self.observation.loop_late_s
+
+    @property
+    def camera_age_s(self) -> float:
+        return self.observation.camera_age_s
+
+    @property
+    def telemetry_age_s(self) -> float:
+        """The age of the oldest part of the newest telemetry."""
+        return self.t_s - self.telemetry.t_s + self.telemetry.behind_s
+
+    @property
+    def delay_used_s(self) -> float:
+        """What is taken off the frames' times."""
+        return self.observation.delay_s
+
+    @property
+    def outside(self) -> ExternalPositions | None:
+        """None where decks measure the position."""
+        return self.turn.outside
 
 
 class Watcher(Protocol):

@@ -187,8 +187,7 @@ class LogWatcher:
         except Exception as error:  # whatever it is: only this record is lost
             self._unmade += 1
             self._remember_unencodable(error)
-        if tick.turn is not None:
-            self.turn(tick.turn)
+        self.turn(tick.turn)
         if self.recorder is not None and record is not None:
             self.recorder.write_tick(record)
 

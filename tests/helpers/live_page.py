@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from perchctl.display.live import TOKEN_HEADER
-from perchctl.mission import Phase, Tick
+from perchctl.mission import Observation, Phase, Tick
 from perchctl.mission.state import BatteryOutlook
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
@@ -24,7 +24,8 @@ def tick(
     t_s: float = 101.0, phase: str = "ALIGN", reason: str = "pose is steady", hold: str = "",
     entered_s: float = 99.75, e_m: tuple[float, ...] | None = (-0.123, 0.045, 1.234),
     e_yaw_rad: float = math.radians(-166.2), tracked: bool = True, battery_v: float = 3.714,
-    battery: BatteryOutlook | None = None, **changes: Any,
+    battery: BatteryOutlook | None = None, output: Any = None,
+    camera_age_s: float = 0.05, telemetry_age_s: float = 0.012,
 ) -> Tick:  # fmt: skip
     """A moment of a flight."""
     seen = None
@@ -36,13 +37,11 @@ def tick(
         phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
         ground_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
     )  # fmt: skip
-    sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v)
+    sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v, behind_s=telemetry_age_s)
     command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)
-    known = Tick(
-        t_s=t_s, telemetry=sample, output=None, target=seen, state=state, command=command,
-        loop_late_s=0.001, camera_age_s=0.05, telemetry_age_s=0.012,
-    )  # fmt: skip
-    return replace(known, **changes)
+    obs = Observation(t_s, sample, seen, camera_age_s=camera_age_s, loop_late_s=0.001)
+    turn = synthetic.flown_turn(obs, command)
+    return Tick(turn=turn, state=state, output=output)
 
 
 def ask(

@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from perchctl.mission import Event, Phase, PlannerState, Tick
+from perchctl.mission import (
+    Event,
+    ExternalPositions,
+    Observation,
+    Phase,
+    PlannerState,
+    Tick,
+    Turn,
+    TurnInputs,
+)
 from perchctl.profile import Profile
 from perchctl.record import LogWatcher
 from perchctl.record.fields import tick_record
 from perchctl.record.header import make_header
 from perchctl.vehicle import Command, Idle, PositionSetpoint, StopMotors, Telemetry
-from perchctl.vision import MarkerPose, PipelineOutput, TargetEstimate
+from perchctl.vision import CameraErrors, MarkerPose, PipelineOutput, TargetEstimate
 from perchctl.vision.types import Detection, Detections, Stage
 from tests.helpers import mission
 from tests.helpers.mission import state_with
@@ -119,21 +129,20 @@ def tick(
     state: PlannerState,
     output: PipelineOutput | None = None,
     target: TargetEstimate | None = None,
-    **more: Any,
+    consistency: CameraErrors | None = None,
+    delay_used_s: float = 0.0,
+    outside: ExternalPositions | None = None,
 ) -> Tick:
-    age_s = t_s - sample.t_s
-    return Tick(
-        t_s=t_s,
-        telemetry=sample,
-        output=output,
-        target=target,
-        state=state,
-        command=command,
-        loop_late_s=0.0,
-        camera_age_s=0.03,
-        telemetry_age_s=age_s,
-        **more,
-    )
+    obs = Observation(t_s, sample, target, camera_age_s=0.03, delay_s=delay_used_s)
+    turn = flown_turn(obs, command, outside=outside)
+    return Tick(turn=turn, state=state, output=output, consistency=consistency)
+
+
+def flown_turn(obs: Observation, command: Command, **more: Any) -> Turn:
+    """A turn that was flown, as the loop hands it to its watchers."""
+    t_s = obs.t_s
+    turn = Turn(number=0, role="flown", began_s=t_s, t_s=t_s, taken=TurnInputs())
+    return replace(turn, observation=obs, command=command, **more)
 
 
 def _command(phase: str, z_m: float) -> Command:

@@ -104,9 +104,8 @@ def test_a_record_without_a_form_costs_itself_alone(
 def test_a_tick_without_a_form_costs_itself_alone(tmp_path: Path) -> None:
     """A log that raised would be left out of its flight."""
     log = LogWatcher.open(tmp_path / "f.jsonl", synthetic.header())
-    good = synthetic.tick(1.0, synthetic.telemetry(), Idle(), state_with())
-    for tick in (good, replace(good, t_s=1.02, command="fly!"), replace(good, t_s=1.04)):  # type: ignore[arg-type]
-        log.tick(tick)
+    for t_s, command in ((1.0, Idle()), (1.02, "fly!"), (1.04, Idle())):
+        log.tick(synthetic.tick(t_s, synthetic.telemetry(), command, state_with()))  # type: ignore[arg-type]
     summary = log.close(FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False))
     assert [r["t_s"] for r in read_log(log.path).records] == [1.0, 1.04]
     assert summary is not None
