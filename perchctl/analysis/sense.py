@@ -5,12 +5,10 @@ The same pictures, samples and times have to give the same poses, to the bit, on
 
 from __future__ import annotations
 
-import contextlib
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +17,7 @@ from perchctl.flight import FlightInputs
 from perchctl.mission import FrameRecord, Observation, Turn, TurnInputs, UnfilteredPose
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision import Frame, Pipeline
+from perchctl.vision import Frame, Pipeline, one_thread
 
 Picture = tuple[int, float, NDArray[np.uint8]]
 """Of a frame: its number, the source's time, and the searched picture."""
@@ -143,7 +141,7 @@ def replay_inputs(
     """
     given = _Given(pictures, pipeline.camera.size_px, delay_s)
     inputs = FlightInputs(given, given, pipeline, profile, is_logged=True)
-    with _one_thread():
+    with one_thread():
         for turn in turns:
             given.turn(turn)
             taken = turn.taken
@@ -173,14 +171,3 @@ def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
     return replace(
         turn.observation, **{name: getattr(seen, name) for name in FlightInputs.SENSED_FIELDS}
     )
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep OpenCV to one thread, so that its sums have one order."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(threads)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -34,6 +35,7 @@ from perchctl.vision.target_selection import (
     to_level,
     to_world,
 )
+from perchctl.vision.threads import one_thread
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
@@ -154,7 +156,9 @@ def pictures(
     """The new state, and the frames to give to `step` one by one: the frame itself, or its two
     fields in time order if the camera is interlaced. Each says in `fields` which it is, by which
     `step` knows that size and colour were looked at here. Errors: as `step`."""
-    fields, found = separate_fields(state.fields, _grey_frame(frame, pipeline.camera))
+    frame = _grey_frame(frame, pipeline.camera)
+    with one_thread():
+        fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
 
@@ -178,9 +182,10 @@ def step(
         empty = None if first else state.empty_frames
         place = pipeline.tracks.own_place
         own = partial(marker_offset_m, place, frame.t_s, attitude, pipeline.pose)
-        detections = detect_markers(
-            frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
-        )
+        with nullcontext() if state.last is None else one_thread():
+            detections = detect_markers(
+                frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
+            )
     return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
 
 
