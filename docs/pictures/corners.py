@@ -212,7 +212,9 @@ def _drawing(view: View, file: Path) -> None:
     x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
     node_px = drawing.reach * mean_side_px(fit.corners_px) / n
-    rows, _ = render_blurred(drawing, n, round(np.log(fit.blur_px / node_px) / 0.02)).light_rows
+    rows, _ = render_blurred(
+        drawing, n, round(np.log(fit.blur_px / node_px) / 0.02)
+    ).illumination_basis
     drawn = rows.T @ np.linalg.lstsq(rows.T, grey, rcond=None)[0]
     figure = new_figure(7.2, 2.4, dpi=100)
     picture, seen, model, rest = figure.subplots(1, 4)

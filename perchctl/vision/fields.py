@@ -34,7 +34,7 @@ _PERIODS_S = (1 / 30, 1 / 25)  # of NTSC and PAL frames
 _VIDEO_PERIODS_S = (0.029, 0.045)  # taken for one of them
 _ANY_PERIOD_S = (0.004, 0.1)
 _KEPT_PERIODS = 25
-_LOST = 1.8
+_LOST_PERIODS = 1.8
 _MAX_GAP_S = 0.25  # older pictures say nothing of the order
 _EVIDENCE = 1.0  # a sum of votes, of at most 1 each, that decides: two frames at least
 _MOST_EVIDENCE = 3.0  # so that a changed order is found in time
@@ -137,7 +137,7 @@ def _period_s(periods_s: tuple[float, ...]) -> float:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
     # A receiver's own rate moves them to and fro: 25 a second in 60 come 33 and 50 ms apart.
-    period_s = mean(p for p in periods_s if p < _LOST * middle_s)
+    period_s = mean(p for p in periods_s if p < _LOST_PERIODS * middle_s)
     if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
         return min(_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s

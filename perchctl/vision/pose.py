@@ -434,7 +434,7 @@ def curl_weight(curl: Array) -> Array:
 
 _EACH = np.eye(8)
 _TILT = np.array(1.0 / math.sqrt(3.0))
-_BEFORE = np.array([3, 0, 1, 2])
+_PREVIOUS_CORNER = np.array([3, 0, 1, 2])
 _START = np.arange(4)  # side k runs from corner k ...
 _END = np.array([1, 2, 3, 0])  # ... to corner k + 1
 _ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
@@ -473,7 +473,7 @@ def weigh_corners(
     corners_px = image_px.reshape(m, 4, 2)
     normals = _outward_normals(corners_px)
     # A corner moves a pixel along the normals of both of its sides.
-    moved = (normals + normals.take(_BEFORE, axis=1)).reshape(m, 8)
+    moved = (normals + normals.take(_PREVIOUS_CORNER, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
         shift[rows, 0] = d.shift_sigma_px * moved[i]

@@ -39,10 +39,10 @@ from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, correlations
 from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
-_BLURS_PX, _BLUR_PX = (1.5, 3.0), 2.0  # to start with
+_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # to start with
 _SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # how far a prediction may be off
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
-_MIN_RESEMBLANCE = 0.5
+_MIN_START_RESEMBLANCE = 0.5
 _NEAR_RESEMBLANCE = 0.45  # where it is expected; textures seldom reach it, and cost a fit each
 _MAX_CANDIDATES = 3
 _CENTRE_GREY, _BEYOND_GREY = 0.3, 0.6  # where there may be anything
@@ -80,7 +80,7 @@ def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _best(image, quads, setup.patterns):
-        seen = align_marker(picture, name, corners_px, blur_px=_BLUR_PX)
+        seen = align_marker(picture, name, corners_px, blur_px=_FIRST_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
@@ -96,7 +96,7 @@ def _best(
     found: list[tuple[float, MarkerName, Array]] = []
     for name in MARKERS:
         like = np.array([correlations(image, quad, patterns[name]) for quad in quads])
-        for i in np.flatnonzero(like.max(axis=1) > _MIN_RESEMBLANCE):
+        for i in np.flatnonzero(like.max(axis=1) > _MIN_START_RESEMBLANCE):
             turn = int(like[i].argmax())
             found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
@@ -162,7 +162,7 @@ _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
 _MAX_CELL_DEPARTURE = 0.3
 _MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
-_MAX_SIGMA = 0.06  # of the side
+_MOST_ALIGNED_SIGMA = 0.06  # of the side
 _MIN_REACH_PX = 3.0
 _MIN_GROWTH, _MAX_GROWTH = 0.6, 1.6  # of the mean side
 _MIN_EVENNESS = 0.6  # shortest side over the longest
@@ -174,7 +174,7 @@ def align_marker(
     start_px: Array,
     reach: float = 0.6,
     blur_px: float = 1.5,
-    max_sigma: float = _MAX_SIGMA,
+    max_sigma: float = _MOST_ALIGNED_SIGMA,
     alone: bool = True,
 ) -> RefinedCorners | None:
     """The marker fitted by its drawing; None unless the picture looks like the drawing.
@@ -212,7 +212,7 @@ def align_marker(
     return RefinedCorners(found.corners_px, sigma_px, True)
 
 
-def is_verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:
+def is_verified(found: Alignment, max_sigma: float = _MOST_ALIGNED_SIGMA) -> bool:
     """True if the picture looks like the drawing.
 
     Without the marker the pattern's correlation stays below 0.72 at the right strength; with the

@@ -41,11 +41,11 @@ from perchctl.vision.types import CameraModel, MarkerName
 MOST_AGE_S = 0.5
 """Since the target was last measured; after that what shows a part of it is no evidence."""
 _EDGE_PX = 40  # from the picture's edge, where a marker may just have been cut
-_LEAST_CELL_PX = 8.0  # of the small marker; smaller, and the large one is in view
+_LEAST_SMALL_CELL_PX = 8.0  # of the small marker; smaller, and the large one is in view
 _MIN_GLANCE = 0.6  # correlation where the prediction was moved to
 _GOOD_GLANCE = 0.95  # then no other size is tried
 _GROWTHS = (1.0, 0.94, 1.06)
-_MIN_LIKENESS, _MIN_GAIN = 0.9, 20.0
+_MIN_LIKENESS, _MIN_CUT_GAIN = 0.9, 20.0
 _MIN_SHOWN = 0.75  # of the places in view
 _MOST_RESIDUAL_PX = 1.2
 _MOST_SPREAD = 0.04  # of the centre, in half sides
@@ -85,7 +85,7 @@ def fit_cut_markers(
     start = _start(expected, ratio, camera)
     if start is None or centre is None:
         return {}
-    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_CELL_PX:
+    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_SMALL_CELL_PX:
         return {}
     covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
     view, texture = make_overview(image, camera, covered), make_texture(drawing)
@@ -96,7 +96,7 @@ def fit_cut_markers(
     if found is None or not _trusted(found):
         return {}
     like, gain = drawing_likeness(found.pose.H, texture, view)
-    if like < _MIN_LIKENESS or gain < _MIN_GAIN:
+    if like < _MIN_LIKENESS or gain < _MIN_CUT_GAIN:
         return {}
     name = _stands_for(found)
     corners = _corners(found, ratio if name == "small" else 1.0, camera)
@@ -431,13 +431,13 @@ def _edges(
 
 # Of the profiles, by rounds. An ascent blurs edges near the picture's rim by several pixels.
 _REACH_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
-_REACH_CELLS, _LEAST_REACH_PX = 0.4, 3.0
-_STILL_PX, _SETTLED_PX = 0.02, 0.5  # no other round follows; without this it is no fit
-_LEAST_CONTRAST, _LEAST_SHARE = 8.0, 0.35  # grey levels; of the median
+_PROFILE_REACH_CELLS, _LEAST_REACH_PX = 0.4, 3.0
+_CUT_STILL_PX, _CUT_SETTLED_PX = 0.02, 0.5  # no other round follows; without this it is no fit
+_LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE = 8.0, 0.35  # grey levels; of the median
 _LEAST_PLACES = 24
 _TUKEY, _LEAST_SCALE_PX = 3.5, 0.15
 _TAILS = 1.3  # what robust weights take away from a residual's square
-_LENS_PX = 0.02  # by which a whole line may be off, of lens and light
+_LINE_OFF_PX = 0.02  # by which a whole line may be off, of lens and light
 _TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
 _SHIFT_PX = 0.15  # by which white may have grown over black
 _PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT_PX]) ** -2.0
@@ -479,7 +479,7 @@ class _Places:
     at: Array
     normal: Array
     J: Array
-    px: Array
+    px_per_unit: Array
     index: NDArray[np.intp]
 
 
@@ -501,7 +501,8 @@ def fit_pose(
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
         if len(places.index) < _LEAST_PLACES:
             return None
-        half_px = np.minimum(reach_px, _REACH_CELLS * outline.cell[places.index] * places.px)
+        cell_px = outline.cell[places.index] * places.px_per_unit
+        half_px = np.minimum(reach_px, _PROFILE_REACH_CELLS * cell_px)
         offset_px, shows = _offsets(image, places, half_px)
         if np.count_nonzero(shows) < _LEAST_PLACES:
             return None
@@ -513,9 +514,9 @@ def fit_pose(
         pose = RigidPose(turn @ pose.R, pose.t + step[3:])
         total[:6] += step
         moved_px = float(np.abs(places.J[:, :6] @ step).max())
-        if moved_px < _STILL_PX:
+        if moved_px < _CUT_STILL_PX:
             break
-    if found is None or not (moved_px <= _SETTLED_PX and pose.t[2] > 0.0):  # or no number
+    if found is None or not (moved_px <= _CUT_SETTLED_PX and pose.t[2] > 0.0):  # or no number
         return None
     return _visible(pose, found, places, outline)
 
@@ -592,7 +593,7 @@ def _offsets(
     mass = gradient * np.exp(-0.5 * (u / (0.5 * half_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
-    least = max(_LEAST_CONTRAST, _LEAST_SHARE * float(np.median(contrast)))
+    least = max(_LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE * float(np.median(contrast)))
     shows = (contrast > least) & (total > 0.25 * least)
     offset_px = (mass * u).sum(axis=1) / np.where(shows, total, 1.0)
     return np.clip(offset_px, -half_px, half_px), shows
@@ -622,7 +623,7 @@ def _solved(
 def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> PoseFit:
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
-    common_px = np.hypot(outline.print_sigma[places.index] * places.px, _LENS_PX)
+    common_px = np.hypot(outline.print_sigma[places.index] * places.px_per_unit, _LINE_OFF_PX)
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line

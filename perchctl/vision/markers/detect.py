@@ -468,11 +468,11 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
 
 
 _GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster
-_GOOD_BLURS = 6.0  # a cell's width over the blur's sigma, likewise
-_REACH = 0.3  # of the side
+_GOOD_CELL_BLURS = 6.0  # a cell's width over the blur's sigma, likewise
+_ALIGN_REACH = 0.3  # of the side
 # Where the other marker shows that it must be there, it may be vague.
-_MAX_SIGMA_ALONE, _MAX_SIGMA = 0.06, 0.12  # of the side
-_BLUR_PX = 1.5  # to start with, where it is not known
+_MOST_SIGMA_ALONE, _MOST_TRACKED_SIGMA = 0.06, 0.12  # of the side
+_UNKNOWN_BLUR_PX = 1.5  # to start with, where it is not known
 _ACROSS_PX = 0.37
 """Sigma: sides have the width of pixels and of reading them in their blur, a drawing has not."""
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
@@ -482,7 +482,7 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
     """True if a marker's edge fit is as accurate as a photometric fit would be: with cells of at
     least 6 px and 6 times the blur."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
-    return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_BLURS * seen.blur_px)
+    return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_CELL_BLURS * seen.blur_px)
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
@@ -499,9 +499,9 @@ def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _
         if start is None or not within(start, image.shape) or is_hidden(picture.hidden, start):
             continue
         alone = _OTHER[name] not in better
-        max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
+        max_sigma = _MOST_SIGMA_ALONE if alone else _MOST_TRACKED_SIGMA
         blur_px = _blur_px(better.get(name))
-        exact = align_marker(picture, name, start, _REACH, blur_px, max_sigma, alone)
+        exact = align_marker(picture, name, start, _ALIGN_REACH, blur_px, max_sigma, alone)
         if exact is not None:
             better[name] = exact
         elif alone and searched:
@@ -514,8 +514,8 @@ def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _
 def _blur_px(seen: RefinedCorners | None) -> float:
     """The first guess of the blur's sigma, px: that of the sides, where lines were fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
-        return _BLUR_PX
-    return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
+        return _UNKNOWN_BLUR_PX
+    return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _UNKNOWN_BLUR_PX)
 
 
 def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
@@ -535,7 +535,7 @@ def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
 # --- Markers where they are expected: no search, only verification ---
 
 
-_LEAST_CELL_PX = 2.5  # for lines
+_LEAST_LINE_CELL_PX = 2.5  # for lines
 _ANCHOR = 0.12  # of the small marker's side
 
 
@@ -565,7 +565,7 @@ def follow_markers(
         for name in MARKERS
         if name in expected
         and within(expected[name], image.shape, ROOM_PX)
-        and side_lengths_px(expected[name]).min() > _LEAST_CELL_PX * patterns[name].rim.cells
+        and side_lengths_px(expected[name]).min() > _LEAST_LINE_CELL_PX * patterns[name].rim.cells
     }
     return {
         name: found

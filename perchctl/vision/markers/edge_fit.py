@@ -138,9 +138,9 @@ MIN_LINE_SIGMA_PX = 0.015
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIERS = 0.5
-_TAILS = 1.7  # what robust weights take away from a residual's square, and from the samples
+_LINE_TAILS = 1.7  # what robust weights take away from a residual's square, and from the samples
 _BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
-_REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
+_CURVED_REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
 CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
 CLIPPED_SHARE = 0.05  # of the profiles
 _WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off an edge that is wide and not central
@@ -150,7 +150,7 @@ _LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apa
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
 _SHIFT_FLOOR_PX = 0.01
 _MAX_SHIFT_PX = 1.0
-_MAX_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
+_MAX_EDGE_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
 _MIN_PROFILES = 3.0  # in total weight, of a side that counts
 _SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
 _CLIPPED_PRIOR_PX = 0.4  # what clipping does
@@ -210,7 +210,7 @@ def _refined_once(
         corners = _intersect(lines)
         if not is_finite(corners):
             return found
-        shift = _measured_shift(markers, sides, inner, lines, residual_px, corners)
+        shift = _measure_edge_shift(markers, sides, inner, lines, residual_px, corners)
     applied = shift or EdgeShift(0.0, shift_prior_px(float(sides.grey[:, :, -1].mean())))
     if applied.shift_px != 0.0:
         lines = lines.copy()
@@ -222,7 +222,7 @@ def _refined_once(
     accepted = _accepted(markers, sides, residual_px, corners_px)
     # A line fitted to n samples spreads twice as far at its ends as in its middle.
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
-    ends_px2 = (4.0 * _TAILS * residual_px * residual_px / independent).tolist()
+    ends_px2 = (4.0 * _LINE_TAILS * residual_px * residual_px / independent).tolist()
     blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
     for i, rim in enumerate(rims):
         if not accepted[i]:
@@ -279,7 +279,7 @@ def shift_prior_px(white_grey: float) -> float:
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
-def _measured_shift(
+def _measure_edge_shift(
     markers: Sides,
     sides: EdgeData,
     inner: EdgeData | None,
@@ -301,7 +301,7 @@ def _measured_shift(
     own = apply_homography(homography_to_unit(corners[k]), inner.points)
     far = np.matmul(own, OUT[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
-    w = inner.weight * (inner.blur_px < _MAX_BLUR_CELLS * depth_px)[:, None]
+    w = inner.weight * (inner.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
     w *= np.abs(far_px) < _MAX_SHIFT_PX
     mass = w.sum(axis=1)
     some = mass > _MIN_PROFILES
@@ -369,7 +369,7 @@ def _sigma_px(
     blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
     bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
-    reach_px = _REACH * blur_px**3
+    reach_px = _CURVED_REACH * blur_px**3
     clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
     # Edges are not where they were meant to be printed.
     print_px = tolerance * cell_px
@@ -536,7 +536,7 @@ _LEAST_SHARE = 0.3  # of the row's mean gradient, for a profile to count
 _TUKEY_FLOOR_PX = 3.5 * 0.05  # of the scatter that is taken for noise
 _ONE_ROUND_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _SETTLED_PX = 0.06
-_ROUNDS = 3
+_LINE_ROUNDS = 3
 _FAR = 1e6
 _QUARTER = PROFILES // 4
 _QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
@@ -576,11 +576,11 @@ def locate_edges(
     blur2 = np.ones(len(near_px), dtype=np.float32)
     line = weight = _halves_line(edge, usable)
     moved_px = np.inf
-    for k in range(_ROUNDS):
+    for k in range(_LINE_ROUNDS):
         if k == 1 and moved_px < _ONE_ROUND_PX:
             continue
         edge, usable, blur2 = profiles.narrow(line, blur2)
-        centre, weight = _robust_line(edge, usable, 2 if k == _ROUNDS - 1 else 1)
+        centre, weight = _robust_line(edge, usable, 2 if k == _LINE_ROUNDS - 1 else 1)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break

@@ -61,10 +61,10 @@ from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELL
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 LEAST_CELL_PX = 4.0  # smaller cells leave no part of a side that would show anything
-_ROUNDS, _STILL_PX = 5, 0.05
+_PART_ROUNDS, _PART_STILL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR = 0.9  # of the window
-_MAX_SIGMA = 0.02  # of the side: vaguer corners are no measurement
+_MOST_PART_SIGMA = 0.02  # of the side: vaguer corners are no measurement
 _LEAST_SHIFT_SIGMA_PX = 0.01
 _TAILS = 1.3  # what robust weights take away from a residual's square
 _MAX_STEP = 0.5
@@ -95,7 +95,7 @@ def fit_partly_seen(
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H = homography_from_unit(start)
-    for k in range(_ROUNDS):
+    for k in range(_PART_ROUNDS):
         seen = seen_edges(picture, H, pattern)
         if seen is None:
             return None
@@ -105,7 +105,7 @@ def fit_partly_seen(
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
         H = increment_homography(H, p)
-        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _STILL_PX:
+        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _PART_STILL_PX:
             break
     assert seen is not None
     left_px = seen.offset_px - (step @ A).reshape(seen.offset_px.shape)
@@ -176,7 +176,7 @@ def _corners(
     floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
-    if not (vaguest_px < _MAX_SIGMA * side_px and np.isfinite(corners_px).all()):
+    if not (vaguest_px < _MOST_PART_SIGMA * side_px and np.isfinite(corners_px).all()):
         return None
     shift_sigma_px = math.sqrt(noise2 * float(np.linalg.inv(N)[8, 8]))
     return RefinedCorners(
@@ -275,7 +275,7 @@ ROOM_PX = 2.0
 """To the picture's edge, where blur would need what is beyond it."""
 _INNER_CELL_PX = 6.0  # of a border whose inner edge is seen apart from the outer one
 _TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white outside
-_LEAST_CONTRAST = 10.0
+_LEAST_PART_CONTRAST = 10.0
 _MIN_WEIGHT = 3.0  # of a side's profiles
 _LEAST_EDGES = 4  # a square has eight unknowns, and an edge fixes two
 _FAR_PX = 1e6
@@ -382,7 +382,7 @@ def _unspoilt(
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]
     black, white = (float(np.median(each[free])) for each in (dark, bright))
     contrast = white - black
-    if contrast < _LEAST_CONTRAST:
+    if contrast < _LEAST_PART_CONTRAST:
         return None
     good = (dark < black + _TOO_BRIGHT * contrast) & (bright > white - _TOO_DARK * contrast)
     return free & good, white

@@ -203,7 +203,7 @@ def align_drawing(
 def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
     """The equations of the next increment; None without contrast. `total` (8,) is the sum of
     the increments so far."""
-    rows, products = seen.light_rows
+    rows, products = seen.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
     light = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
@@ -254,9 +254,9 @@ def _cells_seen(
 
 def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
     """The correlation and height of the inner pattern in grey (n * n,)."""
-    rows, products = drawing.square_light_rows
+    rows, products = drawing.square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
-    both = drawing.light_rows[0][GAIN], grey
+    both = drawing.illumination_basis[0][GAIN], grey
     b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
     shares = np.linalg.solve(A, b)
     bits, seen = (each - np.einsum("kn,k->n", rows, shares[:, k]) for k, each in enumerate(both))
@@ -437,7 +437,7 @@ class RenderedDrawing:
         return tuple(_blurred_with_slope(each, self.sigma, self.grid.axis) for each in sharp)
 
     @cached_property
-    def light_rows(self) -> tuple[Array, Array]:
+    def illumination_basis(self) -> tuple[Array, Array]:
         """Basis of the drawing's grey values under any light: rows (7 or 8, n * n), the eighth if
         the sheet ends, and their Gram matrix."""
         u, v, one = self.grid.uv1
@@ -447,12 +447,12 @@ class RenderedDrawing:
         return stacked, gram_matrix(stacked)
 
     @cached_property
-    def square_light_rows(self) -> tuple[Array, Array]:
+    def square_illumination_basis(self) -> tuple[Array, Array]:
         """Basis of a black square's grey values under any light but slopes of the gain and bend:
         rows (4 or 5, n * n), and their Gram matrix."""
         soft = blur_nodes(black_square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
-        lit, _ = self.light_rows
+        lit, _ = self.illumination_basis
         rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
         return rows, gram_matrix(rows)
 
