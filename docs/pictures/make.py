@@ -87,7 +87,7 @@ class Flight:
 
     @cached_property
     def profile(self) -> Profile:
-        return Profile.model_validate(self.log.header["profile"])
+        return self.log.flown_profile
 
     @cached_property
     def scenario(self) -> Any:

@@ -1,4 +1,4 @@
-from .belief.belief import ContactError as ContactError
+from .belief.belief import ContactOffset as ContactOffset
 from .belief.motion import ImuMotion as ImuMotion
 from .context import Context as Context
 from .descent import step_landing as step_landing

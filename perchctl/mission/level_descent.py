@@ -243,7 +243,7 @@ def _braking(c: Context) -> tuple[float, float]:
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
-    (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.aside_mps2
+    (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.mean_aside_mps2
     known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_MEMORY_S)
     counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
     ahead_mps2, left_mps2 = _in_heading(

@@ -7,8 +7,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perchctl.mission.belief.belief import ContactError
-from perchctl.mission.belief.contact import DOWN, contact_error
+from perchctl.mission.belief.belief import ContactOffset
+from perchctl.mission.belief.contact import DOWN, contact_offset
 from perchctl.mission.context import Context
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Claim, Outcome, Phase
@@ -125,7 +125,7 @@ class FlightReport:
     locked: bool
     history: tuple[Event, ...] = ()  # its phases' events, the first at the start
     findings: Findings | None = None  # of latency and mounting, where it was long enough
-    contact: ContactError | None = None  # of what hangs
+    contact: ContactOffset | None = None  # of what hangs
     touchdown: Touchdown | None = None  # of what met the floor
     detached: tuple[str, ...] = ()  # a sentence for each watcher that raised, and was left out
 
@@ -149,7 +149,7 @@ class FlightReport:
         b = state.belief.seen(obs, profile)
         hangs, contact = state.phase is Phase.PERCHED, b.contact
         if hangs and contact is None:  # it was caught on its way down
-            contact = contact_error(b)
+            contact = contact_offset(b)
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,

@@ -15,13 +15,13 @@ from perchctl.mission.belief.contact import (
     HANGING_S,
     PRESS_SATURATED_PART,
     SATURATED_THRUST,
-    contact_error,
+    contact_offset,
     contact_tolerance_m,
     is_at_contact_height,
     is_at_target,
-    last_touch_error,
+    last_touch_offset,
     max_press_thrust,
-    newest_contact_error,
+    newest_contact_offset,
 )
 from perchctl.mission.belief.motion import PUSHED_S
 from perchctl.mission.belief.quality import (
@@ -225,15 +225,15 @@ def is_held(c: Context) -> bool:
     """True if the target's magnet holds the vehicle already."""
     if c.held_s(HANGING) < HANGING_S:
         return False
-    touched, radius_m = last_touch_error(c.belief), c.planner.perch.contact_xy_m
+    touched, radius_m = last_touch_offset(c.belief), c.planner.perch.contact_xy_m
     near = touched is not None and max(touched.aside_m, touched.sigma_m) <= radius_m
     return near or is_at_target(c.belief)
 
 
 def is_held_elsewhere(c: Context) -> bool:
     """True if something holds the vehicle off the target's height, or beside the target."""
-    touched = last_touch_error(c.belief)
-    error = touched or contact_error(c.belief)
+    touched = last_touch_offset(c.belief)
+    error = touched or contact_offset(c.belief)
     at_its_height = touched is not None or is_at_contact_height(c.belief)
     beside = error.aside_m - 2.0 * error.sigma_m > c.planner.perch.contact_xy_m
     return c.held_s(HANGING) >= HELD_S and (beside or not at_its_height)
@@ -420,7 +420,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         MAGNET_MAY_CATCH,
         lambda c: c.held_s(HANGING) >= HELD_S,
         lambda c: (
-            f"it hangs at the target's height, {newest_contact_error(c.belief).text}: "
+            f"it hangs at the target's height, {newest_contact_offset(c.belief).text}: "
             f"that may be its magnet"
         ),
         claims=Claim.HANGS,

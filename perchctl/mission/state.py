@@ -66,7 +66,7 @@ class PlannerState:
     """The phases' own conditions that hold, and from when."""
     attempts: int = 0  #: that have failed
     confirmed: int = 0  #: frames in a row that measured the target, in this phase
-    searches: int = 0
+    searched_places: int = 0
     search_step_s: float = 0.0
     setpoint: PositionSetpoint | None = None
     integral_m: tuple[float, float] = (0.0, 0.0)

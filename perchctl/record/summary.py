@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.mission import Claim, ContactError, Findings, Touchdown, claims_of
+from perchctl.mission import Claim, ContactOffset, Findings, Touchdown, claims_of
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -58,7 +58,7 @@ class FlightSummary:
     locked: bool = False
     fell: bool = False
     findings: Findings | None = None
-    contact: ContactError | None = None
+    contact: ContactOffset | None = None
     touchdown: Touchdown | None = None
     lost_records: int = 0
     log_problem: str | None = None
@@ -91,7 +91,7 @@ class FlightSummary:
             locked=bool(end.get("locked", False)),
             fell=bool(end.get("fell", False)),
             findings=findings,
-            contact=_part_in(end, ContactError, _CONTACT),
+            contact=_part_in(end, ContactOffset, _CONTACT),
             touchdown=_part_in(end, Touchdown, _TOUCHDOWN),
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),

@@ -44,7 +44,7 @@ def watched(
         for _ in range(round(lasts_s * rate_hz)):
             t_s += dt_s
             reads_g = 1.0 + (mps2 + bias_mps2) / GRAVITY_MPS2
-            fall = fall.watch_fall(t_s, mps2 + bias_mps2, reads_g, dt_s)
+            fall = fall.with_fall(t_s, mps2 + bias_mps2, reads_g, dt_s)
     return fall
 
 
@@ -101,7 +101,7 @@ def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_
     fall, t_s, dt_s = FallDetector(), 1.0, 1.0 / rate_hz
     for _ in range(round(rate_hz)):
         t_s += dt_s
-        fall = fall.watch_fall(t_s, up_mps2, reads_g, dt_s)
+        fall = fall.with_fall(t_s, up_mps2, reads_g, dt_s)
         if fall.fell_s > 0.0:
             break
     assert FALL_S <= t_s - 1.0 <= FALL_S + 2.1 * dt_s
@@ -118,7 +118,7 @@ def struck(gained_mps: float, rate_hz: float, sinks_mps: float = -0.7) -> Impact
         up_mps2 = gained_mps / (blows * dt_s) if 0 <= k - round(0.5 * rate_hz) < blows else 0.0
         t_s, v_mps = t_s + dt_s, v_mps + up_mps2 * dt_s
         now = Impact(t_s, v_mps, v_mps, 1.0 + up_mps2 / GRAVITY_MPS2, 0.0)
-        impact = impact.watch_impact(now, 0.0, up_mps2, dt_s)
+        impact = impact.with_impact(now, 0.0, up_mps2, dt_s)
     return impact
 
 
@@ -147,7 +147,7 @@ def test_full_thrust_is_no_blow(rate_hz: float) -> None:
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
         now = Impact(t_s, 0.0, 0.0, 1.2)
-        impact = impact.watch_impact(now, 1.0, 0.2 * GRAVITY_MPS2, dt_s)
+        impact = impact.with_impact(now, 1.0, 0.2 * GRAVITY_MPS2, dt_s)
     assert impact.blow_s == -math.inf
 
 
@@ -181,10 +181,10 @@ def test_a_constant_speed_is_steady_whatever_it_is(
     velocity = (aside_mps * math.cos(heading_rad), aside_mps * math.sin(heading_rad), climb_mps)
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
-        speed = speed.watch_speed(t_s, velocity, dt_s)
+        speed = speed.with_speed(t_s, velocity, dt_s)
     assert t_s - min(speed.steady_s, t_s) >= 1.9 or abs(climb_mps) <= STEADY_MPS
     assert t_s - min(speed.steady_aside_s, t_s) >= 1.0 or abs(aside_mps) <= 0.15
-    jerked = speed.watch_speed(t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * STEADY_MPS), dt_s)
+    jerked = speed.with_speed(t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * STEADY_MPS), dt_s)
     assert jerked.steady_s == t_s + dt_s
 
 
@@ -202,7 +202,7 @@ def pushed(
             acc_x_g=force_g * math.cos(heading_rad) + offset_g[0],
             acc_y_g=force_g * math.sin(heading_rad) + offset_g[1],
         )
-        push = push.watch_push(sample, (*offset_g, 0.0), dt_s)
+        push = push.with_push(sample, (*offset_g, 0.0), dt_s)
     return push
 
 

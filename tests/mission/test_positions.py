@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
-from perchctl.mission.belief.contact import contact_error
+from perchctl.mission.belief.contact import contact_offset
 from perchctl.mission.belief.quality import OTHERWISE_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.descent import LEAST_ORDERS
@@ -316,7 +316,7 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
     assert math.hypot(*flight.state.belief.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
-    assert contact_error(flight.state.belief).sigma_m >= sigma_m - 1e-3
+    assert contact_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
 
 # --- Another world: what goes astray by it comes down level, by thrust alone ---------------------

@@ -13,7 +13,7 @@ import pytest
 
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.mission import (
-    ContactError,
+    ContactOffset,
     ImuMotion,
     Mismatch,
     Observation,
@@ -208,7 +208,7 @@ CASES: dict[str, Case] = {
     "hangs-at-contact": Case(
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
-            "entered_s": BEGIN_S, "contact_z_m": CONTACT_Z_M, "contact": ContactError(0.01, 0.05),
+            "entered_s": BEGIN_S, "contact_z_m": CONTACT_Z_M, "contact": ContactOffset(0.01, 0.05),
         },
         z_m=CONTACT_Z_M,
     ),
@@ -230,7 +230,7 @@ CASES: dict[str, Case] = {
     ),
     "found": Case(P.SEARCH, P.ESTIMATE, seen(), 0.2),
     "searched-out": Case(
-        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searches": 6}
+        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searched_places": 6}
     ),
     "estimate-lost": Case(P.ESTIMATE, P.SEARCH, unseen(), 1.2),
     "estimated": Case(P.ESTIMATE, P.ALIGN, seen(), 0.6),

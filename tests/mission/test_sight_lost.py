@@ -96,7 +96,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""
-    state = remembering(state_in(phase, z_m=z_m), searches=2, search_step_s=0.0)
+    state = remembering(state_in(phase, z_m=z_m), searched_places=2, search_step_s=0.0)
     after = fly(state, unseen(z_m, for_s=max(age_s, HOLD_S + 0.01)), profile=PROFILE).state
     assert after.setpoint is None or after.setpoint.z_m <= z_m
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import ContactError, ImuMotion, Observation, Outcome, Phase, PlannerState
+from perchctl.mission import ContactOffset, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import CONTACT
 from perchctl.mission.descent import LANDING_MARGIN_S, MOST_DRIFT_M, PLANNED_MPS, onboard_landing
 from perchctl.mission.planner import step_mission
@@ -371,7 +371,7 @@ def test_one_sample_that_looks_like_a_contact_is_no_touch_and_what_carries_it_is
 
 def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_recovered() -> None:
     """Steady because it sticks there, the next attempt would begin pressed."""
-    touched = hanging(Phase.RECOVER, contact=ContactError(0.01, 0.02))
+    touched = hanging(Phase.RECOVER, contact=ContactOffset(0.01, 0.02))
     state = fly(touched, at(HANG_Z_M - 0.1)).state
     assert (state.belief.contact_z_m, state.belief.contact) == (None, None)
     assert fly(touched, at(HANG_Z_M), 1.2).state.phase is Phase.RECOVER

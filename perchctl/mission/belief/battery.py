@@ -32,7 +32,7 @@ HUNGER_WITHIN = 0.3
 LEAST_HUNGER = 1.0
 """Bounds of the fitted factor."""
 MOST_HUNGER = 3.0
-READING_V = 0.02
+READING_SIGMA_V = 0.02
 """Error of a second of readings."""
 FADES_S = 40.0
 """Time in which a reading fades. Larger: a change with temperature is followed late."""
@@ -193,7 +193,7 @@ def _summed(
     counted = max(min(begun, COUNTED_SHARE), begun - state.used_share)
     spent_v = rest_v_from_charge(begun) - rest_v_from_charge(counted)
     off_v = state.ground_v - battery_v - USUAL_SAG_V * state.load - USUAL_HUNGER * spent_v
-    weight, keep = dt_s / READING_V**2, math.exp(-dt_s / FADES_S)
+    weight, keep = dt_s / READING_SIGMA_V**2, math.exp(-dt_s / FADES_S)
     a, b, c, p, q = (keep * each for each in state.fit_sums)
     return (
         a + weight * state.load * state.load,

@@ -43,7 +43,7 @@ unread thrust."""
 
 
 @dataclass(frozen=True)
-class ContactError:
+class ContactOffset:
     """Gear's distance from the target's axis at a touch; its sigma, infinite if unknown."""
 
     aside_m: float
@@ -90,7 +90,7 @@ class Belief:
     target_spread_m: float = 0.0  #: by which successive frames' targets differ
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
     contact_z_m: float | None = None  #: height of the body where the magnet may hold it
-    contact: ContactError | None = None  #: as it made contact
+    contact: ContactOffset | None = None  #: as it made contact
     reach_s: float | None = None  #: within the magnet's reach since
     since: dict[Condition[Any], float] = field(default_factory=dict)  #: conditions, and from when
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from perchctl.mission.belief.belief import Belief, ContactError
+from perchctl.mission.belief.belief import Belief, ContactOffset
 from perchctl.mission.belief.evidence import Condition, Rests
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
@@ -95,19 +95,19 @@ HANGING_S = 1.0
 # --- Where the gear is under the target ---
 
 
-def contact_error(b: Belief) -> ContactError:
+def contact_offset(b: Belief) -> ContactOffset:
     """The gear's distance from the target's axis, and its sigma, which with decks grows after the
     last sighting: the estimate drifts, and the impact on the ceiling shakes it."""
     reckoning = b.reckoning
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if b.profile.positioning.source.is_deck and b.position_valid:
         sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * b.sighting_age_s)
-    return ContactError(math.hypot(*reckoning.aside_m), sigma_m)
+    return ContactOffset(math.hypot(*reckoning.aside_m), sigma_m)
 
 
-def last_touch_error(b: Belief) -> ContactError | None:
-    """The `contact_error` of the last touch, in a retreat only; None with a fresh sighting, or once
-    motion capture shows that the vehicle has left the place of that touch."""
+def last_touch_offset(b: Belief) -> ContactOffset | None:
+    """The `contact_offset` of the last touch, in a retreat only; None with a fresh sighting, or
+    once motion capture shows that the vehicle has left the place of that touch."""
     if not b.sent.maneuver.retreats or b.contact is None or b.target.is_fresh:
         return None
     x_m, y_m, _ = b.telemetry.position_m
@@ -118,9 +118,9 @@ def last_touch_error(b: Belief) -> ContactError | None:
     return b.contact
 
 
-def newest_contact_error(b: Belief) -> ContactError:
+def newest_contact_offset(b: Belief) -> ContactOffset:
     """The error of the last touch where that still counts, else of now."""
-    return last_touch_error(b) or contact_error(b)
+    return last_touch_offset(b) or contact_offset(b)
 
 
 def contact_tolerance_m(b: Belief) -> float:
@@ -137,7 +137,7 @@ def is_at_contact_height(b: Belief) -> bool:
 
 def is_at_target(b: Belief) -> bool:
     """True if the gear is surely in the magnet's reach."""
-    near = contact_error(b).is_within(b.profile.planner.perch.contact_xy_m)
+    near = contact_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
     return near and is_at_contact_height(b)
 
 

@@ -186,7 +186,7 @@ class FallDetector:
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
 
-    def watch_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
+    def with_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
         """The detector after `dt_s` of vertical acceleration `up_mps2`, with a specific force of
         `reads_g` along the body's z axis at its end."""
         offset = self.offset_mps2 + (
@@ -216,7 +216,7 @@ class ImpactDetector:
     last_moment: tuple[Impact, ...] = ()  # what a blow that begins now has ended
     blow: Impact = Impact()  # the newest from below
 
-    def watch_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
+    def with_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
         """The detector after `dt_s` of vertical acceleration `up_mps2`; `now` is this moment, which
         a blow may have ended, `z_m` where the state estimate has the vehicle."""
         gained_mps = max(0.0, self.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
@@ -265,7 +265,7 @@ class SteadySpeed:
     steady_aside_s: float = math.inf  # the same of the sideways speed
     steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # the mean of the last moment
 
-    def watch_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
+    def with_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """The detector after `dt_s`, at a velocity in world axes."""
         x, y, z = velocity_mps
         steady_s, steady_mps = self.steady_s, self.steady_mps
@@ -293,7 +293,7 @@ class PushDetector:
     aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes
     pushed_s: float = -math.inf  # when something last pushed it sideways
 
-    def watch_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
+    def with_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
         """The detector after `dt_s`, with what the accelerometer reads then and read at rest."""
         keeps = math.exp(-dt_s / PUSH_MEMORY_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
@@ -342,10 +342,10 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         motion, up_mps2 = _integrate(motion, last, new, dt_s)
         now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
         motion = (
-            motion.watch_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
-            .watch_impact(now, new.position_m[2], up_mps2, dt_s)
-            .watch_speed(new.t_s, motion.velocity_mps, dt_s)
-            .watch_push(new, motion.offset_g, dt_s)
+            motion.with_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
+            .with_impact(now, new.position_m[2], up_mps2, dt_s)
+            .with_speed(new.t_s, motion.velocity_mps, dt_s)
+            .with_push(new, motion.offset_g, dt_s)
         )
         hover_thrust = _hover_thrust(motion.hover_thrust, new, dt_s)
         return replace(motion, sunk_m=0.0, hover_thrust=hover_thrust)

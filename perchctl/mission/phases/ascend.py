@@ -57,7 +57,7 @@ SETTLED = Condition[Context]("settled", _is_settled)
 def enter(state: PlannerState, before: Context) -> PlannerState:
     """A target that was aligned with is searched for from the beginning if it is lost."""
     del before
-    return replace(state, searches=0)
+    return replace(state, searched_places=0)
 
 
 def act(c: Context) -> Action:

@@ -6,7 +6,7 @@ from perchctl.mission.belief.contact import (
     DOWN,
     MAGNET_HOLDS,
     has_slipped,
-    newest_contact_error,
+    newest_contact_offset,
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
@@ -31,7 +31,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     belief = replace(
         state.belief,
         contact_z_m=before.telemetry.position_m[2],
-        contact=newest_contact_error(before.belief),
+        contact=newest_contact_offset(before.belief),
     )
     return replace(state, belief=belief, released_s=None)
 

@@ -11,7 +11,7 @@ something in the way. No hold applies here: a hold would leave the vehicle press
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import CONTACT, contact_error
+from perchctl.mission.belief.contact import CONTACT, contact_offset
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.quality import KNOCKED, position_loss_text
 from perchctl.mission.context import Context
@@ -57,7 +57,7 @@ def contact_reason(c: Context) -> str:
     by = "position, acceleration and thrust"
     if not c.belief.position_valid:
         by = f"acceleration and thrust, {position_loss_text(c.belief)}"
-    return f"contact proven by {by}; {contact_error(c.belief).text}"
+    return f"contact proven by {by}; {contact_offset(c.belief).text}"
 
 
 PERCH = PhaseDefinition(
@@ -70,9 +70,9 @@ PERCH = PhaseDefinition(
             {Phase.PERCH},
             lambda c: (
                 is_in_contact(c)
-                and not contact_error(c.belief).is_within(c.planner.perch.contact_xy_m)
+                and not contact_offset(c.belief).is_within(c.planner.perch.contact_xy_m)
             ),
-            lambda c: f"contact {contact_error(c.belief).text}",
+            lambda c: f"contact {contact_offset(c.belief).text}",
         ),
         Transition("contact", {Phase.PERCH}, is_in_contact, Phase.COMPLETE, contact_reason),
         back_off_row(

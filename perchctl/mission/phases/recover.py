@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from perchctl.mission.belief.belief import ContactError
+from perchctl.mission.belief.belief import ContactOffset
 from perchctl.mission.belief.contact import (
     CARRIED,
     CONTACT,
-    contact_error,
+    contact_offset,
     is_at_contact_height,
 )
 from perchctl.mission.belief.evidence import Condition
@@ -71,7 +71,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     )
 
 
-def _touched(before: Context, claims: Claim) -> ContactError | None:
+def _touched(before: Context, claims: Claim) -> ContactOffset | None:
     """Where the gear touched something as the attempt ended; None if nothing is known of a
     touch."""
     old, b = before.state, before.belief
@@ -82,7 +82,7 @@ def _touched(before: Context, claims: Claim) -> ContactError | None:
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
     carried = proven or b.held_s(CARRIED) >= 0.0  # which has that dwell in itself
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
-        return contact_error(b)
+        return contact_offset(b)
     return None
 
 

@@ -38,7 +38,7 @@ def act(c: Context) -> Action:
     ground_m = b.ground_m
     assert ground_m is not None
     if c.t_s - state.search_step_s > search.wait_s:
-        state = replace(state, searches=state.searches + 1, search_step_s=c.t_s)
+        state = replace(state, searched_places=state.searched_places + 1, search_step_s=c.t_s)
         c = Context(state)
     x, y, z = state.entry.position_m
     if b.target.world_m is not None:
@@ -50,8 +50,8 @@ def act(c: Context) -> Action:
         top = max(z, ground_m[2] + search.max_height_m)
         if state.blocked_z_m is not None:
             top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
-        height = min(z + search.step_m * state.searches, top)
-    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searches
+        height = min(z + search.step_m * state.searched_places, top)
+    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_places
     goal = PositionSetpoint(x, y, height, yaw)
     old = state.setpoint or hold_here(c)
     return fly_to(c, step_towards(c, old, goal, up_mps=c.planner.ascend.speed_mps))
@@ -91,7 +91,7 @@ SEARCH = PhaseDefinition(
         land_row(
             "searched-out",
             {Phase.SEARCH},
-            lambda c: c.state.searches >= c.planner.search.attempts,
+            lambda c: c.state.searched_places >= c.planner.search.attempts,
             not_found_reason,
             Outcome.TARGET_NOT_FOUND,
         ),
