@@ -10,7 +10,8 @@ and the bias b, the excess of accelerometer and attitude, is learned from the di
 Without one, v runs on by the first line alone. The gear's place under the target runs on with v
 from the last sighting, and its standard deviation grows with the time since and the way flown. All
 of it is wrong by what the bias has changed since the position was lost: 0.1 m/s2 is 0.45 m after
-3 s.
+3 s. The gains are fixed; a Kalman filter of velocity, bias and the pictures' positions is no better
+(`benchmarks/reckoning.py`), since what limits both is that change.
 """
 
 from __future__ import annotations
