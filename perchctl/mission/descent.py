@@ -80,7 +80,7 @@ DROPPING_MPS = -0.35
 STOP_BELOW_M = 0.05
 """Height below which a descent by thrust stands, if it does not move."""
 RESTS_MPS = 0.1
-"""Sink up to which it does not."""
+"""Vertical speed up to which it does not. Larger: what climbs or sinks past falls from there."""
 ON_FLOOR_S = 0.5
 """Time for which a vehicle has to stand still before its motors are stopped."""
 
@@ -260,7 +260,7 @@ def _stands(c: Context) -> bool:
         return True
     placed = b.by_target and b.position_valid and b.dead_reckoned_s is None
     low = b.height_m < STOP_BELOW_M and not b.is_in_magnet_reach
-    return placed and c.state.descent.thrust > 0.0 and low and b.climb_mps > -RESTS_MPS
+    return placed and c.state.descent.thrust > 0.0 and low and abs(b.climb_mps) < RESTS_MPS
 
 
 def _caught_again(c: Context) -> Action:

@@ -282,9 +282,10 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
 
 
-@pytest.mark.parametrize(("vz_mps", "stops"), [(-0.35, False), (-0.05, True)])
+@pytest.mark.parametrize(("vz_mps", "stops"), [(-0.35, False), (-0.05, True), (0.2, False)])
 def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
-    """The height may be wrong by as much: what sinks still is not on the floor."""
+    """The height may be wrong by as much: what sinks still is not on the floor, nor what climbs,
+    as where the landing is ordered just after the lift-off."""
     sinks = {"velocity_mps": (0.0, 0.0, vz_mps)}
     c = context("sight", z_m=0.0, tel=sinks, thrust=0.9 * HOVER_THRUST)
     assert isinstance(descent.act(c)[1], StopMotors if stops else RawThrust)
