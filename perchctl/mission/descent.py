@@ -24,11 +24,11 @@ from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import (
     HANGING,
     HANGING_S,
-    LEAST_POSITION_THRUST,
     ON_FLOOR,
     has_slipped,
     is_pressing,
 )
+from perchctl.mission.belief.hover import LEAST_POSITION_THRUST
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.reckoning import MAGNET_REACH_M
 from perchctl.mission.belief.update import (
@@ -164,21 +164,15 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
         contact_z_m = tel.position_m[2]
     # Where it stands still in the air, what holds it there goes down with it.
     state = anchor_in_wind(Context(state))
-    hover_thrust = hover.at_loss(old)
     within = contact_z_m is not None or b.reckoning.below_m < MAGNET_REACH_M
     lost = b.has_lost_its_position
     b = replace(
         b,
         reach_s=before.t_s if within and old.reach_s is None else old.reach_s,
         contact_z_m=contact_z_m,
-        hover_thrust=hover_thrust,
+        hover=hover.known(old),
     )
-    share = hover.DESCENT_WITHIN if old.hover_thrust else hover.UNLEARNED_WITHIN
-    return replace(
-        state,
-        belief=give_up_position(b) if lost else b,
-        descent=replace(state.descent, hover_thrust=hover_thrust, within=share),
-    )
+    return replace(state, belief=give_up_position(b) if lost else b)
 
 
 def act(c: Context) -> Action:

@@ -113,7 +113,7 @@ def _age_s(c: Context) -> float:
 def waits_for_its_own_estimate(c: Context) -> bool:
     """True if nothing is heard and no hover thrust is known: for a while setpoints are better."""
     descent = c.state.descent
-    unlearned = descent.thrust == 0.0 and descent.within == hover.UNLEARNED_WITHIN
+    unlearned = descent.thrust == 0.0 and c.belief.hover.is_rough
     return is_unheard(c) and unlearned and c.in_phase_s < OWN_ESTIMATE_S
 
 
@@ -123,13 +123,7 @@ def descend_level(c: Context) -> Action:
     dt_s, age_s = _step_s(c), _age_s(c)
     held = tel.t_s < state.entry.t_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else b.climb_mps) + descent.under_way_mps
-    hover_thrust = hover.in_descent(
-        b,
-        first=descent.hover_thrust or b.hover_thrust,
-        within=descent.within,
-        felt_floor=descent.floor_felt_s is not None,
-        dt_s=dt_s,
-    )
+    hover_thrust = hover.known(b).thrust
     height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _rate_thrust(c, hover_thrust, climb_mps, height_m)
@@ -158,10 +152,8 @@ def descend_level(c: Context) -> Action:
     state = _clear_contact_after_fall(c)
     state = replace(
         state,
-        belief=replace(state.belief, hover_thrust=hover_thrust),
         descent=replace(
             descent,
-            hover_thrust=descent.hover_thrust or b.hover_thrust,
             thrust=thrust,
             floor_felt_s=floor_felt_s,
             under_way_mps=under_way_mps,
@@ -214,7 +206,7 @@ def _is_overdue(c: Context) -> bool:
     began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
     heard = b.attitude_age_s <= hover.LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
-    if not heard and state.descent.within == hover.UNLEARNED_WITHIN:
+    if not heard and b.hover.is_rough:
         spare_s += OWN_ESTIMATE_S
     return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 

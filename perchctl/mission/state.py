@@ -8,7 +8,6 @@ from typing import Any
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.hover import DESCENT_WITHIN
 from perchctl.mission.belief.maneuver import Maneuver, Sent
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Claim, Outcome, Phase, Severity
@@ -30,8 +29,6 @@ class BatteryOutlook:
 class LevelDescent:
     """What a descent by raw thrust remembers; thrusts are 0..65535, and 0 before it has begun."""
 
-    hover_thrust: float = 0.0  # as the way down began
-    within: float = DESCENT_WITHIN  # the share of it that the descent may correct
     thrust: float = 0.0  # ordered last
     sample_s: float = -math.inf  # of the newest sample at its last tick
     under_way_mps: float = 0.0  # climb that its last orders give, and no sample shows yet

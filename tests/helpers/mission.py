@@ -11,6 +11,7 @@ import numpy as np
 from perchctl.mission import Event, EventKind, ImuMotion, Observation, Phase, PlannerState
 from perchctl.mission.belief.battery import EnergyState
 from perchctl.mission.belief.belief import Belief
+from perchctl.mission.belief.hover import HoverThrust
 from perchctl.mission.context import Context
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Severity
@@ -149,8 +150,10 @@ def note(t_s: float, text: str) -> Event:
     return Event(t_s, EventKind.NOTE, text)
 
 
+LEARNED_SIGMA = 0.005
+"""Spread, as a share, of a hover thrust that quiet flight has taught."""
 _BELIEF = {each.name for each in fields(Belief)} - {"t_s"}
-_DESCENT = {each.name for each in fields(LevelDescent)} - {"hover_thrust"}
+_DESCENT = {each.name for each in fields(LevelDescent)}
 _ENTRY = {
     "entered_s": "t_s",
     "entry_m": "position_m",
@@ -170,6 +173,9 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
         changes["since"] = {each: s for each, s in since.items() if each in CONDITIONS}
         held = {each: s for each, s in since.items() if each not in CONDITIONS}
         state = replace(state, belief=replace(state.belief, since=held))
+    if "hover_thrust" in changes:
+        thrust = changes.pop("hover_thrust")
+        changes["hover"] = HoverThrust(thrust, LEARNED_SIGMA) if thrust else HoverThrust()
     belief = {name: value for name, value in changes.items() if name in _BELIEF - {"since"}}
     descent = {name: value for name, value in changes.items() if name in _DESCENT}
     entry = {_ENTRY[name]: value for name, value in changes.items() if name in _ENTRY}

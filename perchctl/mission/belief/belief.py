@@ -15,6 +15,7 @@ from typing import Any
 from perchctl.geometry import Array
 from perchctl.mission.belief.battery import EnergyState
 from perchctl.mission.belief.evidence import Condition
+from perchctl.mission.belief.hover import HoverThrust
 from perchctl.mission.belief.maneuver import Maneuver, Sent
 from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
@@ -95,7 +96,7 @@ class Belief:
     since: dict[Condition[Any], float] = field(default_factory=dict)  #: conditions, and from when
 
     # --- thrust and battery ---
-    hover_thrust: float = 0.0  #: 0..65535; 0 while unknown
+    hover: HoverThrust = field(default_factory=HoverThrust)
     unanswered_s: float | None = None  #: the thrust that is read is not what is ordered, since
     unread_s: float = -math.inf  #: when that last had lasted too long
     energy: EnergyState = field(default_factory=EnergyState)  #: fitted to the battery
@@ -321,6 +322,11 @@ class Belief:
             return False
         light_g = 1.0 - self.profile.planner.perch.contact_acc_g
         return self.position_valid or self.obs.telemetry.acc_z_g < light_g
+
+    @property
+    def hover_thrust(self) -> float:
+        """The estimated hover thrust, 0..65535; 0 while unknown."""
+        return self.hover.thrust
 
     @cached_property
     def thrust_is_known(self) -> bool:

@@ -18,12 +18,11 @@ import math
 
 from perchctl.mission.belief.belief import Belief, ContactOffset
 from perchctl.mission.belief.evidence import Condition, Rests
+from perchctl.mission.belief.hover import LEAST_POSITION_THRUST
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
-LEAST_POSITION_THRUST = 20000
-"""The least thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
 PRESS_SATURATED_PART = 0.98
 """Share of full thrust above which it is not known how much more the vehicle would take."""
 LITTLE_LEFT = 0.93

@@ -1,34 +1,54 @@
 """Hover thrust: what the motors give, 0..65535, when the vehicle neither rises nor sinks.
 
-It is the reference of each proof of contact, and of a descent by thrust. There are four estimators,
-each for what it is good at:
+It is the reference of each proof of contact, and of a descent by thrust. One scalar Kalman filter
+estimates it, all in shares of the thrust:
 
-- `ImuMotion.hover_thrust`: thrust divided by the specific force, at any time in flight. Fast, and
-  wrong by the accelerometer's scale, and while something carries the vehicle.
-- `quiet_mean`: slow mean of the thrust in quiet flight. Precise, and only in the open.
-- `at_loss`: the best guess at the moment from which on nothing else is learned.
-- `in_descent`: follows a descent by thrust within a share of its first value, since a sagging
-  battery and the wind change it by a few percent.
+    P += d^2 dt                    d: how fast it changes, by battery and wind
+    K = P / (P + r^2 / dt)         r: noise of a measurement that lasts one second
+    T += K (z - T),  P = (1 - K) P
+
+z is the thrust in quiet flight (`learn_in_quiet_flight`), and in a descent by thrust the thrust for
+each g that the accelerometer reads (`learn_in_descent`). Where neither was ever measured, `known`
+gives what has been felt in flight, with the spread that this has. It is wrong while something
+carries a part of the weight unnoticed, and by the accelerometer's scale after a long descent.
 """
 
 from __future__ import annotations
 
-from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.contact import LEAST_POSITION_THRUST
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-HOVER_WITHIN = 0.2
-"""Share by which quiet thrust may differ from the mean; if it does by more, the ceiling or a hand
-holds the vehicle."""
-QUIET_MEMORY_S = 1.5
-"""Time in which the mean follows quiet thrust. Larger: a sagging battery is followed late."""
-DESCENT_MEMORY_S = 0.3
-"""Time in which a descent's hover thrust follows what is felt. Larger: it sinks too fast for longer
-in a wind. Smaller: vibration changes the thrust."""
-DESCENT_WITHIN = 0.12
-"""Share of its first value by which a descent may correct a learned hover thrust. Larger: what
-touches something learns it. Smaller: a weak battery sinks too fast."""
-UNLEARNED_WITHIN = 0.35
-"""The same of one that was never learned."""
+from perchctl.values import replace
+
+if TYPE_CHECKING:
+    from perchctl.mission.belief.belief import Belief
+
+LEAST_POSITION_THRUST = 20000
+"""The least thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
+THRUST_NOISE = 0.02
+"""Share by which the mean of one second's measurements is wrong: position control itself changes
+the thrust by 1 to 2 % for half a second. Larger: a sagging battery is followed late."""
+OPEN_DRIFT = 0.01
+"""Share by which it changes in the root of a second in the open. Larger: a push that lasts is
+learned. Smaller: a sagging battery is followed late."""
+DESCENT_DRIFT = 0.067
+"""The same in a descent by thrust, where wind and battery change it. Larger: vibration changes the
+thrust. Smaller: it sinks too fast for longer in a wind."""
+FELT_SIGMA = 0.03
+"""Spread, as a share, of what was felt in flight, by the accelerometer's scale."""
+UNSURE_SIGMA = 0.12
+"""The same where it is not known whether the vehicle flew then, or something carried it."""
+ROUGH_SIGMA = 0.05
+"""Spread from which it is rough: good enough to fall slowly, not to descend without telemetry."""
+DESCENT_SIGMA = 0.04
+"""Spread that a descent begins with, at least. Larger: what touches something learns it. Smaller: a
+weak battery sinks too fast."""
+MOST_SIGMAS = 3.0
+"""So many of these a descent may correct it by."""
+QUIET_WITHIN = 0.2
+"""Share by which quiet thrust may differ; if it does by more, the ceiling or a hand holds the
+vehicle."""
 LATEST_S = 1.0
 """Older telemetry shows nothing of the present thrust."""
 LEAST_FELT_G = 0.7
@@ -42,38 +62,71 @@ LEAST_DIVISOR_G = 0.75
 MOST_DIVISOR_G = 1.5
 
 
-def quiet_mean(b: Belief) -> float:
-    """The mean with one more tick of quiet flight; the thrust felt so far if it is the first."""
-    thrust, old = b.telemetry.thrust, b.hover_thrust
-    if old == 0.0:
-        return b.imu.hover_thrust or thrust
-    if abs(thrust / old - 1.0) > HOVER_WITHIN:
-        return old  # held by the ceiling, or by a hand
-    part = min(1.0, (b.obs.t_s - b.t_s) / QUIET_MEMORY_S)
-    return old + part * (thrust - old)
+@dataclass(frozen=True)
+class HoverThrust:
+    """An estimate of the hover thrust, and of its spread.
+
+    Attributes:
+        thrust: 0..65535; 0 while unknown.
+        sigma: standard deviation, as a share of it.
+        first: as the descent began that corrects it, and with which spread; None outside of one.
+    """
+
+    thrust: float = 0.0
+    sigma: float = math.inf
+    first: tuple[float, float] | None = None
+
+    @property
+    def is_rough(self) -> bool:
+        """True if it was never measured in quiet flight, nor lately in a descent."""
+        return self.sigma > ROUGH_SIGMA
+
+    def after(self, dt_s: float, drift: float) -> HoverThrust:
+        """The estimate `dt_s` later."""
+        return replace(self, sigma=math.sqrt(self.sigma**2 + drift**2 * dt_s))
+
+    def with_measured(self, thrust: float, dt_s: float) -> HoverThrust:
+        """The estimate after a measurement that stands for `dt_s`."""
+        if dt_s <= 0.0:
+            return self
+        variance = self.sigma**2
+        gain = variance / (variance + THRUST_NOISE**2 / dt_s)
+        corrected = self.thrust + gain * (thrust - self.thrust)
+        return replace(self, thrust=corrected, sigma=math.sqrt((1.0 - gain) * variance))
 
 
-def at_loss(b: Belief) -> float:
-    """Hover thrust as learned, else as felt in flight, else by this one sample."""
+def known(b: Belief) -> HoverThrust:
+    """The estimate; where there is none, what was felt in flight, else what one sample shows."""
+    if b.hover.thrust > 0.0:
+        return b.hover
     tel = b.telemetry
     divisor_g = min(MOST_DIVISOR_G, max(LEAST_DIVISOR_G, tel.acc_z_g))
-    measured = max(LEAST_POSITION_THRUST, tel.thrust / divisor_g)
-    return b.hover_thrust or b.imu.hover_thrust or measured
+    sample = max(LEAST_POSITION_THRUST, tel.thrust / divisor_g)
+    return HoverThrust(b.imu.hover_thrust or sample, UNSURE_SIGMA)
 
 
-def in_descent(b: Belief, *, first: float, within: float, felt_floor: bool, dt_s: float) -> float:
-    """Hover thrust `dt_s` later in a descent that began with `first`; unchanged where the floor or
-    a magnet may carry a part of the weight, or the telemetry shows nothing of it."""
-    tel = b.telemetry
-    old = b.hover_thrust
+def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
+    """The estimate after a tick in which the thrust is hover thrust; `dt_s` since the last tick."""
+    thrust, old = b.telemetry.thrust, b.hover
+    if old.thrust == 0.0:
+        return HoverThrust(b.imu.hover_thrust or thrust, FELT_SIGMA)
+    if abs(thrust / old.thrust - 1.0) > QUIET_WITHIN:
+        return old  # held by the ceiling, or by a hand
+    return old.after(dt_s, OPEN_DRIFT).with_measured(thrust, dt_s)
+
+
+def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
+    """The estimate after a tick of a descent by thrust; unchanged where the floor or a magnet may
+    carry a part of the weight, or the telemetry shows nothing of it."""
+    tel, old = b.telemetry, known(b)
+    first, sigma = old.first or (old.thrust, max(DESCENT_SIGMA, old.sigma))
+    old = replace(old, first=(first, sigma))
     shows = (
         LEAST_FELT_G <= tel.acc_z_g <= MOST_FELT_G and tel.thrust >= LEAST_PROPORTIONAL_PART * first
     )
-    if b.attitude_age_s > LATEST_S or not shows:
+    felt_floor = b.sent.floor_felt_s is not None
+    if b.attitude_age_s > LATEST_S or not shows or b.is_in_magnet_reach or felt_floor:
         return old
-    if b.is_in_magnet_reach or felt_floor:
-        return old
-    felt = tel.thrust / tel.acc_z_g
-    memory_s = DESCENT_MEMORY_S if within == DESCENT_WITHIN else 0.5 * DESCENT_MEMORY_S
-    hover = old + (felt - old) * min(1.0, dt_s / memory_s)
-    return min((1.0 + within) * first, max((1.0 - within) * first, hover))
+    new = old.after(dt_s, DESCENT_DRIFT).with_measured(tel.thrust / tel.acc_z_g, dt_s)
+    most = MOST_SIGMAS * sigma
+    return replace(new, thrust=min((1.0 + most) * first, max((1.0 - most) * first, new.thrust)))

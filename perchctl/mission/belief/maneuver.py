@@ -59,6 +59,11 @@ class Sent:
     floor_felt_s: float | None = None  # a descent by thrust felt the floor
 
     @property
+    def is_level_descent(self) -> bool:
+        """True while it comes down by raw thrust, its motors turning."""
+        return self.maneuver.descends and self.raw_thrust is not None and self.is_motor_borne
+
+    @property
     def is_motor_borne(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
         return self.released_s is None and self.stopped_s is None

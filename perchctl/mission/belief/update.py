@@ -59,6 +59,8 @@ CARRIED_WITHIN_M = 0.3
 """What carries the vehicle so near below the target is the target."""
 AT_REST_S = 0.3
 """Time for which a vehicle at its contact has to be still to count as at rest."""
+MOST_LEARNED_S = 0.1
+"""Time between two ticks that one sample stands for at most."""
 UNANSWERED_PART = 0.12
 """Share of full thrust by which order and reading may differ: no ramp leads farther."""
 MOST_RAW = 60000.0
@@ -83,7 +85,7 @@ def update_belief(belief: Belief, obs: Observation, sent: Sent, profile: Profile
     if obs.jumped:
         b = _move_with_estimate(b)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        b = replace(b, heading_lost=True, hover_thrust=hover.at_loss(b))
+        b = replace(b, heading_lost=True, hover=hover.known(b))
     b = _compare_thrust(b)
     b = _reckon(b)
     comes_down = sent.maneuver.descends and sent.is_motor_borne
@@ -103,7 +105,7 @@ def give_up_position(b: Belief) -> Belief:
         b,
         dead_reckoned_s=b.obs.t_s,
         reckoned_height_m=b.height_m,
-        hover_thrust=hover.at_loss(b),
+        hover=hover.known(b),
     )
 
 
@@ -343,19 +345,22 @@ def _learn(b: Belief) -> Belief:
     since: dict[Condition[Any], float] = update_since(b.since, fresh, b, obs.t_s)
     if held:
         since = lasting(since)  # a held vehicle proves nothing
-    hover_thrust = b.hover_thrust
+    dt_s = max(0.0, obs.t_s - b.t_s)
+    learned_s = min(dt_s, MOST_LEARNED_S)
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.nears_target or b.target.error_z_m > near_m
+    found = b.hover
     if away and maneuver.learns_hover and is_hover_thrust(b):
-        hover_thrust = hover.quiet_mean(b)
+        found = hover.learn_in_quiet_flight(b, learned_s)
+    elif b.sent.is_level_descent:
+        found = hover.learn_in_descent(b, learned_s)
     mah = b.profile.vehicle.battery_mah
-    dt_s = max(0.0, obs.t_s - b.t_s)
     return replace(
         b,
         t_s=obs.t_s,
         last=obs.telemetry,
         since=since,
-        hover_thrust=hover_thrust,
+        hover=found,
         energy=read_battery(b.energy, obs.telemetry, obs.battery_age_s, dt_s, mah),
         mounting=b.mounting if held else _watch_mounting(b),
     )

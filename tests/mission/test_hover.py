@@ -1,0 +1,119 @@
+"""The hover thrust's filter: laws that hold whatever it measures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.mission.belief.belief import Belief
+from perchctl.mission.belief.hover import (
+    DESCENT_DRIFT,
+    DESCENT_SIGMA,
+    FELT_SIGMA,
+    MOST_SIGMAS,
+    OPEN_DRIFT,
+    THRUST_NOISE,
+    HoverThrust,
+    known,
+    learn_in_descent,
+    learn_in_quiet_flight,
+)
+from perchctl.mission.belief.maneuver import Maneuver, Sent
+from perchctl.mission.phase import Phase
+from perchctl.values import replace
+from tests.helpers.mission import context_at, observation, remembering, state_in, telemetry
+
+thrusts = st.floats(30_000.0, 62_000.0)
+drifts = st.sampled_from([OPEN_DRIFT, DESCENT_DRIFT])
+DESCENDS = Sent(maneuver=Maneuver(descends=True), raw_thrust=48_000)
+
+
+def believing(phase: Phase, thrust: float, acc_z_g: float = 1.0) -> Belief:
+    """A belief, in the air, with a hover thrust of 50000 learned and one more sample."""
+    sample = replace(telemetry(10.0, 1.0), thrust=thrust, acc_z_g=acc_z_g)
+    state = remembering(state_in(phase), hover_thrust=50_000.0)
+    return context_at(state, observation(10.0, telemetry=sample)).belief
+
+
+def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: float) -> HoverThrust:
+    for value in values:
+        start = start.after(dt_s, drift).with_measured(value, dt_s)
+    return start
+
+
+@given(first=thrusts, true=thrusts, drift=drifts)
+def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
+    settled_s = 12.0 * THRUST_NOISE / drift  # the filter's own time, twelve times
+    steps = int(settled_s / 0.02)
+    found = measured(HoverThrust(first, FELT_SIGMA), [true] * steps, 0.02, drift)
+    assert found.thrust == pytest.approx(true, rel=1e-3)
+
+
+@given(sigma=st.floats(1e-3, 0.2), drift=drifts)
+def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: float) -> None:
+    """P = r d for a scalar Kalman filter, within the step of a tick."""
+    found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
+    assert found.sigma == pytest.approx(math.sqrt(THRUST_NOISE * drift), rel=0.05)
+
+
+@given(first=thrusts, true=thrusts, drift=drifts)
+def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: float) -> None:
+    """Half as many measurements that stand for twice the time; 2 % of the step that is measured."""
+    start = HoverThrust(first, FELT_SIGMA)
+    slow = measured(start, [true] * 25, 0.02, drift)
+    fast = measured(start, [true] * 50, 0.01, drift)
+    assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
+    assert slow.sigma == pytest.approx(fast.sigma, rel=0.05)
+
+
+@given(old=thrusts, one=thrusts, other=thrusts, sigma=st.floats(1e-3, 0.2))
+def test_more_measured_is_more_believed(old: float, one: float, other: float, sigma: float) -> None:
+    start = HoverThrust(old, sigma)
+    low, high = (start.with_measured(each, 0.02).thrust for each in sorted((one, other)))
+    assert low <= high
+    assert min(old, one) - 1e-6 <= start.with_measured(one, 0.02).thrust <= max(old, one) + 1e-6
+    assert start.with_measured(one, 0.0) == start  # no time, no evidence
+
+
+@pytest.mark.parametrize(("thrust", "learns"), [(52_000.0, True), (62_000.0, False)])
+def test_a_hand_that_holds_the_vehicle_teaches_nothing(thrust: float, learns: bool) -> None:
+    found = learn_in_quiet_flight(believing(Phase.ALIGN, thrust), 0.02)
+    assert (found.thrust > 50_000.0) is learns
+
+
+@given(thrust=thrusts, acc_z_g=st.floats(0.7, 1.3))
+def test_a_descent_stays_within_the_spread_that_it_began_with(
+    thrust: float, acc_z_g: float
+) -> None:
+    b = believing(Phase.LANDING, thrust, acc_z_g)
+    for _ in range(200):
+        b = replace(b, hover=learn_in_descent(b, 0.02))
+    assert abs(b.hover_thrust / 50_000.0 - 1.0) <= MOST_SIGMAS * DESCENT_SIGMA + 1e-9
+    assert (b.hover_thrust > 50_000.0) is (thrust / acc_z_g > 50_000.0)
+
+
+@pytest.mark.parametrize(
+    "hides",
+    [
+        {"sent": replace(DESCENDS, floor_felt_s=9.9)},
+        {"contact_z_m": 1.0},  # a magnet may hold it
+        {"reach_s": 9.0},
+    ],
+    ids=["floor", "contact", "reach"],
+)
+def test_what_may_carry_it_teaches_a_descent_nothing(hides: dict[str, Any]) -> None:
+    b = believing(Phase.LANDING, 30_000.0)
+    assert learn_in_descent(replace(b, sent=DESCENDS), 0.02).thrust < 50_000.0
+    assert learn_in_descent(replace(b, **hides), 0.02).thrust == 50_000.0
+
+
+def test_what_was_never_learned_is_felt_and_rough() -> None:
+    b = replace(believing(Phase.LANDING, 45_000.0), hover=HoverThrust())
+    assert known(b).thrust == pytest.approx(45_000.0)
+    assert known(b).is_rough
+    assert not learn_in_quiet_flight(b, 0.02).is_rough
