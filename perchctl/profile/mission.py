@@ -98,9 +98,7 @@ class PerchConfig(Section):
     contact_xy_m: float = key(
         0.025, "largest horizontal distance in contact, the magnet's radius", gt=0, le=0.5
     )
-    contact_speed_mps: ClassVar[float] = 0.06  # contact: vertical speed
     contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this
-    contact_thrust_ratio: ClassVar[float] = 1.03  # contact: at least, over hover thrust
     timeout_s: ClassVar[float] = 3.0
     """Without a contact by then the attempt counts as failed."""
 
@@ -256,5 +254,4 @@ class SafetyConfig(Section):
     start_tilt_deg: ClassVar[float] = 10.0
     """A larger roll or pitch refuses take-off."""
     blocked_s: ClassVar[float] = 0.7  # pressed and not moving: back off down
-    blocked_thrust_ratio: ClassVar[float] = 1.1  # of the hover thrust: pressed from here on
     land_on_log_error: bool = key(False, "land when the log cannot be written")

@@ -6,10 +6,11 @@ thrust is. So thrust far from hover thrust, at 1 g and at rest, is a contact: wi
 vehicle presses, with less something carries it. Where it is, and what it was flown to do, then tell
 a magnet from the floor, and both from something else.
 
-"Pressing" and "carried" have several sets of thresholds, side by side and named for what each is
-used for: the proof of contact (`CONTACT`), something in the way (`BLOCKED`), what is felt without a
-position (`CARRIED`), a press that has to be left (`is_pressing`), and a thrust that cannot be what
-carries the vehicle (`is_carried_by_other_than_thrust`, for `HANGING`, `MAGNET_HOLDS`, `ON_FLOOR`).
+More thrust than hovering takes is one thing everywhere: `is_strong`. At rest it is a press
+(`is_pressing`), at the target's height a contact (`CONTACT`), under a setpoint something in the way
+(`BLOCKED`), and without a position what is felt (`CARRIED`). Less is `CARRIED`, too; and a thrust
+that cannot be what carries the vehicle (`is_carried_by_other_than_thrust`) is what `HANGING`,
+`MAGNET_HOLDS` and `ON_FLOOR` begin with.
 """
 
 from __future__ import annotations
@@ -23,29 +24,24 @@ from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
+PRESSING_RATIO = 1.08
+"""Multiple of hover thrust from which a vehicle at rest presses: five times what that is known to.
+Larger: a weak press proves nothing. Smaller: a gust, or a sagging battery, looks like a press."""
 PRESS_SATURATED_PART = 0.98
-"""Share of full thrust above which it is not known how much more the vehicle would take."""
+"""Share of the most thrust above which it is not known how much more the vehicle would take."""
 LITTLE_LEFT = 0.93
 """Share of full thrust: if hovering takes more, more thrust is no sign of a press. Smaller: heavy
 vehicles are never seen to press."""
 MOST_HOLDING = 0.8
 """Share of hover thrust: with more, the air under the ceiling may hold the vehicle."""
-PROVABLE = 0.99
-"""Share of the pressing thrust that a proof of contact asks for at most."""
 STILL_MOTORS_THRUST = 5000
 """Raw thrust at which the motors stand still, and less."""
-PRESSING_PART = 0.95
-"""Share of full thrust from which a still vehicle presses, as an attempt ends."""
-PRESSING_HOVER_RATIO = 1.05
-"""The same as a multiple of hover thrust."""
 LEAST_HOVER = 1000
 """Thrust below which nothing flies."""
 
 # --- motion and place ---
 MOTIONLESS_MPS = 0.05
 """Vertical speed below which the vehicle does not move. Larger: a slow sink counts as hanging."""
-UNPRESSED_MPS = 0.05
-"""Vertical speed up to which it may press, as an attempt ends."""
 QUIET_MPS = 0.3
 """Speed up to which thrust is hover thrust."""
 QUIET_CLIMB_MPS = 0.27
@@ -182,18 +178,17 @@ def is_carried_by_other_than_thrust(b: Belief) -> bool:
 
 
 def is_strong(b: Belief) -> bool:
-    """True if the thrust is at its limit, or above hover thrust."""
-    thrust, hover = b.telemetry.thrust, b.hover_thrust
-    return thrust >= PRESSING_PART * FULL_THRUST or (
-        hover > 0 and thrust >= PRESSING_HOVER_RATIO * hover
-    )
+    """True if the thrust is above what hovering takes, or at the limit of a press."""
+    most = PRESS_SATURATED_PART * max_press_thrust(b.profile)
+    least = min(PRESSING_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
+    return b.telemetry.thrust >= least
 
 
 def is_pressing(b: Belief) -> bool:
-    """True if the thrust is at its limit, or above hover thrust, and the vehicle does not move."""
+    """True if the thrust is above what hovering takes, and the vehicle does not move."""
     return (
         is_strong(b)
-        and abs(b.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
+        and abs(b.telemetry.velocity_mps[2]) <= MOTIONLESS_MPS
         and b.height_m >= STANDING_BELOW_M
     )
 
@@ -224,9 +219,8 @@ def _is_in_contact(b: Belief) -> bool:
     above what hovering takes: the ceiling must carry the difference.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
-    steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and b.position_valid
+    steady = abs(tel.velocity_mps[2]) <= MOTIONLESS_MPS and b.position_valid
     felt_s = b.obs.t_s - b.imu.steady_s
-    wanted = perch.contact_thrust_ratio * b.hover_thrust  # as far as there is more
     return (
         abs(b.target.error_z_m)
         <= perch.contact_z_m + (CARRIED_ON_MPS * b.sighting_age_s if b.by_target else 0)
@@ -234,7 +228,7 @@ def _is_in_contact(b: Belief) -> bool:
         and b.reads_one_g
         and b.hover_thrust > 0
         and b.thrust_is_known
-        and tel.thrust >= min(wanted, PROVABLE * max_press_thrust(b.profile))
+        and is_strong(b)
     )
 
 
@@ -297,25 +291,18 @@ def _is_blocked(b: Belief) -> bool:
     setpoint, tel = b.sent.setpoint, b.telemetry
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
-    hover = b.hover_thrust
-    ratio = b.profile.safety.blocked_thrust_ratio
-    pressing = hover < LITTLE_LEFT * FULL_THRUST and (
-        tel.thrust >= PRESS_SATURATED_PART * FULL_THRUST
-        or (hover > 0 and tel.thrust >= ratio * hover)
-    )
-    return pressing and b.height_m > OFF_GROUND_M and is_still(b)
+    strong = b.hover_thrust < LITTLE_LEFT * FULL_THRUST and is_strong(b)
+    return strong and b.height_m > OFF_GROUND_M and is_still(b)
 
 
 def _is_carried_by_feel(b: Belief) -> bool:
     """True if accelerometer and thrust alone show that something carries or presses it: by much
     more or much less thrust than hovering takes it would rise or sink in the air."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
-    apart = (b.profile.safety.blocked_thrust_ratio - 1.0) * hover
-    pressed = tel.thrust >= min(hover + apart, PRESS_SATURATED_PART * FULL_THRUST)
     return (
         0 < hover < LITTLE_LEFT * FULL_THRUST
         and b.thrust_is_known
-        and (pressed or tel.thrust <= hover - apart)
+        and (is_strong(b) or tel.thrust <= (2.0 - PRESSING_RATIO) * hover)
         and b.reads_one_g
         and b.obs.t_s - b.imu.steady_s >= perch.contact_dwell_s
     )
