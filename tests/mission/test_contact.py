@@ -7,8 +7,16 @@ from typing import Any
 import pytest
 
 from perchctl.mission import ImuMotion, Observation, Phase
-from perchctl.mission.belief.contact import CONTACT
+from perchctl.mission.belief.contact import (
+    BLOCKED,
+    CARRIED,
+    CONTACT,
+    PRESSING_RATIO,
+    is_pressing,
+)
 from perchctl.profile import Profile
+from perchctl.values import replace
+from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import (
     BY_TARGET,
     CEILING_M,
@@ -69,3 +77,14 @@ def test_without_a_reference_for_the_thrust_there_is_none() -> None:
     assert not is_contact(touching(), hover_thrust=0.0)
     unanswered = {"raw_order": 20000, "unanswered_s": BEGIN_S - 1.0, "setpoint": None}
     assert not is_contact(touching(), **unanswered)
+
+
+@pytest.mark.parametrize("thrust", [1.02, 1.06, 1.1, 1.2])
+def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -> None:
+    """In the same tick a press proves a contact, is in the way, is felt, and is left slowly."""
+    obs = touching(thrust=thrust * HOVER_THRUST)
+    pressing = state_in(Phase.PERCH, z_m=HANG_Z_M)
+    above = PositionSetpoint(0.0, 0.0, HANG_Z_M + 0.2, 0.0)
+    b = observing(replace(pressing, setpoint=above), obs).belief
+    found = [CONTACT in b.since, BLOCKED in b.since, CARRIED in b.since, is_pressing(b)]
+    assert found == [thrust >= PRESSING_RATIO] * 4
