@@ -501,8 +501,8 @@ def fit_pose(
         places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
         if len(places.index) < _LEAST_PLACES:
             return None
-        cell_px = outline.cell[places.index] * places.px_per_unit
-        half_px = np.minimum(reach_px, _PROFILE_REACH_CELLS * cell_px)
+        reach_cells_px = _PROFILE_REACH_CELLS * outline.cell[places.index] * places.px_per_unit
+        half_px = np.minimum(reach_px, reach_cells_px)
         offset_px, shows = _offsets(image, places, half_px)
         if np.count_nonzero(shows) < _LEAST_PLACES:
             return None
