@@ -154,10 +154,9 @@ def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """The new state, and the frames to give to `step` one by one: the frame itself, or its two
-    fields in time order if the camera is interlaced. Each says in `fields` which it is, by which
-    `step` knows that size and colour were looked at here. Errors: as `step`."""
-    frame = _grey_frame(frame, pipeline.camera)
+    fields in time order if the camera is interlaced. Errors: as `step`."""
     with one_thread():
+        frame = _grey_frame(frame, pipeline.camera)
         fields, found = separate_fields(state.fields, frame)
     return replace(state, fields=fields), found
 
@@ -165,14 +164,13 @@ def pictures(
 def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Process a frame, in grey or colour, or one that `pictures` gave; return the new state and the
-    frame's output. Raises InvalidValue for an image that is none, or not of the calibration's size.
+    """Process a frame, in grey or colour; return the new state and the frame's output. Raises
+    InvalidValue for an image that is none, or not of the calibration's size.
 
     If `attitude`, the vehicle's at the frame's time, is None, the vehicle counts as level and at
     rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
-    if frame.fields is None:  # not from `pictures`
-        frame = classify_fields(_grey_frame(frame, pipeline.camera))
+    frame = classify_fields(_grey_frame(frame, pipeline.camera))
     expected, near = expected_corners(state.last_pose, frame.t_s, attitude, pipeline.pose)
     if pipeline.own_detector is not None:
         detections = _own_detections(frame, pipeline.own_detector)
