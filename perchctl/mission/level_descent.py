@@ -16,8 +16,8 @@ import math
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief import hover
+from perchctl.mission.belief.contact import MOST_RAW
 from perchctl.mission.belief.reckoning import BIAS_MEMORY_S
-from perchctl.mission.belief.update import MOST_RAW
 from perchctl.mission.context import Context
 from perchctl.mission.release import clear_contact_below
 from perchctl.mission.setpoints import Action
@@ -84,8 +84,8 @@ LEVEL_SPARE_S = 2.0
 UNHEARD_SPARE_S = 0.8
 """The same without telemetry."""
 OWN_ESTIMATE_S = 1.5
-"""Time for which a vehicle that is not heard, and whose hover thrust was never learned, comes down
-by its own estimate."""
+"""Time for which a vehicle that is not heard, and whose hover thrust is known only roughly, comes
+down by its own estimate."""
 LEVEL_MEAN_MPS = 0.35
 """Mean speed of the way down, at least."""
 PEELED_M = 0.1
@@ -111,10 +111,10 @@ def _age_s(c: Context) -> float:
 
 
 def waits_for_its_own_estimate(c: Context) -> bool:
-    """True if nothing is heard and no hover thrust is known: for a while setpoints are better."""
-    descent = c.state.descent
-    unlearned = descent.thrust == 0.0 and c.belief.hover.is_rough
-    return is_unheard(c) and unlearned and c.in_phase_s < OWN_ESTIMATE_S
+    """True if nothing is heard, and the hover thrust is known only roughly: for a while setpoints
+    are better."""
+    begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_rough
+    return is_unheard(c) and begins_rough and c.in_phase_s < OWN_ESTIMATE_S
 
 
 def descend_level(c: Context) -> Action:

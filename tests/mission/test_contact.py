@@ -24,6 +24,7 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     MOCAP,
     PROFILE,
+    changed,
     observing,
     remembering,
     state_in,
@@ -88,3 +89,17 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     b = observing(replace(pressing, setpoint=above), obs).belief
     found = [CONTACT in b.since, BLOCKED in b.since, CARRIED in b.since, is_pressing(b)]
     assert found == [thrust >= PRESSING_RATIO] * 4
+
+
+@pytest.mark.parametrize(("raw_order", "presses"), [(60_000, True), (None, False)])
+def test_the_end_of_a_raw_press_counts_only_while_one_is_flown(
+    raw_order: int | None, presses: bool
+) -> None:
+    """At 59400 of a raw press's 60000 no more can be shown; in position mode, hover thrust of a
+    heavy vehicle is as much, and presses nothing."""
+    raw = changed({"planner.perch.mode": "raw", "planner.perch.thrust": 62_000})
+    pressing = remembering(
+        state_in(Phase.PERCH, z_m=HANG_Z_M), hover_thrust=58_500.0, raw_order=raw_order
+    )
+    b = observing(pressing, touching(thrust=59_500.0), raw).belief
+    assert is_pressing(b) is presses

@@ -26,7 +26,14 @@ from perchctl.mission.belief.hover import (
 from perchctl.mission.belief.maneuver import Maneuver, Sent
 from perchctl.mission.phase import Phase
 from perchctl.values import replace
-from tests.helpers.mission import context_at, observation, remembering, state_in, telemetry
+from tests.helpers.mission import (
+    context_at,
+    observation,
+    observing,
+    remembering,
+    state_in,
+    telemetry,
+)
 
 thrusts = st.floats(30_000.0, 62_000.0)
 drifts = st.sampled_from([OPEN_DRIFT, DESCENT_DRIFT])
@@ -117,3 +124,27 @@ def test_what_was_never_learned_is_felt_and_rough() -> None:
     assert known(b).thrust == pytest.approx(45_000.0)
     assert known(b).is_rough
     assert not learn_in_quiet_flight(b, 0.02).is_rough
+
+
+def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
+    """One late packet teaches no more in a second than in a tick."""
+    start = remembering(
+        state_in(Phase.LANDING), raw_order=45_000, hover=HoverThrust(50_000.0, 0.12)
+    )
+    sample = replace(telemetry(10.02, 1.0), thrust=45_000.0)
+    once = observing(start, observation(10.02, telemetry=sample))
+    again = observing(once, observation(10.04, telemetry=sample))
+    assert once.belief.hover_thrust < 50_000.0
+    assert again.belief.hover_thrust == once.belief.hover_thrust
+
+
+@given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
+def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
+    later = HoverThrust(50_000.0, sigma).aged(dt_s)
+    assert sigma <= later.sigma <= max(sigma, FELT_SIGMA)
+
+
+def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:
+    found = HoverThrust().with_measured(48_000.0, 0.02)
+    assert found.thrust == 48_000.0
+    assert math.isfinite(found.sigma)

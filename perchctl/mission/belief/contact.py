@@ -25,10 +25,15 @@ from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
 PRESSING_RATIO = 1.08
-"""Multiple of hover thrust from which a vehicle at rest presses: five times what that is known to.
-Larger: a weak press proves nothing. Smaller: a gust, or a sagging battery, looks like a press."""
+"""Multiple of hover thrust from which a vehicle at rest presses: five times the spread of what
+quiet flight has taught. Larger: a weak press proves nothing. Smaller: a gust, or a sagging battery,
+looks like a press."""
 PRESS_SATURATED_PART = 0.98
-"""Share of the most thrust above which it is not known how much more the vehicle would take."""
+"""Share of full thrust above which it is not known how much more the vehicle would take."""
+MOST_RAW = 60000.0
+"""The most raw thrust that the firmware gives."""
+PROVABLE = 0.99
+"""Share of a raw press's thrust that shows the press, however little is left above hovering."""
 LITTLE_LEFT = 0.93
 """Share of full thrust: if hovering takes more, more thrust is no sign of a press. Smaller: heavy
 vehicles are never seen to press."""
@@ -114,7 +119,7 @@ def last_touch_offset(b: Belief) -> ContactOffset | None:
 
 
 def newest_contact_offset(b: Belief) -> ContactOffset:
-    """The error of the last touch where that still counts, else of now."""
+    """The offset of the last touch where that still counts, else of now."""
     return last_touch_offset(b) or contact_offset(b)
 
 
@@ -142,7 +147,7 @@ def is_at_target(b: Belief) -> bool:
 def max_press_thrust(profile: Profile) -> float:
     """The largest thrust that a press can have, 0..65535."""
     perch = profile.planner.perch
-    return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
+    return min(float(perch.thrust), MOST_RAW) if perch.mode == "raw" else FULL_THRUST
 
 
 def is_hover_thrust(b: Belief) -> bool:
@@ -178,8 +183,11 @@ def is_carried_by_other_than_thrust(b: Belief) -> bool:
 
 
 def is_strong(b: Belief) -> bool:
-    """True if the thrust is above what hovering takes, or at the limit of a press."""
-    most = PRESS_SATURATED_PART * max_press_thrust(b.profile)
+    """True if the thrust is above what hovering takes, or nearly all there is: the motors' own, or
+    while a press by raw thrust is flown, that thrust."""
+    most = PRESS_SATURATED_PART * FULL_THRUST
+    if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
+        most = PROVABLE * max_press_thrust(b.profile)
     least = min(PRESSING_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
     return b.telemetry.thrust >= least
 

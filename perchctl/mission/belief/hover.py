@@ -40,7 +40,7 @@ FELT_SIGMA = 0.03
 UNSURE_SIGMA = 0.12
 """The same where it is not known whether the vehicle flew then, or something carried it."""
 ROUGH_SIGMA = 0.05
-"""Spread from which it is rough: good enough to fall slowly, not to descend without telemetry."""
+"""Spread from which it is rough: good enough to sink slowly, not to descend without telemetry."""
 DESCENT_SIGMA = 0.04
 """Spread that a descent begins with, at least. Larger: what touches something learns it. Smaller: a
 weak battery sinks too fast."""
@@ -69,7 +69,7 @@ class HoverThrust:
     Attributes:
         thrust: 0..65535; 0 while unknown.
         sigma: standard deviation, as a share of it.
-        first: as the descent began that corrects it, and with which spread; None outside of one.
+        first: as the descent began that corrects it, and with which spread; None before one.
     """
 
     thrust: float = 0.0
@@ -85,10 +85,17 @@ class HoverThrust:
         """The estimate `dt_s` later."""
         return replace(self, sigma=math.sqrt(self.sigma**2 + drift**2 * dt_s))
 
+    def aged(self, dt_s: float) -> HoverThrust:
+        """The estimate `dt_s` later in the open; what was learned stays as sure as what is felt."""
+        sigma = self.after(dt_s, OPEN_DRIFT).sigma
+        return replace(self, sigma=min(sigma, max(self.sigma, FELT_SIGMA)))
+
     def with_measured(self, thrust: float, dt_s: float) -> HoverThrust:
-        """The estimate after a measurement that stands for `dt_s`."""
+        """The estimate after a measurement that stands for `dt_s`; unchanged for 0."""
         if dt_s <= 0.0:
             return self
+        if math.isinf(self.sigma):
+            return replace(self, thrust=thrust, sigma=THRUST_NOISE / math.sqrt(dt_s))
         variance = self.sigma**2
         gain = variance / (variance + THRUST_NOISE**2 / dt_s)
         corrected = self.thrust + gain * (thrust - self.thrust)
@@ -106,18 +113,20 @@ def known(b: Belief) -> HoverThrust:
 
 
 def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
-    """The estimate after a tick in which the thrust is hover thrust; `dt_s` since the last tick."""
+    """The estimate after a tick in which the thrust is hover thrust; `dt_s` since the sample
+    before, 0 if this one is not new."""
     thrust, old = b.telemetry.thrust, b.hover
     if old.thrust == 0.0:
         return HoverThrust(b.imu.hover_thrust or thrust, FELT_SIGMA)
     if abs(thrust / old.thrust - 1.0) > QUIET_WITHIN:
         return old  # held by the ceiling, or by a hand
-    return old.after(dt_s, OPEN_DRIFT).with_measured(thrust, dt_s)
+    return old.with_measured(thrust, dt_s)
 
 
 def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
-    """The estimate after a tick of a descent by thrust; unchanged where the floor or a magnet may
-    carry a part of the weight, or the telemetry shows nothing of it."""
+    """The estimate after a tick of a descent by thrust, `dt_s` as in `learn_in_quiet_flight`;
+    unchanged where the floor or a magnet may carry a part of the weight, or the telemetry shows
+    nothing of it."""
     tel, old = b.telemetry, known(b)
     first, sigma = old.first or (old.thrust, max(DESCENT_SIGMA, old.sigma))
     old = replace(old, first=(first, sigma))

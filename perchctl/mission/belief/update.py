@@ -26,6 +26,7 @@ from perchctl.mission.belief.contact import (
     CARRIED,
     DOWN,
     HANGING_S,
+    MOST_RAW,
     STANDING_BELOW_M,
     SUPPORT_CONDITIONS,
     counts,
@@ -60,11 +61,10 @@ CARRIED_WITHIN_M = 0.3
 AT_REST_S = 0.3
 """Time for which a vehicle at its contact has to be still to count as at rest."""
 MOST_LEARNED_S = 0.1
-"""Time between two ticks that one sample stands for at most."""
+"""Time since the sample before that one sample stands for at most. Larger: after a gap a single
+sample counts as much as a second of them."""
 UNANSWERED_PART = 0.12
 """Share of full thrust by which order and reading may differ: no ramp leads farther."""
-MOST_RAW = 60000.0
-"""The most raw thrust that the firmware gives."""
 STILL_THRUST = 1000
 """Raw thrust on which the motors stand still and the stream of setpoints lives on."""
 SPREAD_KEEPS = 0.9
@@ -346,14 +346,16 @@ def _learn(b: Belief) -> Belief:
     if held:
         since = lasting(since)  # a held vehicle proves nothing
     dt_s = max(0.0, obs.t_s - b.t_s)
-    learned_s = min(dt_s, MOST_LEARNED_S)
+    last_s = obs.telemetry.t_s - dt_s if b.last is None else b.last.t_s
+    sample_s = max(0.0, min(MOST_LEARNED_S, obs.telemetry.t_s - last_s))  # 0: nothing new
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.nears_target or b.target.error_z_m > near_m
+    b = replace(b, hover=b.hover.aged(dt_s))
     found = b.hover
     if away and maneuver.learns_hover and is_hover_thrust(b):
-        found = hover.learn_in_quiet_flight(b, learned_s)
+        found = hover.learn_in_quiet_flight(b, sample_s)
     elif b.sent.is_level_descent:
-        found = hover.learn_in_descent(b, learned_s)
+        found = hover.learn_in_descent(b, sample_s)
     mah = b.profile.vehicle.battery_mah
     return replace(
         b,
