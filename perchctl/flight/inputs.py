@@ -76,9 +76,8 @@ class FlightInputs:
     profile: Profile
     send: SendPosition = lambda place: True
     is_logged: bool = False  # then with the pictures' checksums and the present's spread
-    on_frame: Callable[[Frame], None] = lambda frame: (
-        None
-    )  # called with each, as its source gave it
+    # Gets each frame as its source gave it.
+    on_frame: Callable[[Frame], None] = lambda frame: None
     perception: Perception = field(init=False)
     # Hands the vehicle's places to `send`, where the target is its positioning system.
     target_positioning: TargetPositioning | None = field(init=False, default=None)
@@ -256,9 +255,9 @@ class FlightInputs:
         self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
         if kind != "ok" and self._note is None:
             return VERDICT_TEXTS[kind]
-        age_s = now_s - self.perception.exposure_s(frame)
+        t_s = self.perception.exposure_s(frame)
+        age_s = now_s - t_s
         if live and not age_s >= -PICTURE_AHEAD_S:
-            t_s = self.perception.exposure_s(frame)
             return f"the picture's time, {t_s:.3f} s, is not past"
         is_late = live and age_s > self.profile.safety.max_frame_age_s
         return f"the picture is {age_s:.1f} s late" if is_late else None

@@ -27,7 +27,7 @@ class FrameWatcher(Watcher, Protocol):
     """A watcher of the pictures, too."""
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame as the camera gave it, before it is searched; also before take-off."""
+        """Take a frame as it came, before it is searched; also before take-off."""
 
 
 class TurnWatcher(Watcher, Protocol):

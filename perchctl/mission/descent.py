@@ -80,7 +80,7 @@ DROPPING_MPS = -0.35
 STOP_BELOW_M = 0.05
 """Height below which a descent by thrust stands, if it does not move."""
 RESTS_MPS = 0.1
-"""Vertical speed up to which it does not. Larger: what climbs or sinks past falls from there."""
+"""Vertical speed up to which it does not. Larger: motors stop while it still climbs or sinks."""
 ON_FLOOR_S = 0.5
 """Time for which a vehicle has to stand still before its motors are stopped."""
 

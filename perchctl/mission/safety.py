@@ -233,9 +233,9 @@ def is_held(c: Context) -> bool:
 def is_held_elsewhere(c: Context) -> bool:
     """True if something holds the vehicle off the target's height, or beside the target."""
     touched = last_touch_offset(c.belief)
-    error = touched or contact_offset(c.belief)
+    offset = touched or contact_offset(c.belief)
     at_its_height = touched is not None or is_at_contact_height(c.belief)
-    beside = error.aside_m - 2.0 * error.sigma_m > c.planner.perch.contact_xy_m
+    beside = offset.aside_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
     return c.held_s(HANGING) >= HELD_S and (beside or not at_its_height)
 
 

@@ -71,7 +71,7 @@ class Perception:
     _mirrored: int = 0  # frames with the target's mirror image since one showed the target
 
     def exposure_s(self, frame: Frame) -> float:
-        """When a frame was exposed, s on the loop's clock, as well as the flight knows by now.
+        """When a frame was exposed, s on the loop's clock, as far as the flight knows by then.
 
         The source stamps a frame with its arrival less the latency that the profile gives; what the
         flight has measured beyond that is taken off here, and nowhere else."""

@@ -94,10 +94,7 @@ class DeadReckoning:
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
     bias_mps2: Vector = ZERO  # excess of accelerometer and attitude
-    mean_aside_mps2: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # mean of what the accelerometer reads sideways
+    mean_aside_mps2: tuple[float, float] = (0.0, 0.0)  # what the accelerometer reads sideways
     estimated_mps: Vector = ZERO
     beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
     missed_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the accelerometer alone
