@@ -54,6 +54,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "perchctl.values",
         "perchctl.children",
         "perchctl.extensions",
+        "perchctl.opencv_threads",
     ),
     ("perchctl.plot",),
     ("perchctl.profile",),

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import FlightInputs
 from perchctl.mission import FrameRecord, Observation, Turn, TurnInputs, UnfilteredPose
+from perchctl.opencv_threads import one_thread
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision import Frame, Pipeline, one_thread
+from perchctl.vision import Frame, Pipeline
 
 Picture = tuple[int, float, NDArray[np.uint8]]
 """Of a frame: its number, the source's time, and the searched picture."""

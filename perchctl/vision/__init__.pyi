@@ -17,7 +17,6 @@ from .pose import estimate_pose as estimate_pose
 from .pose import square_corners as square_corners
 from .target_selection import to_level as to_level
 from .target_selection import to_world as to_world
-from .threads import one_thread as one_thread
 from .types import MARKERS as MARKERS
 from .types import Attitude as Attitude
 from .types import CameraErrors as CameraErrors

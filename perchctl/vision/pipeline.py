@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
 from perchctl.extensions import error_at, load_extension
+from perchctl.opencv_threads import one_thread
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import classify_fields, separate_fields
@@ -35,7 +36,6 @@ from perchctl.vision.target_selection import (
     to_level,
     to_world,
 )
-from perchctl.vision.threads import one_thread
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,

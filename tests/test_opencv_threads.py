@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import cv2
 import pytest
 
-from perchctl.vision import one_thread
+from perchctl.opencv_threads import one_thread
 
 
 @pytest.fixture
