@@ -28,9 +28,9 @@ from perchctl.mission.belief.contact import (
     has_slipped,
     is_pressing,
 )
-from perchctl.mission.belief.hover import LEAST_POSITION_THRUST
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.reckoning import MAGNET_REACH_M
+from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
 from perchctl.mission.belief.update import (
     STILL_THRUST,
     after_command,

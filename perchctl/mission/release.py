@@ -8,7 +8,7 @@ on the magnet and monitored, and only then the motors are stopped.
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import WEIGHT_HANGS, is_strong
-from perchctl.mission.belief.hover import LEAST_POSITION_THRUST
+from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
 from perchctl.mission.belief.update import STILL_THRUST
 from perchctl.mission.context import Context
 from perchctl.mission.setpoints import (

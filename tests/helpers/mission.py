@@ -11,7 +11,7 @@ import numpy as np
 from perchctl.mission import Event, EventKind, ImuMotion, Observation, Phase, PlannerState
 from perchctl.mission.belief.battery import EnergyState
 from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.hover import HoverThrust
+from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.context import Context
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Severity

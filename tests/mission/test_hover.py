@@ -14,16 +14,13 @@ from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.hover import (
     DESCENT_DRIFT,
     DESCENT_SIGMA,
-    FELT_SIGMA,
     MOST_SIGMAS,
-    OPEN_DRIFT,
-    THRUST_NOISE,
-    HoverThrust,
     known,
     learn_in_descent,
     learn_in_quiet_flight,
 )
 from perchctl.mission.belief.maneuver import Maneuver, Sent
+from perchctl.mission.belief.thrust import FELT_SIGMA, OPEN_DRIFT, THRUST_NOISE, HoverThrust
 from perchctl.mission.phase import Phase
 from perchctl.values import replace
 from tests.helpers.mission import (

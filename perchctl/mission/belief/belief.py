@@ -15,12 +15,12 @@ from typing import Any
 from perchctl.geometry import Array
 from perchctl.mission.belief.battery import EnergyState
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.hover import HoverThrust
 from perchctl.mission.belief.maneuver import Maneuver, Sent
 from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.belief.target import TargetBelief
+from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.observation import Mismatch, Observation
 from perchctl.profile import Profile
 from perchctl.values import replace

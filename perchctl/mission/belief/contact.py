@@ -19,7 +19,7 @@ import math
 
 from perchctl.mission.belief.belief import Belief, ContactOffset
 from perchctl.mission.belief.evidence import Condition, Rests
-from perchctl.mission.belief.hover import LEAST_POSITION_THRUST
+from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
