@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
-from perchctl.camera import FrameSource, WrappedSource
+from perchctl.camera import FrameSource, WrappedSource, open_camera
 from perchctl.errors import (
     ConnectionFailed,
     Interrupted,
@@ -319,10 +319,12 @@ class Session:
     def fly(self, before_arming: Callable[[], None] = lambda: None) -> None:
         profile = load_profile(SHORT)
         options = FlyOptions(profile, Path(SHORT), self.sim.uri, self.sim.stream_url)
-        fly_session(options, (self,), self.switch, self.watch, before_arming=before_arming)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("perchctl.flight.session.open_camera", self.open_camera)
+            fly_session(options, (self,), self.switch, before_arming=before_arming)
 
-    def watch(self, source: FrameSource) -> FrameSource:
-        return EndsOnWord(source, self)
+    def open_camera(self, *given: Any, **named: Any) -> FrameSource:
+        return EndsOnWord(open_camera(*given, **named), self)
 
     @property
     def propellers_turn(self) -> bool:
