@@ -15,11 +15,11 @@ _threads = 0  # that OpenCV had before the first of them
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Context manager: OpenCV works on one thread until the last user leaves, in the whole process,
-    since its setting is global.
+    """Limit OpenCV to one thread until the last user leaves. The limit applies to the whole
+    process, because OpenCV's setting is global.
 
-    For small patches, whose threads take longer to wake than they save, and where sums must have
-    one order. A whole picture is searched faster by all threads.
+    Use it for small patches, where waking threads costs more than it saves, and where sums need a
+    fixed order. Searching a whole picture is faster with all threads.
     """
     global _users, _threads
     with _LOCK:

@@ -24,10 +24,10 @@ SLOW_WATCHER_S = 0.25
 
 
 class FrameWatcher(Watcher, Protocol):
-    """A watcher of the pictures, too."""
+    """A watcher that also receives the camera's frames."""
 
     def frame(self, frame: Frame) -> None:
-        """Take a frame as it came, before it is searched; also before take-off."""
+        """Receive a frame before it is searched; called before take-off as well."""
 
 
 class TurnWatcher(Watcher, Protocol):

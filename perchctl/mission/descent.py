@@ -170,7 +170,7 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
         b,
         reach_s=before.t_s if within and old.reach_s is None else old.reach_s,
         contact_z_m=contact_z_m,
-        hover=hover.known(old),
+        hover=hover.best_estimate(old),
     )
     return replace(state, belief=give_up_position(b) if lost else b)
 

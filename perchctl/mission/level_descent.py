@@ -123,7 +123,7 @@ def descend_level(c: Context) -> Action:
     dt_s, age_s = _step_s(c), _age_s(c)
     held = tel.t_s < state.entry.t_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else b.climb_mps) + descent.under_way_mps
-    hover_thrust = hover.known(b).thrust
+    hover_thrust = hover.best_estimate(b).thrust
     height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _rate_thrust(c, hover_thrust, climb_mps, height_m)
@@ -235,7 +235,10 @@ def _braking(c: Context) -> tuple[float, float]:
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
-    (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = reckoning.bias_mps2, reckoning.mean_aside_mps2
+    (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
+        reckoning.bias_mps2,
+        reckoning.mean_lateral_mps2,
+    )
     known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_MEMORY_S)
     counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
     ahead_mps2, left_mps2 = _in_heading(

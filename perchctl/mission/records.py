@@ -174,8 +174,8 @@ class Turn:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tick:
-    """A turn that was flown, with what the log keeps only in part: the planner's whole state, and
-    the pipeline's output.
+    """A flown turn with the planner's whole state and the pipeline's output, of which the log keeps
+    only parts.
 
     `output` is None where no new frame was searched; `consistency`: errors of latency and mounting,
     if worked out in this turn.

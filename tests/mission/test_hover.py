@@ -15,7 +15,7 @@ from perchctl.mission.belief.hover import (
     DESCENT_DRIFT,
     DESCENT_SIGMA,
     MOST_SIGMAS,
-    known,
+    best_estimate,
     learn_in_descent,
     learn_in_quiet_flight,
 )
@@ -118,8 +118,8 @@ def test_what_may_carry_it_teaches_a_descent_nothing(hides: dict[str, Any]) -> N
 
 def test_what_was_never_learned_is_felt_and_rough() -> None:
     b = replace(believing(Phase.LANDING, 45_000.0), hover=HoverThrust())
-    assert known(b).thrust == pytest.approx(45_000.0)
-    assert known(b).is_rough
+    assert best_estimate(b).thrust == pytest.approx(45_000.0)
+    assert best_estimate(b).is_rough
     assert not learn_in_quiet_flight(b, 0.02).is_rough
 
 

@@ -313,7 +313,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     reckoning = DeadReckoning(
         imu=imu,
         bias_mps2=(bias_mps2 * cos, bias_mps2 * sin, 0.0),
-        mean_aside_mps2=(reads_mps2 * cos, reads_mps2 * sin),
+        mean_lateral_mps2=(reads_mps2 * cos, reads_mps2 * sin),
         held_s=held_s,
     )
     c = context("imu", reckoning=reckoning, tel={"yaw_rad": heading_rad})

@@ -6,11 +6,11 @@ thrust is. So thrust far from hover thrust, at 1 g and at rest, is a contact: wi
 vehicle presses, with less something carries it. Where it is, and what it was flown to do, then tell
 a magnet from the floor, and both from something else.
 
-More thrust than hovering takes is one thing everywhere: `is_strong`. At rest it is a press
-(`is_pressing`), at the target's height a contact (`CONTACT`), under a setpoint something in the way
-(`BLOCKED`), and without a position what is felt (`CARRIED`). Less is `CARRIED`, too; and a thrust
-that cannot be what carries the vehicle (`is_carried_by_other_than_thrust`) is what `HANGING`,
-`MAGNET_HOLDS` and `ON_FLOOR` begin with.
+One threshold decides whether the thrust exceeds hover thrust: `is_strong`. A vehicle at rest with
+that thrust is pressing (`is_pressing`): against the target if it is at the target's height
+(`CONTACT`), against an obstacle if its setpoint is above (`BLOCKED`), and against something unknown
+without a position (`CARRIED`, which also covers too little thrust). `HANGING`, `MAGNET_HOLDS` and
+`ON_FLOOR` require a thrust too small to carry the vehicle (`is_carried_by_other_than_thrust`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
 PRESSING_RATIO = 1.08
-"""Multiple of hover thrust from which a vehicle at rest presses: five times the spread of what
-quiet flight has taught. Larger: a weak press proves nothing. Smaller: a gust, or a sagging battery,
-looks like a press."""
+"""Multiple of hover thrust above which a vehicle at rest is pressing: more than five standard
+deviations of hover thrust learned in quiet flight. Larger: a weak press proves nothing. Smaller: a
+gust or a sagging battery looks like a press."""
 PRESS_SATURATED_PART = 0.98
 """Share of full thrust above which it is not known how much more the vehicle would take."""
 MOST_RAW = 60000.0
 """The most raw thrust that the firmware gives."""
 PROVABLE = 0.99
-"""Share of a raw press's thrust that shows the press, however little is left above hovering."""
+"""Share of a raw press's thrust that always counts as pressing. Larger: a reading just below the
+order proves nothing. Smaller: a heavy vehicle seems to press while it hovers."""
 LITTLE_LEFT = 0.93
 """Share of full thrust: if hovering takes more, more thrust is no sign of a press. Smaller: heavy
 vehicles are never seen to press."""
@@ -183,8 +184,8 @@ def is_carried_by_other_than_thrust(b: Belief) -> bool:
 
 
 def is_strong(b: Belief) -> bool:
-    """True if the thrust is above what hovering takes, or nearly all there is: the motors' own, or
-    while a press by raw thrust is flown, that thrust."""
+    """True if the thrust exceeds hover thrust, or is close to its limit: during a press by raw
+    thrust the ordered thrust, otherwise full thrust."""
     most = PRESS_SATURATED_PART * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
         most = PROVABLE * max_press_thrust(b.profile)
@@ -193,7 +194,7 @@ def is_strong(b: Belief) -> bool:
 
 
 def is_pressing(b: Belief) -> bool:
-    """True if the thrust is above what hovering takes, and the vehicle does not move."""
+    """True if the thrust exceeds hover thrust and the vehicle does not move vertically."""
     return (
         is_strong(b)
         and abs(b.telemetry.velocity_mps[2]) <= MOTIONLESS_MPS

@@ -1,10 +1,11 @@
-"""What teaches the hover thrust, the reference of each proof of contact and of a descent by thrust.
+"""Measurements for the hover-thrust filter (`perchctl.mission.belief.thrust`).
 
-Its filter (`perchctl.mission.belief.thrust`) measures the thrust in quiet flight
-(`learn_in_quiet_flight`), and in a descent by thrust the thrust for each g that the accelerometer
-reads (`learn_in_descent`). Where neither was ever measured, `known` gives what has been felt in
-flight, with the spread that this has. It is wrong while something carries a part of the weight
-unnoticed, and by the accelerometer's scale after a long descent.
+Hover thrust is the reference for every proof of contact and for a descent by thrust. In quiet
+flight the filter measures the thrust itself (`learn_in_quiet_flight`); in a descent by thrust it
+measures thrust divided by specific force (`learn_in_descent`). Before either has happened,
+`best_estimate` falls back on the accelerometer, with a larger standard deviation. The estimate is
+wrong while something carries part of the weight unnoticed, and after a long descent by the scale
+error of the accelerometer.
 """
 
 from __future__ import annotations
@@ -14,18 +15,21 @@ from perchctl.mission.belief.thrust import FELT_SIGMA, LEAST_POSITION_THRUST, Ho
 from perchctl.values import replace
 
 DESCENT_DRIFT = 0.067
-"""The same in a descent by thrust, where wind and battery change it. Larger: vibration changes the
-thrust. Smaller: it sinks too fast for longer in a wind."""
+"""Random walk of the hover thrust in a descent by thrust, as a share per square root of a second.
+Larger: vibration changes the thrust. Smaller: in wind the vehicle sinks too fast for longer."""
 UNSURE_SIGMA = 0.12
-"""Spread of what was felt where it is not known whether the vehicle flew then, or was carried."""
+"""Standard deviation, as a share, of an estimate by the accelerometer alone when the vehicle may
+have been carried. Larger: a descent may correct it further. Smaller: a wrong one persists."""
 DESCENT_SIGMA = 0.04
-"""Spread that a descent begins with, at least. Larger: what touches something learns it. Smaller: a
-weak battery sinks too fast."""
+"""Smallest standard deviation, as a share, at the start of a descent. Larger: contact with an
+obstacle teaches a wrong value. Smaller: with a weak battery the vehicle sinks too fast."""
 MOST_SIGMAS = 3.0
-"""So many of these a descent may correct it by."""
+"""Largest correction in a descent, in standard deviations at its start. Larger and smaller: as for
+`DESCENT_SIGMA`."""
 QUIET_WITHIN = 0.2
-"""Share by which quiet thrust may differ; if it does by more, the ceiling or a hand holds the
-vehicle."""
+"""Largest share by which quiet thrust may differ from the estimate; beyond it, the ceiling or a
+hand holds the vehicle. Larger: a held vehicle teaches a wrong value. Smaller: a real change is
+rejected."""
 LATEST_S = 1.0
 """Older telemetry shows nothing of the present thrust."""
 LEAST_FELT_G = 0.7
@@ -39,8 +43,9 @@ LEAST_DIVISOR_G = 0.75
 MOST_DIVISOR_G = 1.5
 
 
-def known(b: Belief) -> HoverThrust:
-    """The estimate; where there is none, what was felt in flight, else what one sample shows."""
+def best_estimate(b: Belief) -> HoverThrust:
+    """Return the estimate; without one, the mean by the accelerometer; without that, the value of
+    the newest sample."""
     if b.hover.thrust > 0.0:
         return b.hover
     tel = b.telemetry
@@ -64,7 +69,7 @@ def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     """The estimate after a tick of a descent by thrust, `dt_s` as in `learn_in_quiet_flight`;
     unchanged where the floor or a magnet may carry a part of the weight, or the telemetry shows
     nothing of it."""
-    tel, old = b.telemetry, known(b)
+    tel, old = b.telemetry, best_estimate(b)
     first, sigma = old.first or (old.thrust, max(DESCENT_SIGMA, old.sigma))
     old = replace(old, first=(first, sigma))
     shows = (

@@ -94,7 +94,7 @@ class DeadReckoning:
     imu: ImuMotion | None = None  # the motion up to which it is reckoned
     velocity_mps: Vector = ZERO
     bias_mps2: Vector = ZERO  # excess of accelerometer and attitude
-    mean_aside_mps2: tuple[float, float] = (0.0, 0.0)  # what the accelerometer reads sideways
+    mean_lateral_mps2: tuple[float, float] = (0.0, 0.0)  # what the accelerometer reads sideways
     estimated_mps: Vector = ZERO
     beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
     missed_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the accelerometer alone
@@ -214,7 +214,7 @@ def _carry_on(
         GRAVITY_MPS2 * (ahead_g * cos - left_g * sin),
         GRAVITY_MPS2 * (ahead_g * sin + left_g * cos),
     )
-    mean_aside_mps2 = [*old.mean_aside_mps2]
+    mean_lateral_mps2 = [*old.mean_lateral_mps2]
     for i in range(3):
         gained = imu.velocity_mps[i] - before.velocity_mps[i]
         if i == 2 and believed and old.below_m < BOUNCE_WITHIN_M:
@@ -233,7 +233,7 @@ def _carry_on(
                 share = min(1.0, dt_s / BIAS_MEMORY_S)
                 b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b + share * (wrong - b)))
                 if i < 2:
-                    mean_aside_mps2[i] += share * (reads_mps2[i] - mean_aside_mps2[i])
+                    mean_lateral_mps2[i] += share * (reads_mps2[i] - mean_lateral_mps2[i])
         velocity.append(v)
         bias.append(b)
     vx, vy, vz = velocity
@@ -247,7 +247,7 @@ def _carry_on(
         imu=imu,
         velocity_mps=(vx, vy, vz),
         bias_mps2=(bias[0], bias[1], bias[2]),
-        mean_aside_mps2=(mean_aside_mps2[0], mean_aside_mps2[1]),
+        mean_lateral_mps2=(mean_lateral_mps2[0], mean_lateral_mps2[1]),
         estimated_mps=estimated,
         beside_mps=(beside[0], beside[1]),
         missed_mps=(missed[0], missed[1]),

@@ -1,10 +1,10 @@
-"""The filter of the hover thrust; what teaches it is in `perchctl.mission.belief.hover`.
+"""A scalar Kalman filter for hover thrust; `perchctl.mission.belief.hover` supplies measurements.
 
-Hover thrust is what the motors give, 0..65535, when the vehicle neither rises nor sinks. A scalar
-Kalman filter estimates it, all in shares of the thrust:
+Hover thrust T is the thrust, 0..65535, at which the vehicle neither rises nor sinks. With the
+variance P as a squared share of the thrust, and a measurement z that stands for a time dt,
 
-    P += d^2 dt                    d: how fast it changes, by battery and wind
-    K = P / (P + r^2 / dt)         r: noise of a measurement that lasts one second
+    P += d^2 dt                       d: random walk of T, from battery and wind
+    K = P / (P + r^2 / dt)            r: standard deviation of a measurement over one second
     T += K (z - T),  P = (1 - K) P
 """
 
@@ -18,25 +18,28 @@ from perchctl.values import replace
 LEAST_POSITION_THRUST = 20000
 """The least thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
 THRUST_NOISE = 0.02
-"""Share by which the mean of one second's measurements is wrong: position control itself changes
-the thrust by 1 to 2 % for half a second. Larger: a sagging battery is followed late."""
+"""Standard deviation, as a share, of measurements averaged over one second: position control varies
+the thrust by 1 to 2 % for half a second. Larger: a sagging battery is followed late. Smaller: these
+variations are learned."""
 OPEN_DRIFT = 0.01
-"""Share by which it changes in the root of a second in the open. Larger: a push that lasts is
-learned. Smaller: a sagging battery is followed late."""
+"""Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
+a lasting push is learned. Smaller: a sagging battery is followed late."""
 FELT_SIGMA = 0.03
-"""Spread, as a share, of what was felt in flight, by the accelerometer's scale."""
+"""Standard deviation, as a share, of an estimate by the accelerometer in flight, from its scale
+error. Larger: early quiet flight, just after take-off, counts more. Smaller: it counts less."""
 ROUGH_SIGMA = 0.05
-"""Spread from which it is rough: good enough to sink slowly, not to descend without telemetry."""
+"""Standard deviation, as a share, above which the estimate is too rough to descend without
+telemetry. Larger: the vehicle comes down too fast. Smaller: it waits in the air for longer."""
 
 
 @dataclass(frozen=True)
 class HoverThrust:
-    """An estimate of the hover thrust, and of its spread.
+    """An estimate of hover thrust with its standard deviation.
 
     Attributes:
         thrust: 0..65535; 0 while unknown.
-        sigma: standard deviation, as a share of it.
-        first: as the descent began that corrects it, and with which spread; None before one.
+        sigma: standard deviation, as a share of `thrust`.
+        first: `thrust` and `sigma` at the start of a descent by thrust; None before one.
     """
 
     thrust: float = 0.0
@@ -45,20 +48,21 @@ class HoverThrust:
 
     @property
     def is_rough(self) -> bool:
-        """True if it was never measured in quiet flight, nor lately in a descent."""
+        """True if neither quiet flight nor a descent has measured it well enough."""
         return self.sigma > ROUGH_SIGMA
 
     def after(self, dt_s: float, drift: float) -> HoverThrust:
-        """The estimate `dt_s` later."""
+        """Return the estimate `dt_s` later, with a random walk of `drift` in between."""
         return replace(self, sigma=math.sqrt(self.sigma**2 + drift**2 * dt_s))
 
     def aged(self, dt_s: float) -> HoverThrust:
-        """The estimate `dt_s` later in the open; what was learned stays as sure as what is felt."""
+        """Return the estimate `dt_s` later without a measurement. The standard deviation grows, at
+        most to that of the accelerometer's estimate, which is always available in flight."""
         sigma = self.after(dt_s, OPEN_DRIFT).sigma
         return replace(self, sigma=min(sigma, max(self.sigma, FELT_SIGMA)))
 
     def with_measured(self, thrust: float, dt_s: float) -> HoverThrust:
-        """The estimate after a measurement that stands for `dt_s`; unchanged for 0."""
+        """Return the estimate after a measurement that stands for `dt_s`, or the same for 0."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma):

@@ -85,7 +85,7 @@ def update_belief(belief: Belief, obs: Observation, sent: Sent, profile: Profile
     if obs.jumped:
         b = _move_with_estimate(b)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        b = replace(b, heading_lost=True, hover=hover.known(b))
+        b = replace(b, heading_lost=True, hover=hover.best_estimate(b))
     b = _compare_thrust(b)
     b = _reckon(b)
     comes_down = sent.maneuver.descends and sent.is_motor_borne
@@ -105,7 +105,7 @@ def give_up_position(b: Belief) -> Belief:
         b,
         dead_reckoned_s=b.obs.t_s,
         reckoned_height_m=b.height_m,
-        hover=hover.known(b),
+        hover=hover.best_estimate(b),
     )
 
 
