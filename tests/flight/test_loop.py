@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, SafetyAbort, TimedOut
+from perchctl.flight import fly
 from perchctl.flight.preflight import GroundTurn, still_waiting_for
 from perchctl.mission import EventKind, FlightReport, Operator, Outcome, Tick
 from perchctl.perception import perception
@@ -321,6 +322,17 @@ def first_setpoint_s(rig: Rig) -> float:
     rig.operator = lambda: Operator.LAND if rig.link.said(PositionSetpoint) else Operator.NONE
     assert rig.fly().outcome is Outcome.OPERATOR
     return rig.link.said(PositionSetpoint)[0]
+
+
+def test_begin_turn_is_called_in_every_turn_from_the_first_one_on() -> None:
+    """Your `should_stop` is asked while the vehicle is not ready yet, too."""
+    rig = Rig(is_late())
+    rig.operator = lambda: Operator.LAND if rig.link.said(PositionSetpoint) else Operator.NONE
+    called_s: list[float] = []
+    fly(replace(rig.parts(), begin_turn=lambda: called_s.append(rig.link.now_s)))
+    period_s = 1.0 / PROFILE.link.loop_hz
+    assert called_s[0] < period_s
+    assert sum(t_s < READY_S for t_s in called_s) >= 0.9 * READY_S / period_s
 
 
 def test_a_camera_that_comes_back_is_flown_with() -> None:

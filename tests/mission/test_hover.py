@@ -145,3 +145,11 @@ def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:
     found = HoverThrust().with_measured(48_000.0, 0.02)
     assert found.thrust == 48_000.0
     assert math.isfinite(found.sigma)
+
+
+def test_a_tick_without_a_measurement_makes_it_less_sure() -> None:
+    """In a press nothing measures the hover thrust."""
+    start = remembering(state_in(Phase.PERCH), hover_thrust=50_000.0)
+    later = observing(start, observation(10.5))
+    assert later.belief.hover_thrust == 50_000.0
+    assert later.belief.hover.sigma > start.belief.hover.sigma
