@@ -196,11 +196,12 @@ def act(c: Context) -> Action:
 def descend(c: Context) -> Action:
     """Come down by one of the four policies.
 
-    In the magnet's reach a setpoint below takes the thrust to its least; if the vehicle does not
-    come off, its weight is hung on the magnet. Else sink by setpoints to the hand-over, and from
-    there by the vehicle's own landing: at once where height, stream or loop are doubtful. By the
-    target it would follow an estimate that rests on pictures, to an unmeasured floor: then it is
-    level from there.
+    Without a position the descent is level from the start. In the magnet's reach the setpoint is
+    lowered until the vehicle peels off; if it does not, its weight is put on the magnet. Elsewhere
+    it descends by setpoints to `handover_m` and from there by the firmware's own landing, or by
+    that landing at once if height, telemetry or loop cannot be relied on. With the target as the
+    positioning system there is no such landing, since its trajectory would follow the camera's
+    estimate to a floor of unknown height: from `handover_m` on the descent is level.
     """
     b = c.belief
     if not b.knows_its_place:

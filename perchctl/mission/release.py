@@ -7,7 +7,7 @@ on the magnet and monitored, and only then the motors are stopped.
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import WEIGHT_HANGS, is_strong
+from perchctl.mission.belief.contact import WEIGHT_HANGS, exceeds_hover_thrust
 from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
 from perchctl.mission.belief.update import STILL_THRUST
 from perchctl.mission.context import Context
@@ -75,7 +75,11 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     if not state.pressed:
         return state, None
     away_m = z - tel.position_m[2]
-    calm = away_m > CONTACT_LEFT_M and not is_strong(c.belief) and tel.velocity_mps[2] > PULLED_MPS
+    calm = (
+        away_m > CONTACT_LEFT_M
+        and not exceeds_hover_thrust(c.belief)
+        and tel.velocity_mps[2] > PULLED_MPS
+    )
     if calm or c.in_phase_s > UNPRESS_LIMIT_S:
         return replace(state, pressed=False), None
     below_m = UNWIND_M if away_m < CONTACT_LEFT_M else UNWIND_AWAY_M

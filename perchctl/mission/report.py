@@ -36,7 +36,8 @@ TURN_GATE_DEG = 2.0
 
 
 def claims_of(row_name: str) -> Claim:
-    """What the row of that name, as a log holds it, claims; nothing if it is not of the table."""
+    """The claims of the built-in row with this name, as a log holds it; none for any other name, as
+    of your own rows."""
     return next((row.claims for row in TABLE if row.name == row_name), Claim.NONE)
 
 
@@ -73,8 +74,8 @@ class Findings:
 
     @classmethod
     def of(cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False) -> Findings:
-        """The flight's findings, with advice on each that is surely beyond its limit, unless
-        `simulated`."""
+        """The findings by a flight's estimates, with advice on each error whose 95 % interval lies
+        beyond its limit; none if the flight was `simulated`."""
         latency_s = camera.start_latency_s + seen.delay_s
         x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)

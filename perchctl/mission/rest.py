@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 
-from perchctl.mission.belief.contact import contact_tolerance_m
+from perchctl.mission.belief.contact import possible_contact_tolerance_m
 from perchctl.mission.belief.target import FAR_BELOW_M
 from perchctl.mission.context import Context
 from perchctl.mission.phase import Claim, Phase
@@ -58,7 +58,9 @@ def _is_held_elsewhere(c: Context) -> bool:
         return False
     if Claim.HELD_BY_OTHER in state.entry.claims:
         return b.imu.fell_s <= state.entry.t_s
-    below = contact_tolerance_m(b) < b.target.error_z_m <= FAR_BELOW_M and b.contact is None
+    below = (
+        possible_contact_tolerance_m(b) < b.target.error_z_m <= FAR_BELOW_M and b.contact is None
+    )
     by_position = b.position_valid and not b.by_target and b.jump_s is None and b.height_m > HIGH_M
     return below and (b.target.is_fresh or by_position)
 

@@ -16,12 +16,12 @@ from perchctl.mission.belief.contact import (
     PRESS_SATURATED_PART,
     SATURATED_THRUST,
     contact_offset,
-    contact_tolerance_m,
     is_at_contact_height,
     is_at_target,
     last_touch_offset,
     max_press_thrust,
     newest_contact_offset,
+    possible_contact_tolerance_m,
 )
 from perchctl.mission.belief.motion import PUSHED_S
 from perchctl.mission.belief.quality import (
@@ -248,7 +248,7 @@ def is_blocked_off_target(c: Context) -> bool:
     """True if the vehicle is blocked, and not where a press would prove the contact."""
     pressing = c.state.phase is Phase.PERCH
     return is_blocked(c) and not (
-        pressing and abs(c.belief.target.error_z_m) <= contact_tolerance_m(c.belief)
+        pressing and abs(c.belief.target.error_z_m) <= possible_contact_tolerance_m(c.belief)
     )
 
 

@@ -42,7 +42,8 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 
 def is_combed(image: Grey) -> bool:
-    """True if a picture (h, w) is woven: adjacent rows differ more than one field's rows."""
+    """True if an interlaced picture (h, w) shows combing: a row differs more from its neighbours
+    than from the rows of its own field."""
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False

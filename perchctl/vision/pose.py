@@ -51,7 +51,8 @@ class PoseSetup:
 
     @cached_property
     def curl_lift_m(self) -> dict[_Source, Array]:
-        """Distances of `curl_lift`, (8, 2), ``joint`` (16, 2), for each entry of `corners_m`."""
+        """How far each corner lies off the sheet's plane, m, for one standard deviation of each of
+        the curl's two modes: (8, 2), ``joint`` (16, 2), each corner twice, for x and y."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 

@@ -35,11 +35,15 @@ from tests.mission.rig import BEGIN_S, at
 PRESSED = 1.2 * HOVER_THRUST
 
 
-def touching(below_m: float = 0.0, steady_s: float = 5.0, **changes: Any) -> Observation:
+def touching(
+    below_m: float = 0.0, steady_s: float = 5.0, unseen_s: float = 0.0, **changes: Any
+) -> Observation:
     """A vehicle that presses its gear against the target, `below_m` too low by the target's place,
-    its vertical speed steady since `steady_s`; with changes of its telemetry."""
+    which was seen `unseen_s` ago, its vertical speed steady since `steady_s`; with changes of its
+    telemetry."""
+    place_m = (0.0, 0.0, CEILING_M + below_m)
     seen = {
-        "target": target_at(BEGIN_S, (0.0, 0.0, CEILING_M + below_m), (0.0, 0.0, HANG_Z_M)),
+        "target": target_at(BEGIN_S, place_m, (0, 0, HANG_Z_M), measured_s=BEGIN_S - unseen_s),
         "imu": ImuMotion(t_s=BEGIN_S, steady_s=steady_s),
     }
     return at(HANG_Z_M, obs=seen, **{"thrust": PRESSED, **changes})(BEGIN_S)
@@ -71,6 +75,32 @@ def test_all_terms_together_are_a_contact(profile: Profile) -> None:
 )
 def test_without_one_of_them_there_is_none(spoilt: Observation, profile: Profile) -> None:
     assert not is_contact(spoilt, profile)
+
+
+@pytest.mark.parametrize(
+    ("profile", "inside", "outside"),
+    [
+        (PROFILE, touching(thrust=1.09 * HOVER_THRUST), touching(thrust=1.07 * HOVER_THRUST)),
+        (PROFILE, touching(acc_z_g=1.11), touching(acc_z_g=1.13)),
+        (PROFILE, touching(acc_z_g=0.89), touching(acc_z_g=0.87)),
+        (PROFILE, touching(below_m=0.049), touching(below_m=0.051)),
+        (PROFILE, touching(below_m=-0.049), touching(below_m=-0.051)),
+        (
+            PROFILE,
+            touching(velocity_mps=(0.0, 0.0, 0.045), steady_s=BEGIN_S),
+            touching(velocity_mps=(0.0, 0.0, 0.055), steady_s=BEGIN_S),
+        ),
+        # By the target alone the estimated height may have run away, by 0.1 m/s since it was seen.
+        (BY_TARGET, touching(0.14, unseen_s=1.0), touching(0.16, unseen_s=1.0)),
+        (MOCAP, touching(0.049, unseen_s=1.0), touching(0.051, unseen_s=1.0)),
+    ],
+    ids=["thrust", "heavy", "light", "low", "high", "speed", "unseen", "unseen by mocap"],
+)
+def test_each_term_has_its_limit(
+    profile: Profile, inside: Observation, outside: Observation
+) -> None:
+    """Just inside of it there is a contact, just outside there is none."""
+    assert [is_contact(inside, profile), is_contact(outside, profile)] == [True, False]
 
 
 def test_without_a_reference_for_the_thrust_there_is_none() -> None:

@@ -60,7 +60,7 @@ class EnergyState:
     hunger, hunger^2, and the two right sides.
     """
 
-    ground_v: float | None = None  # at rest; from the first reading where that was under load
+    ground_v: float | None = None  # resting, before take-off; estimated if read under load first
     used_share: float = 0.0  # by the count of the thrust, for a battery as assumed
     load: float = 0.0  # as the reading follows it
     mean_load: float = 0.0  # over the last seconds in the air

@@ -6,11 +6,12 @@ thrust is. So thrust far from hover thrust, at 1 g and at rest, is a contact: wi
 vehicle presses, with less something carries it. Where it is, and what it was flown to do, then tell
 a magnet from the floor, and both from something else.
 
-One threshold decides whether the thrust exceeds hover thrust: `is_strong`. A vehicle at rest with
-that thrust is pressing (`is_pressing`): against the target if it is at the target's height
-(`CONTACT`), against an obstacle if its setpoint is above (`BLOCKED`), and against something unknown
-without a position (`CARRIED`, which also covers too little thrust). `HANGING`, `MAGNET_HOLDS` and
-`ON_FLOOR` require a thrust too small to carry the vehicle (`is_carried_by_other_than_thrust`).
+One threshold decides whether the thrust exceeds hover thrust (`exceeds_hover_thrust`). A vehicle
+at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
+height (`CONTACT`), against an obstacle if its setpoint is above (`BLOCKED`), and against something
+unknown without a position (`CARRIED`, which also covers too little thrust). `HANGING`,
+`MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to carry the vehicle
+(`is_carried_by_other_than_thrust`).
 """
 
 from __future__ import annotations
@@ -124,16 +125,20 @@ def newest_contact_offset(b: Belief) -> ContactOffset:
     return last_touch_offset(b) or contact_offset(b)
 
 
-def contact_tolerance_m(b: Belief) -> float:
-    """The height difference (m) between gear and target up to which the gear is in contact."""
+def possible_contact_tolerance_m(b: Belief) -> float:
+    """The height difference (m) between gear and target up to which what is felt may be a contact.
+
+    It is capped, and so tells an obstacle from the target; the proof of a contact (`CONTACT`) asks
+    for less with a positioning system, and by the target alone allows a height that has run away.
+    """
     planner = b.profile.planner
     drift_mps = CARRIED_ON_MPS if b.by_target else planner.landing.drift_mps
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * b.sighting_age_s)
 
 
 def is_at_contact_height(b: Belief) -> bool:
-    """True if the gear is at the target's height, within the tolerance of a contact."""
-    return abs(b.target.error_z_m) <= contact_tolerance_m(b)
+    """True if the gear is at the target's height, within `possible_contact_tolerance_m`."""
+    return abs(b.target.error_z_m) <= possible_contact_tolerance_m(b)
 
 
 def is_at_target(b: Belief) -> bool:
@@ -183,7 +188,7 @@ def is_carried_by_other_than_thrust(b: Belief) -> bool:
     return b.thrust_is_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
 
-def is_strong(b: Belief) -> bool:
+def exceeds_hover_thrust(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust, or is close to its limit: during a press by raw
     thrust the ordered thrust, otherwise full thrust."""
     most = PRESS_SATURATED_PART * FULL_THRUST
@@ -196,7 +201,7 @@ def is_strong(b: Belief) -> bool:
 def is_pressing(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust and the vehicle does not move vertically."""
     return (
-        is_strong(b)
+        exceeds_hover_thrust(b)
         and abs(b.telemetry.velocity_mps[2]) <= MOTIONLESS_MPS
         and b.height_m >= STANDING_BELOW_M
     )
@@ -237,7 +242,7 @@ def _is_in_contact(b: Belief) -> bool:
         and b.reads_one_g
         and b.hover_thrust > 0
         and b.thrust_is_known
-        and is_strong(b)
+        and exceeds_hover_thrust(b)
     )
 
 
@@ -300,7 +305,7 @@ def _is_blocked(b: Belief) -> bool:
     setpoint, tel = b.sent.setpoint, b.telemetry
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
-    strong = b.hover_thrust < LITTLE_LEFT * FULL_THRUST and is_strong(b)
+    strong = b.hover_thrust < LITTLE_LEFT * FULL_THRUST and exceeds_hover_thrust(b)
     return strong and b.height_m > OFF_GROUND_M and is_still(b)
 
 
@@ -311,7 +316,7 @@ def _is_carried_by_feel(b: Belief) -> bool:
     return (
         0 < hover < LITTLE_LEFT * FULL_THRUST
         and b.thrust_is_known
-        and (is_strong(b) or tel.thrust <= (2.0 - PRESSING_RATIO) * hover)
+        and (exceeds_hover_thrust(b) or tel.thrust <= (2.0 - PRESSING_RATIO) * hover)
         and b.reads_one_g
         and b.obs.t_s - b.imu.steady_s >= perch.contact_dwell_s
     )

@@ -182,7 +182,7 @@ class FallDetector:
     """
 
     fell_s: float = -math.inf  # when it last fell, or came down and met the floor
-    light_since_s: float = math.inf
+    light_since_s: float = math.inf  # the accelerometer has read less than `FALL_G`
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
 
@@ -317,7 +317,7 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
     velocity_mps: Vector = ZERO  # since the first sample, world axes
     offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
     silent_s: float = -math.inf  # end of the newest silence
-    gap_s: float = -math.inf  # of the newest that may hide a fall
+    gap_s: float = -math.inf  # end of the newest silence that may hide a fall
     started_s: float = -math.inf  # first heard again after it had started anew
     sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
     hover_thrust: float = 0.0  # for each measured g in flight

@@ -1,7 +1,8 @@
 """Phase 6, PERCH: press the gear against the target until a contact is proven.
 
-The phase begins with nothing of its own, settled at the stand-off. The setpoint rises through the
-target, or raw thrust presses (keys `planner.perch` of the profile). A contact is proven by
+ASCEND hands over a vehicle that has settled at the stand-off; PERCH has no entry action of its own.
+The setpoint rises through the target, or raw thrust presses (`planner.perch` of the profile,
+`PerchConfig`). A contact is proven by
 position, acceleration and thrust together (`CONTACT` in `belief/contact.py`): within the magnet's
 radius it leads to COMPLETE, beside it to RECOVER. So do a push from the side, a press that goes on
 unseen for too long, and one that touches nothing in time; each of these counts as a failed attempt.
@@ -35,7 +36,11 @@ beside the magnet. Smaller: a covered marker ends attempts that would perch."""
 
 
 def act(c: Context) -> Action:
-    """Press. Position and trim stay as they are: against the ceiling they would wind up."""
+    """Raise the setpoint through the target while x, y and heading keep following it.
+
+    The learned trim is frozen and the height correction is off (`lift=False`): against the ceiling
+    both would wind up. In raw mode the thrust is ordered instead.
+    """
     perch, target = c.planner.perch, c.belief.target
     if perch.mode == "raw":
         return c.state, RawThrust(perch.thrust)
