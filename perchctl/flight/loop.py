@@ -56,7 +56,7 @@ TURN_HANG_S = 0.25
 """A turn that takes longer hung somewhere: what it knew of the vehicle is old."""
 
 
-class PositionSource(Protocol):
+class PositionStatus(Protocol):
     """What the loop needs of a `perchctl.positioning.PositionFeed`."""
 
     def status(self, now_s: float) -> FeedStatus: ...
@@ -82,7 +82,7 @@ class FlightParts:
     pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    positions: PositionSource | None = None
+    positions: PositionStatus | None = None
     remarks: Callable[[], Sequence[str]] = tuple
     table: tuple[Transition, ...] = table_of(None)
     judges: tuple[Watcher, ...] = ()
@@ -333,4 +333,5 @@ def _observe(
         log_problem=log_problem,
         position_age_s=0.0 if feed is None else feed.age_s,
         position_problem=None if feed is None else feed.problem,
+        position_beside_m=0.0 if feed is None else feed.beside_m,
     )

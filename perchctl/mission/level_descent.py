@@ -5,7 +5,8 @@ that orders have given and no sample shows yet, and the wanted sink s,
 
     T = T_h (1 - k (v + u + s)) / cos(tilt)
 
-is a proportional rate controller; k falls with the telemetry's age, or the vehicle would swing.
+is a proportional rate controller; k falls with the age of v, or the vehicle would swing. Where the
+telemetry is old and the target is seen, v is the climb that pictures show.
 What does not sink gets less and less thrust: it sinks, the magnet lets go, or the floor proves
 itself. Sideways the vehicle leans against the wind and brakes (`_braking`).
 """
@@ -18,6 +19,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import MOST_RAW
 from perchctl.mission.belief.reckoning import BIAS_MEMORY_S
+from perchctl.mission.belief.target import SEEN_MEMORY_S, TargetMotion
 from perchctl.mission.context import Context
 from perchctl.mission.release import clear_contact_below
 from perchctl.mission.setpoints import Action
@@ -39,12 +41,23 @@ LEAST_GAIN_S_PER_M = 0.2
 GAIN_AGE_S2_PER_M = 0.06
 """Gain times age of the telemetry, between the two."""
 UNHEARD_PART = 0.98
-"""Share of the thrust that lets it come down then."""
+"""Share of the thrust that lets it come down without a vertical speed."""
+SEEN_SINK_MPS = 0.4
+"""Wanted sink by pictures, which do not show how far the floor is. Larger: it lands harder.
+Smaller: it drifts aside for longer."""
+SEEN_LEAST_SINK_MPS = 0.2
+"""Sink by pictures below which it does not sink; single detections are off by half of that."""
+BRAKE_BY_TARGET_RAD_PER_MPS = 0.15
+"""Lean against a sideways speed that pictures show. Larger: it swings, since what it leans looks
+like a way, too. Smaller: it drifts farther aside."""
 ON_THE_SPOT_S = 0.6
 """Time by setpoints at one place after which no speed is left."""
 RAMP_PER_S = 0.25
 """Share of the hover thrust by which what does not sink gets less, each second. Larger: the floor
 is met faster. Smaller: a magnet holds it for longer."""
+SEEN_RAMP_PER_S = 0.1
+"""The same by pictures, which show a sink only after a quarter of a second. Larger: it falls at
+first. Smaller: it stands on the floor for longer with turning motors."""
 LEAST_SINK_MPS = 0.05
 """Sink below which it does not sink."""
 LEAST_ORDERED_PART = 0.4
@@ -82,7 +95,7 @@ TOUCH_BELOW_M = 0.7
 LEVEL_SPARE_S = 2.0
 """Time beyond the way down's own after which it has come down, or hangs."""
 UNHEARD_SPARE_S = 0.8
-"""The same without telemetry."""
+"""The same without a vertical speed."""
 OWN_ESTIMATE_S = 1.5
 """Time for which a vehicle that is not heard, and whose hover thrust is known only roughly, comes
 down by its own estimate."""
@@ -91,12 +104,40 @@ LEVEL_MEAN_MPS = 0.35
 PEELED_M = 0.1
 """The magnet has let go of a vehicle that is this far below its contact. Larger: one that has come
 off still seems to hang. Smaller: a drifting estimate lets one go that hangs."""
+SEEN_BELOW_M = 0.2
+"""The same by pictures with an old attitude. Larger: it drifts aside for longer until it brakes.
+Smaller: a target seen at an angle counts as one above."""
+SEEN_STANDING_PART = 0.75
+"""Share of the hover thrust at which a vehicle that pictures show still stands: in the air it would
+sink by a metre a second. Larger: a slow start of the descent is taken for the floor. Smaller: its
+motors turn on the floor for longer."""
 MOST_STEP_S = 0.1
 """Longest step between two ticks that the ramp counts."""
 
 
-def is_unheard(c: Context) -> bool:
-    """True if the telemetry is too old to tell the vertical speed."""
+def _seen_motion(c: Context) -> TargetMotion | None:
+    """The motion that pictures show, if the telemetry is old and they are newer."""
+    b, seen = c.belief, c.belief.target_motion
+    old = b.attitude_age_s > c.safety.telemetry_hold_s
+    return seen if old and seen.is_known and seen.t_s > b.telemetry.t_s else None
+
+
+def _is_seen_again(c: Context) -> bool:
+    """True if the telemetry is old, and the target is detected again but not for long enough to
+    tell the motion."""
+    b, seen = c.belief, c.belief.target_motion
+    old = b.attitude_age_s > c.safety.telemetry_hold_s
+    return old and not seen.is_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
+
+
+def _measured_s(c: Context) -> float:
+    """When the vertical speed was measured, by telemetry or pictures."""
+    seen = _seen_motion(c)
+    return c.telemetry.t_s if seen is None else seen.t_s - SEEN_MEMORY_S
+
+
+def _is_unmeasured(c: Context) -> bool:
+    """True if telemetry and pictures are too old to tell the vertical speed."""
     return _age_s(c) > hover.LATEST_S
 
 
@@ -106,32 +147,33 @@ def _step_s(c: Context) -> float:
 
 
 def _age_s(c: Context) -> float:
-    """Age of the vertical speed: of the telemetry, and a tick at least."""
-    return max(1e-3, _step_s(c), c.belief.attitude_age_s)
+    """Age of the vertical speed, a tick at least."""
+    return max(1e-3, _step_s(c), c.t_s - _measured_s(c))
 
 
 def waits_for_its_own_estimate(c: Context) -> bool:
-    """True if nothing is heard, and the hover thrust is known only roughly: for a while setpoints
-    are better."""
+    """True if the vertical speed is not measured, and the hover thrust is known only roughly: for a
+    while setpoints are better."""
     begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_rough
-    return is_unheard(c) and begins_rough and c.in_phase_s < OWN_ESTIMATE_S
+    return _is_unmeasured(c) and begins_rough and c.in_phase_s < OWN_ESTIMATE_S
 
 
 def descend_level(c: Context) -> Action:
     """Sink level by raw thrust on the vertical speed, tilted against the sideways speed."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
-    dt_s, age_s = _step_s(c), _age_s(c)
-    held = tel.t_s < state.entry.t_s - ON_THE_SPOT_S
-    climb_mps = (0.0 if held else b.climb_mps) + descent.under_way_mps
+    dt_s, age_s, measured_s = _step_s(c), _age_s(c), _measured_s(c)
+    measured_mps = _measured_climb_mps(c)
+    climb_mps = measured_mps + descent.under_way_mps
+    sinks, ramp_per_s = climb_mps <= -LEAST_SINK_MPS, RAMP_PER_S
+    if _seen_motion(c) is not None:  # on the floor the orders under way give no climb
+        sinks, ramp_per_s = measured_mps <= -SEEN_LEAST_SINK_MPS, SEEN_RAMP_PER_S
     hover_thrust = hover.best_estimate(b).thrust
     height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _rate_thrust(c, hover_thrust, climb_mps, height_m)
-    floor_felt_s = descent.floor_felt_s
-    if floor_felt_s is None and c.t_s - b.imu.blow_s < TOUCH_S and height_m < TOUCH_BELOW_M:
-        floor_felt_s = c.t_s
     if age_s > hover.LATEST_S:
         thrust *= UNHEARD_PART
+    floor_felt_s = _floor_felt_s(c, hover_thrust, height_m, sinks=sinks)
     touched_s = math.inf if floor_felt_s is None else c.t_s - floor_felt_s
     # In the air the accelerometer reads what the thrust gives, on the floor one g.
     falls = b.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
@@ -142,11 +184,13 @@ def descend_level(c: Context) -> Action:
     before = descent.thrust or hover_thrust
     if touched_s < TOUCH_S:
         thrust = TOUCH_PART * hover_thrust
-    elif floor_felt_s is not None or carried or climb_mps > -LEAST_SINK_MPS or overdue:
-        thrust = min(thrust, before - RAMP_PER_S * hover_thrust * dt_s)
+    elif _is_seen_again(c):
+        thrust = before
+    elif floor_felt_s is not None or carried or not sinks or overdue:
+        thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
     thrust = max(LEAST_ORDERED_PART * hover_thrust, min(MOST_RAW, thrust))
     # The speed that orders have given since the newest sample.
-    shown_s = 0.0 if b.last is None else max(0.0, tel.t_s - descent.sample_s)
+    shown_s = 0.0 if b.last is None else max(0.0, measured_s - descent.sample_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
     under_way_mps = descent.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
     state = _clear_contact_after_fall(c)
@@ -157,7 +201,7 @@ def descend_level(c: Context) -> Action:
             thrust=thrust,
             floor_felt_s=floor_felt_s,
             under_way_mps=under_way_mps,
-            sample_s=tel.t_s,
+            sample_s=measured_s,
         ),
         setpoint=None,
         orders=0,
@@ -167,25 +211,51 @@ def descend_level(c: Context) -> Action:
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
 
+def _measured_climb_mps(c: Context) -> float:
+    """The vertical speed as it was measured last, by telemetry or pictures; 0 where setpoints held
+    the vehicle at one place since the last telemetry."""
+    seen = _seen_motion(c)
+    if seen is not None:
+        return seen.velocity_mps[2]
+    held = c.telemetry.t_s < c.state.entry.t_s - ON_THE_SPOT_S
+    return 0.0 if held else c.belief.climb_mps
+
+
+def _floor_felt_s(c: Context, hover_thrust: float, height_m: float, *, sinks: bool) -> float | None:
+    """When the floor was first felt: by a blow from below while it sank, or by pictures that show
+    it stand on a thrust which does not carry it."""
+    descent, b, seen = c.state.descent, c.belief, _seen_motion(c)
+    if descent.floor_felt_s is not None:
+        return descent.floor_felt_s
+    struck = c.t_s - b.imu.blow_s < TOUCH_S and b.reckoning.struck_mps < 0.0
+    weak = 0.0 < descent.thrust < SEEN_STANDING_PART * hover_thrust
+    stands = seen is not None and seen.e_m[2] > SEEN_BELOW_M and weak and not sinks
+    return c.t_s if stands or (struck and height_m < TOUCH_BELOW_M) else None
+
+
 def _rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: float) -> float:
     """The rate controller's thrust, by the equation above."""
     b = c.belief
     # Late pictures may show the floor half a metre too far.
     low = height_m <= SLOW_BELOW_M or b.mismatch.later_s != 0.0
     sink_mps = LOW_SINK_MPS if low else LEVEL_SINK_MPS
-    gain = GAIN_AGE_S2_PER_M / max(1e-3, b.attitude_age_s)
+    if _seen_motion(c) is not None:
+        sink_mps = SEEN_SINK_MPS
+    gain = GAIN_AGE_S2_PER_M / max(1e-3, c.t_s - _measured_s(c))
     gain = max(LEAST_GAIN_S_PER_M, min(MOST_GAIN_S_PER_M, gain))
     tilt = max(LEAST_COSINE, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
 
 def _clear_contact_after_fall(c: Context) -> PlannerState:
-    """The state; without its contact once a position shows the vehicle lower, or after a fall."""
-    state, b = c.state, c.belief
+    """The state; without its contact once a position or pictures show the vehicle lower, or after a
+    fall."""
+    state, b, seen = c.state, c.belief, _seen_motion(c)
     if b.position_valid and b.dead_reckoned_s is None:
         return clear_contact_below(state, PEELED_M)
     reach_s = b.reach_s
-    if reach_s is not None and b.imu.fell_s > max(reach_s, state.entry.t_s):
+    fell = reach_s is not None and b.imu.fell_s > max(reach_s, state.entry.t_s)
+    if fell or (seen is not None and seen.e_m[2] > SEEN_BELOW_M):
         belief = replace(
             b,
             contact_z_m=None,
@@ -204,9 +274,9 @@ def _is_overdue(c: Context) -> bool:
         return False
     way_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
-    heard = b.attitude_age_s <= hover.LATEST_S
-    spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
-    if not heard and b.hover.is_rough:
+    measured = c.t_s - _measured_s(c) <= hover.LATEST_S
+    spare_s = LEVEL_SPARE_S if measured else UNHEARD_SPARE_S
+    if not measured and b.hover.is_rough:
         spare_s += OWN_ESTIMATE_S
     return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
@@ -235,6 +305,9 @@ def _braking(c: Context) -> tuple[float, float]:
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
+    seen, gain = _seen_motion(c), BRAKE_RAD_PER_MPS
+    if seen is not None and b.camera_is_proven:
+        (ahead_mps, left_mps, _), gain = seen.velocity_mps, BRAKE_BY_TARGET_RAD_PER_MPS
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
         reckoning.bias_mps2,
         reckoning.mean_lateral_mps2,
@@ -246,8 +319,8 @@ def _braking(c: Context) -> tuple[float, float]:
     )
     roll_rad, pitch_rad = c.obs.imu.misled_rad
     return (
-        _against(-left_mps) - _lean_rad(left_mps2) + roll_rad,
-        _against(ahead_mps) + _lean_rad(ahead_mps2) + pitch_rad,
+        _against(-left_mps, gain) - _lean_rad(left_mps2) + roll_rad,
+        _against(ahead_mps, gain) + _lean_rad(ahead_mps2) + pitch_rad,
     )
 
 
@@ -261,5 +334,5 @@ def _lean_rad(mps2: float) -> float:
     return max(-MOST_LEAN_RAD, min(MOST_LEAN_RAD, math.atan(mps2 / GRAVITY_MPS2)))
 
 
-def _against(mps: float) -> float:
-    return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))
+def _against(mps: float, rad_per_mps: float) -> float:
+    return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -rad_per_mps * mps))

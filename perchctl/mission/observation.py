@@ -53,6 +53,7 @@ class Observation:
     target_refused: str | None = None  #: why the last target seen is another vehicle's
     position_age_s: float = 0.0  #: of the newest external position sent; 0 where decks measure
     position_problem: str | None = None  #: why none is sent; None while they are
+    position_beside_m: float = 0.0  #: from the estimate to the newest sight; 0 if that was believed
     imu: ImuMotion = field(default_factory=ImuMotion)  #: by all samples up to `telemetry`
     felt: VisualInertialMotion | None = None  #: sideways, as pictures and accelerometer agreed
     mismatch: Mismatch | None = None  #: between the pictures and `imu`; None while they agree

@@ -90,6 +90,12 @@ HELD_S = 2.0
 """Time after which the magnet has been told from other things."""
 BLIND_VARIANCE_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting."""
+CONTRADICTED_M = 0.3
+"""Distance of the newest sight from the estimate at which the estimate is wrong. Larger: position
+control leads farther aside. Smaller: a swing ends the flight."""
+CONTRADICTED_S = 0.35
+"""Age of the newest position, latency included, from which on such sights are no single mistake.
+Larger: position control leads astray for longer. Smaller: one wrong detection ends the flight."""
 
 
 # --- Whether the position, the pictures and their mounting can be relied on ---
@@ -154,9 +160,12 @@ def divergence_reason(c: Context) -> str:
 
 def is_position_lost(c: Context) -> bool:
     """True if no position came for `positioning.land_s`, or the estimate is useless earlier: after
-    a blow or gust that no sighting has corrected, or by its variance."""
+    a blow or gust that no sighting has corrected, by its variance, or because sightings contradict
+    it."""
     b = c.belief
     if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
+        return True
+    if b.position_age_s > CONTRADICTED_S and c.obs.position_beside_m > CONTRADICTED_M:
         return True
     unsure = b.velocity_variance_m2ps2 > BLIND_VARIANCE_M2PS2
     return b.by_target and b.position_is_stale and unsure

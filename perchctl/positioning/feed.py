@@ -79,7 +79,8 @@ class FeedStatus:
     `age_s`: time since the exposure of the newest position that was sent; inf before the first.
     `problem`: None while positions are sent, else one sentence with the cause. `sent`: positions
     sent so far; `rate_hz`: in the last second. `pose`: the newest position sent; `measured`: that
-    with its attitude, also where only the position is sent.
+    with its attitude, also where only the position is sent. `beside_m`: distance of the newest
+    sight from the estimate if it is too large to be believed, else 0.
     """
 
     age_s: float = math.inf
@@ -88,6 +89,7 @@ class FeedStatus:
     pose: ExternalPosition | None = None
     rate_hz: float = 0.0
     measured: ExternalPosition | None = None
+    beside_m: float = 0.0
 
 
 class SendingRate:

@@ -81,7 +81,7 @@ class TargetFeed:
         self._seen_s = -math.inf
         self._placed_s = -math.inf
         self._pose: ExternalPosition | None = None
-        self._refusal = ""
+        self._refusal, self._beside_m = "", 0.0
 
     def send_origin(self, now_s: float) -> None:
         """Send the world's origin while the vehicle stands and no target is known yet."""
@@ -154,6 +154,7 @@ class TargetFeed:
             pose=self._pose,
             rate_hz=self._rate.sent_hz(now_s),
             measured=self._pose,
+            beside_m=self._beside_m,
         )
 
     def _refused(
@@ -161,12 +162,14 @@ class TargetFeed:
     ) -> str:
         """Say why a sight is not believed; an empty string if it is."""
         age_s, sigma_m = now_s - pose.t_s, float(np.max(pose.sigma_m))
+        self._beside_m = 0.0
         if not age_s <= OLDEST_S:
             return f"the picture is {age_s:.2f} s old"
         if not sigma_m <= WORST_SIGMA_M:
             return f"the target's pose is unsure by {sigma_m:.2f} m"
         off_m = float(np.linalg.norm(place.position_m - then.position_m))
         if not off_m <= GATE_M + GATE_MPS * silent_s + GATE_SIGMAS * sigma_m:
+            self._beside_m = off_m
             return f"by the target the vehicle is {off_m:.2f} m beside its estimate"
         return ""
 

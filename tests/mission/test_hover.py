@@ -135,6 +135,20 @@ def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
     assert again.belief.hover_thrust == once.belief.hover_thrust
 
 
+@pytest.mark.parametrize("step", [0.6, 1.3])
+def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
+    """The rotors follow an order with their lag, and the accelerometer with them: until they have,
+    the thrust that is read divided by the specific force is not what hovering takes."""
+    state = remembering(state_in(Phase.LANDING), hover=HoverThrust(50_000.0, 0.12))
+    force_g = 1.0
+    for i in range(100):
+        t_s, read = 10.0 + 0.01 * i, 50_000.0 if i < 50 else step * 50_000.0
+        force_g += (1.0 - math.exp(-0.01 / 0.06)) * (read / 50_000.0 - force_g)
+        sample = replace(telemetry(t_s, 1.0), thrust=read, acc_z_g=force_g)
+        state = observing(replace(state, raw_order=int(read)), observation(t_s, telemetry=sample))
+        assert state.belief.hover_thrust == pytest.approx(50_000.0, rel=0.005)
+
+
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
     later = HoverThrust(50_000.0, sigma).aged(dt_s)

@@ -282,6 +282,17 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
 
 
+@pytest.mark.parametrize(("struck_mps", "floor"), [(-0.3, True), (0.3, False)])
+def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(struck_mps: float, floor: bool) -> None:
+    """A vehicle that climbs, just after the lift-off, has not met the floor."""
+    imu = ImuMotion(t_s=NOW_S - 0.01, blow_s=NOW_S - 0.05)
+    struck = DeadReckoning(imu=imu, struck_mps=struck_mps)
+    c = context("imu", z_m=0.15, reckoning=struck)
+    c = Context(replace(c.state, belief=c.belief.seen(replace(c.obs, imu=imu), c.profile)))
+    state, _ = descent.act(c)
+    assert (state.descent.floor_felt_s is not None) is floor
+
+
 @pytest.mark.parametrize(("vz_mps", "stops"), [(-0.35, False), (-0.05, True), (0.2, False)])
 def test_below_5_cm_it_stops_only_at_rest(vz_mps: float, stops: bool) -> None:
     """The height may be wrong by as much: what sinks still is not on the floor, nor what climbs,

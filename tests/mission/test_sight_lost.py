@@ -93,6 +93,20 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
     assert "down level" in flight.state.reason
 
 
+@pytest.mark.parametrize(
+    ("beside_m", "age_s", "lands"),
+    [(0.4, 0.4, True), (0.2, 0.4, False), (0.4, 0.2, False), (0.0, 0.4, False)],
+)
+def test_what_sightings_contradict_is_not_flown_by(
+    beside_m: float, age_s: float, lands: bool
+) -> None:
+    """It comes down level as soon as they have done so for longer than one of them may be wrong."""
+    seen = at(1.0, obs={"position_beside_m": beside_m, "position_age_s": age_s})
+    state = fly(state_in(Phase.ALIGN), seen, profile=PROFILE).state
+    assert (state.phase is Phase.LANDING) is lands
+    assert ("beside its estimate" in state.reason) is lands
+
+
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""

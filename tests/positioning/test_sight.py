@@ -171,6 +171,7 @@ def test_what_estimate_and_blindness_cannot_explain_is_not_sent(
     elif off_m > never:
         assert len(sent.places) == 1
         assert "beside its estimate" in (it.status(t_s + 1.0).problem or "")
+        assert it.status(t_s).beside_m == pytest.approx(off_m)
 
 
 @pytest.mark.parametrize(("late_s", "sigma_m", "words"), [

@@ -19,7 +19,7 @@ from perchctl.mission.belief.maneuver import Maneuver, Sent
 from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.belief.target import TargetBelief
+from perchctl.mission.belief.target import TargetBelief, TargetMotion
 from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.observation import Mismatch, Observation
 from perchctl.profile import Profile
@@ -89,6 +89,7 @@ class Belief:
     reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     last_target_m: Array | None = None  #: in the world, at the last frame that measured it
     target_spread_m: float = 0.0  #: by which successive frames' targets differ
+    target_motion: TargetMotion = field(default_factory=TargetMotion)  #: by pictures alone
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
     contact_z_m: float | None = None  #: height of the body where the magnet may hold it
     contact: ContactOffset | None = None  #: as it made contact
@@ -97,6 +98,7 @@ class Belief:
 
     # --- thrust and battery ---
     hover: HoverThrust = field(default_factory=HoverThrust)
+    lagged_thrust: float | None = None  #: that the rotors give, 0..65535; None before a sample
     unanswered_s: float | None = None  #: the thrust that is read is not what is ordered, since
     unread_s: float = -math.inf  #: when that last had lasted too long
     energy: EnergyState = field(default_factory=EnergyState)  #: fitted to the battery
@@ -134,7 +136,7 @@ class Belief:
 
     @cached_property
     def imu_proves(self) -> bool:
-        """True if these are new enough to prove anything."""
+        """True if attitude, acceleration and thrust are new enough to prove anything."""
         return self.attitude_age_s <= self.profile.safety.proof_age_s
 
     @cached_property
@@ -164,8 +166,8 @@ class Belief:
 
     @cached_property
     def position_variance_m2(self) -> float:
-        """The same of the position; with decks of the height alone, since a Flow deck measures no
-        other."""
+        """Variance of the estimated position; with decks of the height alone, since a Flow deck
+        measures nothing else. Infinite if unknown, 0 if `link.unreported` names it."""
         tel = self.obs.telemetry
         by_deck = self.profile.positioning.source.is_deck
         return self._reported(tel.height_variance_m2 if by_deck else tel.position_variance_m2)
@@ -349,6 +351,14 @@ class Belief:
     def sighting_age_s(self) -> float:
         """Seconds since the exposure of the last picture with the target."""
         return max(0.0, self.obs.t_s - self.reckoning.sight_s)
+
+    @cached_property
+    def camera_is_proven(self) -> bool:
+        """True if pictures have moved as the vehicle did: as its accelerometer felt by the target
+        alone, else as its estimate did."""
+        if self.by_target:
+            return self.obs.felt is not None and self.obs.mismatch is None
+        return not (self.mounting.is_unconfirmed or self.mounting.is_wrong)
 
     @property
     def is_in_magnet_reach(self) -> bool:

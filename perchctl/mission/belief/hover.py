@@ -10,6 +10,8 @@ error of the accelerometer.
 
 from __future__ import annotations
 
+import math
+
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.thrust import FELT_SIGMA, LEAST_POSITION_THRUST, HoverThrust
 from perchctl.values import replace
@@ -30,6 +32,9 @@ QUIET_WITHIN = 0.2
 """Largest share by which quiet thrust may differ from the estimate; beyond it, the ceiling or a
 hand holds the vehicle. Larger: a held vehicle teaches a wrong value. Smaller: a real change is
 rejected."""
+ROTOR_LAG_S = 0.06
+"""Time constant with which the rotors follow an order (docs/firmware.md, real flights 50 to 80 ms).
+Larger or smaller: a step of the thrust teaches a wrong hover thrust."""
 LATEST_S = 1.0
 """Older telemetry shows nothing of the present thrust."""
 LEAST_FELT_G = 0.7
@@ -54,6 +59,15 @@ def best_estimate(b: Belief) -> HoverThrust:
     return HoverThrust(b.imu.hover_thrust or sample, UNSURE_SIGMA)
 
 
+def lagged_thrust(b: Belief, dt_s: float) -> float:
+    """The thrust, 0..65535, that the rotors give `dt_s` after the sample before: a first-order lag
+    behind what is read."""
+    before, read = b.lagged_thrust, b.telemetry.thrust
+    if before is None:
+        return read
+    return before + (1.0 - math.exp(-dt_s / ROTOR_LAG_S)) * (read - before)
+
+
 def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
     """The estimate after a tick in which the thrust is hover thrust; `dt_s` since the sample
     before, 0 if this one is not new."""
@@ -70,14 +84,13 @@ def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     unchanged where the floor or a magnet may carry a part of the weight, or the telemetry shows
     nothing of it."""
     tel, old = b.telemetry, best_estimate(b)
+    thrust = tel.thrust if b.lagged_thrust is None else b.lagged_thrust
     first, sigma = old.first or (old.thrust, max(DESCENT_SIGMA, old.sigma))
     old = replace(old, first=(first, sigma))
-    shows = (
-        LEAST_FELT_G <= tel.acc_z_g <= MOST_FELT_G and tel.thrust >= LEAST_PROPORTIONAL_PART * first
-    )
+    shows = LEAST_FELT_G <= tel.acc_z_g <= MOST_FELT_G and thrust >= LEAST_PROPORTIONAL_PART * first
     felt_floor = b.sent.floor_felt_s is not None
     if b.attitude_age_s > LATEST_S or not shows or b.is_in_magnet_reach or felt_floor:
         return old
-    new = old.after(dt_s, DESCENT_DRIFT).with_measured(tel.thrust / tel.acc_z_g, dt_s)
+    new = old.after(dt_s, DESCENT_DRIFT).with_measured(thrust / tel.acc_z_g, dt_s)
     most = MOST_SIGMAS * sigma
     return replace(new, thrust=min((1.0 + most) * first, max((1.0 - most) * first, new.thrust)))

@@ -78,6 +78,8 @@ def position_loss_text(b: Belief) -> str:
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:
         why = why or UNCORRECTED
+    if b.obs.position_beside_m > 0.0:
+        why = f"by the target the vehicle is {b.obs.position_beside_m:.2f} m beside its estimate"
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
     return f"{text}: {why}" if why else text
 

@@ -6,12 +6,26 @@ import math
 from dataclasses import dataclass
 
 from perchctl.geometry import Array
+from perchctl.mission.belief.motion import ZERO, Vector
 from perchctl.profile import Profile
+from perchctl.values import replace
 from perchctl.vision import TargetEstimate
 
 FAR_BELOW_M = 0.5
 """A target this far above the gear does not hold the vehicle. Larger: what has fallen off seems to
 hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to hold."""
+SEEN_MEMORY_S = 0.1
+"""Time constant of the low pass of the velocity by pictures. Larger: a descent by it swings.
+Smaller: the noise of single detections moves the vehicle."""
+SEEN_GAP_S = 1.0
+"""Longest time between two detections whose difference is a velocity. Larger: a motion that is over
+counts. Smaller: a few lost pictures leave it unknown."""
+SEEN_S = 0.3
+"""Time for which the target has to be detected until its motion counts. Smaller: the low pass has
+not settled yet."""
+MOST_SEEN_MPS = 1.5
+"""Largest velocity between two detections; more is a step of the pose. Larger: such a step counts
+as motion. Smaller: a fast motion goes unseen."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,3 +85,48 @@ class TargetBelief:
             is_fresh=target.tracked and age_s <= limit_s,
             is_small_fresh=t_s - target.small_measured_s <= limit_s,
         )
+
+
+@dataclass(frozen=True)
+class TargetMotion:
+    """The vehicle's velocity by pictures of a target that stands still, for want of telemetry.
+
+    The vehicle moves by -de/dt, where e is the target's position from the gear in the level frame;
+    a first-order low pass smooths it. Only roll and pitch, which level e, come from telemetry: old
+    ones add e_z dphi/dt sideways while the vehicle tilts, and little vertically. The velocity is
+    wrong if the target moves, and sideways if the camera is mounted otherwise than assumed.
+
+    Attributes:
+        t_s: exposure of the newest detection.
+        since_s: exposure of the first in a row without a gap.
+        e_m: the newest position of the target, (ahead, left, up).
+        velocity_mps: of the vehicle, (ahead, left, up).
+    """
+
+    t_s: float = -math.inf
+    since_s: float = -math.inf
+    e_m: Vector = ZERO
+    velocity_mps: Vector = ZERO
+
+    @property
+    def is_known(self) -> bool:
+        """True if the target was detected for long enough to tell the velocity."""
+        return self.t_s - self.since_s >= SEEN_S
+
+    def with_detection(self, target: TargetEstimate) -> TargetMotion:
+        """The motion after a frame that measured the target."""
+        x_m, y_m, z_m = (float(v) for v in target.e_m)
+        e_m, t_s = (x_m, y_m, z_m), target.measured_s
+        dt_s = t_s - self.t_s
+        if dt_s <= 0.0:
+            return self
+        if dt_s > SEEN_GAP_S:
+            return TargetMotion(t_s, t_s, e_m)
+        moved_mps = [(before - now) / dt_s for before, now in zip(self.e_m, e_m, strict=True)]
+        if math.hypot(*moved_mps) > MOST_SEEN_MPS:
+            return replace(self, t_s=t_s, e_m=e_m)
+        share = 1.0 - math.exp(-dt_s / SEEN_MEMORY_S)
+        ahead, left, up = (
+            old + share * (new - old) for old, new in zip(self.velocity_mps, moved_mps, strict=True)
+        )
+        return TargetMotion(t_s, self.since_s, e_m, (ahead, left, up))

@@ -126,9 +126,13 @@ def after_command(b: Belief, command: Command) -> Belief:
 
 
 def _see_target(b: Belief) -> Belief:
-    """The belief with the target's place at a frame that measured it, and its spread."""
+    """The belief with the target's place at a frame that measured it, its spread, and the motion
+    that pictures show."""
     target = b.obs.target
-    if not b.obs.new_frame or target is None or not target.measured or target.world_m is None:
+    if not b.obs.new_frame or target is None or not target.measured:
+        return b
+    b = replace(b, target_motion=b.target_motion.with_detection(target))
+    if target.world_m is None:
         return b
     spread_m = 0.0
     if b.last_target_m is not None:
@@ -350,7 +354,7 @@ def _learn(b: Belief) -> Belief:
     sample_s = max(0.0, min(MOST_LEARNED_S, obs.telemetry.t_s - last_s))  # 0: nothing new
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.nears_target or b.target.error_z_m > near_m
-    b = replace(b, hover=b.hover.aged(dt_s))
+    b = replace(b, hover=b.hover.aged(dt_s), lagged_thrust=hover.lagged_thrust(b, sample_s))
     found = b.hover
     if away and maneuver.learns_hover and is_hover_thrust(b):
         found = hover.learn_in_quiet_flight(b, sample_s)

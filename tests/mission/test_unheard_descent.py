@@ -1,0 +1,196 @@
+"""A descent by the target's pictures, while the vehicle is not heard: what they show of its motion,
+and how it comes down by that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.mission import Observation, Phase, PlannerState, VisualInertialMotion
+from perchctl.mission.belief.target import TargetMotion
+from perchctl.mission.planner import step_mission
+from perchctl.values import replace
+from perchctl.vehicle import Command, RawThrust
+from tests.helpers.mission import (
+    BY_TARGET,
+    CEILING_M,
+    HOVER_THRUST,
+    Felt,
+    observation,
+    remembering,
+    state_in,
+    target_at,
+    telemetry,
+)
+from tests.mission.rig import BEGIN_S, TICK_S
+
+# --- What pictures show of the motion -------------------------------------------------------------
+
+speeds_mps = st.tuples(*[st.floats(-0.7, 0.7)] * 3)
+places_m = st.tuples(*[st.floats(-0.5, 0.5)] * 2, st.floats(0.2, 2.5))
+
+
+def watched(
+    place_m: tuple[float, float, float],
+    velocity_mps: tuple[float, float, float],
+    rate_hz: float,
+    lasts_s: float = 1.0,
+) -> TargetMotion:
+    """The motion of a vehicle that leaves `place_m` below a target at this velocity."""
+    motion = TargetMotion()
+    for i in range(int(lasts_s * rate_hz) + 1):
+        t_s = BEGIN_S + i / rate_hz
+        e_m = np.array(place_m) - np.array(velocity_mps) * (t_s - BEGIN_S)
+        motion = motion.with_detection(replace(target_at(t_s), e_m=e_m))
+    return motion
+
+
+@given(place_m=places_m, velocity_mps=speeds_mps, rate_hz=st.sampled_from([10.0, 30.0, 60.0]))
+def test_the_velocity_is_that_of_the_target_turned_round(
+    place_m: tuple[float, float, float], velocity_mps: tuple[float, float, float], rate_hz: float
+) -> None:
+    """Wherever the target is and however often it is seen; e^-10 is left of the low pass."""
+    motion = watched(place_m, velocity_mps, rate_hz)
+    assert motion.is_known
+    assert motion.velocity_mps == pytest.approx(velocity_mps, abs=1e-3)
+
+
+@given(velocity_mps=speeds_mps, step_m=st.floats(0.1, 1.0))
+def test_a_step_of_the_pose_is_no_motion(
+    velocity_mps: tuple[float, float, float], step_m: float
+) -> None:
+    """As when the small marker takes over from the large one."""
+    before = watched((0.0, 0.0, 1.0), velocity_mps, 30.0)
+    t_s = before.t_s + 1 / 30
+    stepped = np.add(before.e_m, (0.0, 0.0, step_m))
+    after = before.with_detection(replace(target_at(t_s), e_m=stepped))
+    assert after.velocity_mps == before.velocity_mps
+    assert after.e_m == pytest.approx(tuple(stepped))
+
+
+def test_after_a_gap_the_motion_has_to_be_seen_again() -> None:
+    seen = watched((0.0, 0.0, 1.0), (0.0, 0.0, -0.5), 30.0)
+    again = seen.with_detection(target_at(seen.t_s + 1.1))
+    assert not again.is_known
+    assert again.velocity_mps == (0.0, 0.0, 0.0)
+
+
+# --- How it comes down by that --------------------------------------------------------------------
+
+PICTURES_LATE_S = 0.12
+DRAG_PER_S = 0.3
+
+
+@dataclass
+class Falling:
+    """A vehicle of one dimension and a half: a height, and a way ahead in a steady wind. Its
+    motors give `strength` of what is believed of them."""
+
+    z_m: float
+    climb_mps: float
+    strength: float
+    wind_mps: float = 0.0
+    x_m: float = 0.0
+    x_mps: float = 0.0
+    thrust: float = HOVER_THRUST
+    lean_rad: float = 0.0
+    touched_mps: float | None = None
+
+    def step(self, command: Command) -> None:
+        """A tick later, by a raw thrust; the floor is at 0."""
+        if isinstance(command, RawThrust):
+            share = 1.0 - math.exp(-TICK_S / 0.06)
+            self.thrust += share * (command.thrust - self.thrust)
+            self.lean_rad += share * (command.pitch_rad - self.lean_rad)
+        lift = self.strength * self.thrust / HOVER_THRUST
+        self.climb_mps += TICK_S * GRAVITY_MPS2 * (lift * math.cos(self.lean_rad) - 1.0)
+        pushed = DRAG_PER_S * (self.wind_mps - self.x_mps)
+        self.x_mps += TICK_S * (GRAVITY_MPS2 * lift * math.sin(self.lean_rad) + pushed)
+        self.x_m += TICK_S * self.x_mps
+        self.z_m += TICK_S * self.climb_mps
+        if self.z_m <= 0.0:
+            if self.touched_mps is None:
+                self.touched_mps = self.climb_mps
+            self.z_m, self.climb_mps, self.x_mps = 0.0, max(0.0, self.climb_mps), 0.0
+
+
+def come_down(
+    vehicle: Falling, lasts_s: float, *, seen: Callable[[float], bool] = lambda _: True
+) -> list[Command]:
+    """Let a landing that has not heard the vehicle for a second fly it, by pictures that are late
+    and show the target while it is `seen`; its last telemetry had it hovering where it was."""
+    heard = telemetry(BEGIN_S - 1.1, vehicle.z_m)
+    state: PlannerState = remembering(
+        state_in(Phase.LANDING, z_m=vehicle.z_m), hover_thrust=HOVER_THRUST
+    )
+    felt = VisualInertialMotion(heard.t_s, (0.0, 0.0), (0.0, 0.0), None)
+    look: Callable[[Observation], Observation] = Felt()
+    past: list[tuple[float, float]] = [(vehicle.x_m, vehicle.z_m)] * round(PICTURES_LATE_S / TICK_S)
+    commands: list[Command] = []
+    for i in range(round(lasts_s / TICK_S)):
+        t_s = BEGIN_S + TICK_S * i
+        past.append((vehicle.x_m, vehicle.z_m))
+        x_m, z_m = past[-1 - round(PICTURES_LATE_S / TICK_S)]
+        now = seen(TICK_S * i)
+        target = target_at(
+            t_s, body_m=(x_m, 0.0, z_m), measured_s=t_s - PICTURES_LATE_S, measured=now
+        )
+        obs = observation(t_s, telemetry=heard, target=target, position_age_s=1.1 + TICK_S * i)
+        obs = replace(obs, new_frame=now, felt=felt)
+        state, command = step_mission(state, look(obs), BY_TARGET)
+        commands.append(command)
+        vehicle.step(command)
+    return commands
+
+
+@pytest.mark.parametrize("climb_mps", [-0.4, 0.0, 0.3])
+@pytest.mark.parametrize("strength", [0.95, 1.0, 1.05])
+def test_it_comes_down_softly_whatever_its_motors_give(strength: float, climb_mps: float) -> None:
+    """By the last telemetry it stands still in the air, and its hover thrust is wrong by 5 %."""
+    vehicle = Falling(CEILING_M - 0.8, climb_mps, strength)
+    come_down(vehicle, 12.0)
+    assert vehicle.touched_mps is not None
+    assert -0.75 < vehicle.touched_mps < 0.0
+
+
+@pytest.mark.parametrize("gap_s", [(8.0, 8.4), (4.5, 5.5), (5.0, 6.5), (1.0, 1.4), (1.0, 14.0)])
+def test_pictures_that_are_lost_never_let_it_climb(gap_s: tuple[float, float]) -> None:
+    """In the air and on the floor, for a few pictures or for good (seeds 20511149, 20511165)."""
+    vehicle = Falling(1.4, 0.0, 1.0)
+    begin_s, end_s = gap_s
+    orders = come_down(vehicle, 14.0, seen=lambda t_s: not begin_s <= t_s < end_s)
+    assert vehicle.z_m == 0.0
+    after = [each.thrust for each in orders[round(5.0 / TICK_S) :] if isinstance(each, RawThrust)]
+    assert max(after) <= HOVER_THRUST
+
+
+@pytest.mark.parametrize("strength", [0.95, 1.0, 1.05])
+def test_on_the_floor_its_thrust_goes_down_to_the_least(strength: float) -> None:
+    vehicle = Falling(0.8, 0.0, strength)
+    come_down(vehicle, 14.0)
+    assert vehicle.z_m == 0.0
+    assert vehicle.thrust < 0.5 * HOVER_THRUST
+
+
+def test_without_pictures_the_same_vehicle_drops() -> None:
+    """What the pictures are for: by orders alone an error of 5 % is a fall, or no way down."""
+    vehicle = Falling(1.8, 0.0, 0.95)
+    come_down(vehicle, 12.0, seen=lambda _: False)
+    assert vehicle.touched_mps is not None
+    assert vehicle.touched_mps < -0.9
+
+
+@pytest.mark.parametrize("wind_mps", [-1.0, 1.0])
+def test_it_brakes_what_carries_it_aside(wind_mps: float) -> None:
+    """Less than half of the way that a steady wind would carry it in the same time."""
+    vehicle, carried = (Falling(1.8, 0.0, 1.0, wind_mps) for _ in range(2))
+    come_down(vehicle, 4.0)
+    come_down(carried, 4.0, seen=lambda _: False)
+    assert abs(vehicle.x_m) < 0.5 * abs(carried.x_m)
