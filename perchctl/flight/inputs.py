@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
+import numpy as np
+
 from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
 from perchctl.mission import (
     ExternalPositions,
@@ -249,7 +251,7 @@ class FlightInputs:
         live = self.source.live
         kind = self.perception.health.assess(frame, live)
         if self.is_logged and self.taken.frame is not None:
-            seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
+            seen = replace(self.taken.frame, checksum=zlib.crc32(np.ascontiguousarray(frame.image).data))
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen.
         self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None
@@ -324,12 +326,25 @@ def is_supported(history: History, now_s: float) -> bool:
     newest = history.newest
     if newest is None or now_s - newest.t_s + newest.behind_s > SUPPORTED_FOR_S:
         return False
-    lately = [s for s in history.samples if newest.t_s - s.t_s <= SUPPORTED_FOR_S]
+    lately = _newest_samples(history, SUPPORTED_FOR_S)
     mean_g = sum(s.acc_z_g for s in lately) / len(lately)
     return abs(mean_g - 1.0) <= SUPPORTED_MEAN_G and all(
         abs(s.acc_z_g - 1.0) <= SUPPORTED_SAMPLE_G and s.velocity_mps[2] > SUPPORTED_SINK_MPS
         for s in lately
     )
+
+
+def _newest_samples(history: History, within_s: float) -> list[Telemetry]:
+    """The samples at most `within_s` older than the newest one, oldest first; looked for from the
+    newest on, as the history is much longer."""
+    newest_s = history.samples[-1].t_s
+    found: list[Telemetry] = []
+    for sample in reversed(history.samples):
+        if newest_s - sample.t_s > within_s:
+            break
+        found.append(sample)
+    found.reverse()  # sums of floats depend on the order
+    return found
 
 
 # --- Each turn of the loop as a value, for the log ---

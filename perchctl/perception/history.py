@@ -77,7 +77,7 @@ def add_samples(
         samples.append(sample)
     if samples:
         within = bisect.bisect_left(samples, samples[-1].t_s - KEEP_S, key=_time_s)
-        samples = samples[max(0, within - 1) :]
+        del samples[: max(0, within - 1)]
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
 
 
