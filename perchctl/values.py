@@ -1,16 +1,29 @@
-"""Changed copies of frozen dataclasses, at the cost of a dictionary's copy."""
+"""Changed copies of frozen dataclasses, and properties that are worked out once, both cheaply."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["replace"]
+__all__ = ["cached_property", "replace"]
 
 if TYPE_CHECKING:
     from dataclasses import replace as replace
+    from functools import cached_property as cached_property
 else:
+    import functools
     from dataclasses import fields
     from dataclasses import replace as _by_init
+
+    class cached_property(functools.cached_property):
+        """A `functools.cached_property` without the lock that Python 3.11 takes for each value,
+        which costs more than most of the values. Two threads may both work one out, and find the
+        same."""
+
+        def __get__(self, instance: Any, owner: type | None = None) -> Any:
+            if instance is None:
+                return self
+            value = instance.__dict__[self.attrname] = self.func(instance)
+            return value
 
     _NAMES: dict[type, tuple[str, ...]] = {}
     """Of the fields; none where the class has to be built by its own `__init__`."""

@@ -251,7 +251,9 @@ class FlightInputs:
         live = self.source.live
         kind = self.perception.health.assess(frame, live)
         if self.is_logged and self.taken.frame is not None:
-            seen = replace(self.taken.frame, checksum=zlib.crc32(np.ascontiguousarray(frame.image).data))
+            seen = replace(
+                self.taken.frame, checksum=zlib.crc32(np.ascontiguousarray(frame.image).data)
+            )
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen.
         self._note = VERDICT_TEXTS[kind] if kind in ("dark", "uniform") else None

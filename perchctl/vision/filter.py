@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from filterpy.kalman import predict
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.profile import KalmanConfig
-from perchctl.values import replace
+from perchctl.values import cached_property, replace
 from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -19,7 +18,7 @@ import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, is_finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
-from perchctl.values import replace
+from perchctl.values import cached_property, replace
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
-from perchctl.values import replace
+from perchctl.values import cached_property, replace
 from perchctl.vision.filter import (
     MAX_TRACK_GAP_S,
     MEASURED,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import cached_property
 from typing import Any, Literal
 
 import cv2
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
+from perchctl.values import cached_property
 
 MarkerName = Literal["large", "small"]
 PictureKind = Literal["whole", "woven", "top", "bottom"]

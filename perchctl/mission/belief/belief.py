@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 from perchctl.geometry import Array
@@ -23,7 +22,7 @@ from perchctl.mission.belief.target import TargetBelief, TargetMotion
 from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.observation import Mismatch, Observation
 from perchctl.profile import Profile
-from perchctl.values import replace
+from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
 POSITION_RETURNS_S = 0.5

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -30,6 +30,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.values import cached_property
 from perchctl.vision.lens import distort, undistort_px
 from perchctl.vision.markers.corners import (
     UNIT,
