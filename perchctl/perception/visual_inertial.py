@@ -8,8 +8,10 @@ the sum wanders; with the right delay or turn it comes to rest.
 
 from __future__ import annotations
 
+import bisect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import attrgetter
 
 import numpy as np
 
@@ -66,6 +68,34 @@ class MeasuredLatency:
         return self.least_s - BEYOND_S <= delay_s <= self.most_s + BEYOND_S
 
 
+@dataclass(frozen=True, eq=False)
+class FeltSamples:
+    """What the hypotheses need of telemetry samples, kept from one sight to the next, since to work
+    it out for all of two seconds takes as long as the fit itself.
+
+    Attributes:
+        rows: (n, 7) of each sample: time, roll, pitch, yaw, and the acceleration in world axes.
+    """
+
+    samples: tuple[Telemetry, ...] = ()
+    offset_g: Vector = (0.0, 0.0, 0.0)
+    rows: Array = field(default_factory=lambda: np.empty((0, 7)))
+
+    def of(self, samples: tuple[Telemetry, ...], offset_g: Vector) -> FeltSamples:
+        """The same for these samples, oldest first, of which the first ones may be known already,
+        and for what the accelerometer reads too much."""
+        begin = bisect.bisect_left(self.samples, samples[0].t_s, key=attrgetter("t_s"))
+        known = len(self.samples) - begin
+        if self.offset_g != offset_g or self.samples[begin:] != samples[:known]:
+            known = 0
+        new = [
+            (s.t_s, s.roll_rad, s.pitch_rad, s.yaw_rad, *ImuMotion.acceleration_mps2(s, offset_g))
+            for s in samples[known:]
+        ]
+        rows = np.concatenate([self.rows[len(self.rows) - known :], np.reshape(new, (-1, 7))])
+        return FeltSamples(samples, offset_g, rows)
+
+
 @dataclass(frozen=True)
 class VisualInertialWindow:
     """The sights of the last `MISMATCH_WINDOW_S`, and the mismatch and motion that they show.
@@ -84,6 +114,7 @@ class VisualInertialWindow:
     in_use_s: float = 0.0  # the delay from which `mismatch` counts
     motion: VisualInertialMotion | None = None  # the newest in which the sum wandered by at most
     motion_within_m: float = WANDERS_M  # ... this
+    felt: FeltSamples = field(default_factory=FeltSamples, compare=False, repr=False)
 
     @property
     def mismatch(self) -> Mismatch | None:
@@ -129,8 +160,9 @@ def estimate_motion(
     if short or len(samples) < MISMATCH_LEAST_SIGHTS or t_s - old.judged_s < MISMATCH_PERIOD_S:
         return new
     hypotheses_s = delay_hypotheses(0.0 if measured is None else measured.in_use_s)
+    new = replace(new, felt=old.felt.of(samples, offset_g))
     wanders_m, upwards_m, velocity_mps, bias_mps2 = fit_hypotheses(
-        new.sights, samples, offset_g, hypotheses_s
+        new.sights, new.felt, hypotheses_s
     )
     if old.mismatch is None or measured is not None:  # else it stays
         found, before = _found(wanders_m, hypotheses_s, measured), old.latest
@@ -211,8 +243,7 @@ def _refined_s(wanders_m: Array, later_s: Array, best: int) -> float:
 
 def fit_hypotheses(
     sights: tuple[tuple[float, Vector], ...],
-    samples: tuple[Telemetry, ...],
-    offset_g: Vector,
+    felt: FeltSamples,
     later_s: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """The motion under each of n hypotheses: the delay `later_s[i]` and camera turn `TURNS_RAD[i]`.
@@ -221,10 +252,8 @@ def fit_hypotheses(
     motion, rms in m, sideways (n,) and upwards (n,); the vehicle's velocity at the newest sample,
     m/s, (3, n); and the offset of its acceleration, m/s2, (3, n).
     """
-    stamps_s = np.array([s.t_s for s in samples])
-    attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
+    stamps_s, attitudes, forces = felt.rows[:, 0], felt.rows[:, 1:4].copy(), felt.rows[:, 4:]
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])
-    forces = np.array([ImuMotion.acceleration_mps2(s, offset_g) for s in samples])
     speeds = _integral(stamps_s, forces)
     moved = _integral(stamps_s, speeds)
 
