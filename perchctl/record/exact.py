@@ -24,6 +24,7 @@ import numpy as np
 T = TypeVar("T")
 _GONE = {"timing"}  # fields of a flight in real time by 0.2.0
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+_AS_IT_IS = (bool, int, str)  # in JSON, too
 
 
 def to_exact_json(value: Any) -> Any:
@@ -31,13 +32,16 @@ def to_exact_json(value: Any) -> Any:
 
     Raises TypeError for what has no exact form.
     """
-    if isinstance(value, float):  # numpy's float64, too
-        return float(value) if math.isfinite(value) else repr(float(value))
-    if value is None or type(value) in (bool, int, str):
+    kind = type(value)
+    if kind is float:  # nearly all of a record
+        return value if math.isfinite(value) else repr(value)
+    if value is None or kind in _AS_IT_IS:
         return value
+    if isinstance(value, float):  # numpy's float64, too
+        return to_exact_json(float(value))
     if isinstance(value, (list, tuple)):
         return [to_exact_json(v) for v in value]
-    if dataclasses.is_dataclass(value):
+    if hasattr(kind, "__dataclass_fields__"):
         return _exact_fields(value)
     if isinstance(value, Enum):
         return to_exact_json(value.value)
@@ -60,11 +64,13 @@ def _exact_fields(value: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, default, members in _fields_of(kind):
         part = getattr(value, name)
-        if part is None and default is None:
-            continue
-        exact = to_exact_json(part)
-        is_named = part is not None and len(members) > 1
-        found[name] = [type(part).__name__, exact] if is_named else exact
+        if part is None:
+            if default is not None:
+                found[name] = None
+        elif len(members) > 1:
+            found[name] = [type(part).__name__, to_exact_json(part)]
+        else:
+            found[name] = to_exact_json(part)
     return found
 
 
@@ -224,6 +230,8 @@ def to_rounded_json(value: Any) -> Any:
 
     Raises TypeError for a value that has no place in a log.
     """
+    if value is None or type(value) is str:
+        return value
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):  # nearly all of a record
@@ -243,10 +251,18 @@ def encode_line(record: Mapping[str, Any]) -> bytes:
     return json_line({k: v for k, v in to_rounded_json(record).items() if v is not None})
 
 
+_ENCODER = json.JSONEncoder(
+    ensure_ascii=False,
+    allow_nan=False,
+    check_circular=False,  # what holds itself has no exact form in the first place
+    separators=(",", ":"),
+)
+"""Made once: `json.dumps` makes one for each line."""
+
+
 def json_line(values: Mapping[str, Any]) -> bytes:
     """Return values of JSON types as one UTF-8 line with its newline, without rounding."""
-    text = json.dumps(values, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return text.encode("utf-8", errors="backslashreplace") + b"\n"
+    return _ENCODER.encode(values).encode("utf-8", errors="backslashreplace") + b"\n"
 
 
 def decode_line(line: bytes) -> dict[str, Any]:
