@@ -90,6 +90,7 @@ class Sender:
         self._spare = spare
         self._queue: deque[_Waiting] = deque()
         self._ready = threading.Condition()
+        self._stopped = threading.Event()  # apart, so that a command does not wake the guard
         self._waiting_since_s: float | None = None  # for the library to take the next piece
         self._called_s: float | None = None  # when the library was called, until it returns
         self._held_since_s: float | None = None  # the call that was too long at the last look
@@ -170,6 +171,7 @@ class Sender:
         with self._ready:
             self._running = False
             self._ready.notify_all()
+        self._stopped.set()
         for thread in (self._worker, self._keeper):
             thread.join(timeout=1.0)
 
@@ -278,11 +280,7 @@ class Sender:
     # --- the second thread ---
 
     def _keep(self) -> None:
-        while True:
-            with self._ready:
-                self._ready.wait_for(lambda: not self._running, GUARD_PERIOD_S)
-                if not self._running:
-                    return
+        while not self._stopped.wait(GUARD_PERIOD_S):
             failed: str | None = None
             for part in (self._look_after_worker, self._run_guard):
                 try:
