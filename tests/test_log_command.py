@@ -34,6 +34,15 @@ def test_the_newest_is_shown_and_named(words: list[str], logs: Path) -> None:
     assert json.loads(run("log", *words, "--json").stdout)["log"] == NEW
 
 
+def test_what_never_took_off_was_not_killed_in_the_air(tmp_path: Path) -> None:
+    """As where a check before take-off has refused: the log has a header and nothing flown."""
+    log = synthetic.write(tmp_path / "flight_refused.jsonl", most=0)
+    said = run("log", "show", str(log)).stdout
+    assert "UNKNOWN: the log holds no flight" in said
+    assert "it never took off" in " ".join(said.split())
+    assert "positions by deck" in " ".join(said.split())
+
+
 def test_a_table_goes_beside_the_log_or_to_a_file(logs: Path) -> None:
     said = run("log", "export", OLD)
     assert said.stdout.startswith("export:    perchctl-logs/flight_old.csv (60 rows, ")

@@ -79,7 +79,10 @@ def _end_lines(flight: FlightAnalysis) -> Iterator[str]:
         name, _, text = line.partition(":")
         yield from _named(name, text.strip())
     if log.summary is None:
-        yield from _named("log lost", "its end: the program was killed, or the disk failed")
+        cause = "its end: the program was killed, or the disk failed"
+        if not log.phases:
+            cause = "nothing: it never took off, or its program was killed before"
+        yield from _named("log lost", cause)
     if log.ignored_bytes:
         yield from _named("log lost", f"its tail, {log.ignored_bytes} unreadable bytes")
 
@@ -89,11 +92,19 @@ def _origin(log: FlightLog) -> str:
     started = header.get("started_utc")
     parts = [
         log.setup_text,
+        _positions_text(log),
         f"{header.get('uri', '?')} with {header.get('source', '?')}",
         "" if not started else f"begun {utc_text(started)}",
         f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
     ]
     return ", ".join(part for part in parts if part)
+
+
+def _positions_text(log: FlightLog) -> str:
+    """What measured the position; a fault or an option may have flown with another than the
+    profile's."""
+    section = (log.header.get("profile") or {}).get("positioning") or {}
+    return f"positions by {section['by']}" if "by" in section else ""
 
 
 def utc_text(started_utc: Any) -> str:
