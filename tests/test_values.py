@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, cast
 
 import pytest
 
-from perchctl.values import replace
+from perchctl.values import cached_property, replace
 
 
 @dataclass(frozen=True)
@@ -29,6 +28,21 @@ class Checked:
     def __post_init__(self) -> None:
         if self.a < 0:
             raise ValueError("negative")
+
+
+def test_a_property_is_worked_out_once() -> None:
+    worked_out = []
+
+    @dataclass(frozen=True)
+    class Counts:
+        @cached_property
+        def answer(self) -> int:
+            worked_out.append(self)
+            return 42
+
+    one, other = Counts(), Counts()
+    assert [one.answer, one.answer, other.answer] == [42, 42, 42]
+    assert len(worked_out) == 2
 
 
 @pytest.mark.parametrize("value", [Plain(1, (2,)), Checked(4)])

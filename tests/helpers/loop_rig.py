@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from perchctl.flight import FlightParts, fly
-from perchctl.flight.loop import PositionSource
+from perchctl.flight.loop import PositionStatus
 from perchctl.flight.watchdog import rescue
 from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.mission import (
@@ -285,7 +285,7 @@ class Rig:
     profile: Profile = PROFILE
     setup: Pipeline = SETUP
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    positions: PositionSource | None = None
+    positions: PositionStatus | None = None
 
     def parts(self) -> FlightParts:
         return FlightParts(
