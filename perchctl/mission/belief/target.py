@@ -20,7 +20,7 @@ Smaller: the noise of single detections moves the vehicle."""
 SEEN_GAP_S = 1.0
 """Longest time between two detections whose difference is a velocity. Larger: a motion that is over
 counts. Smaller: a few lost pictures leave it unknown."""
-SEEN_S = 0.3
+LEAST_SEEN_S = 0.3
 """Time for which the target has to be detected until its motion counts. Smaller: the low pass has
 not settled yet."""
 MOST_SEEN_MPS = 1.5
@@ -111,7 +111,7 @@ class TargetMotion:
     @property
     def is_known(self) -> bool:
         """True if the target was detected for long enough to tell the velocity."""
-        return self.t_s - self.since_s >= SEEN_S
+        return self.t_s - self.since_s >= LEAST_SEEN_S
 
     def with_detection(self, target: TargetEstimate) -> TargetMotion:
         """The motion after a frame that measured the target."""
