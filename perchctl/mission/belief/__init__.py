@@ -1,1 +1,2 @@
-"""What is believed about the vehicle, computed once per tick; knows no phases and no decisions."""
+"""Compute once per tick what the planner believes about the vehicle, without phases or
+decisions."""

@@ -1,8 +1,9 @@
-"""The battery's charge, fitted to its readings.
+"""Estimate the battery's charge from its voltage readings.
 
-No current is measured on a Crazyflie. Assumed are a cell's resting voltage by its charge (`VOLTS`)
-and the current at full thrust (`Drive`). Fitted are the sag under full thrust and `hunger`: how
-much faster this battery empties than assumed, by least squares, with old readings fading:
+A Crazyflie does not measure its battery current. The model therefore assumes a cell's resting
+voltage as a function of its charge (`VOLTS`) and the current at full thrust (`Drive`). It fits two
+parameters by least squares with exponential forgetting: the voltage sag at full thrust, and
+`hunger`, the factor by which this battery discharges faster than the assumed current predicts:
 
     reading = rest voltage(charge) - sag * load,   d charge = -hunger * load * current / capacity dt
 """
@@ -18,55 +19,64 @@ from perchctl.vehicle import AUTO_ARM, FULL_THRUST, Telemetry, is_battery_readin
 
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 VOLTS = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
-"""Of the charge, and of the resting cell with it: a little below the firmware's own table."""
+"""Resting voltage of a cell, V, at each charge in `SHARES` (0..1); slightly below the table in the
+firmware."""
 USUAL_SAG_V = 0.63
-"""Sag under full thrust of a usual battery. Larger: attempts are refused that it has charge for."""
+"""Voltage sag of a typical battery at full thrust, V. Larger: perchctl refuses attempts that the
+battery could finish."""
 SAG_WITHIN_V = 0.3
-"""Standard deviation of that between batteries. Smaller: a tired battery is noticed late."""
+"""Standard deviation of the sag between batteries, V. Smaller: the fit recognizes a worn battery
+late."""
 LEAST_SAG_V = 0.2
-"""No battery sags less."""
+"""Lower bound of the fitted sag, V; no battery sags less."""
 USUAL_HUNGER = 1.1
-"""Factor by which a usual battery empties faster than assumed."""
+"""Factor by which a typical battery discharges faster than the assumed current predicts."""
 HUNGER_WITHIN = 0.3
-"""Standard deviation of that between batteries."""
+"""Standard deviation of that factor between batteries."""
 LEAST_HUNGER = 1.0
-"""Bounds of the fitted factor."""
+"""Lower bound of the fitted discharge factor."""
 MOST_HUNGER = 3.0
+"""Upper bound of the fitted discharge factor."""
 READING_SIGMA_V = 0.02
-"""Error of a second of readings."""
+"""Standard deviation of one second of averaged voltage readings, V."""
 FADES_S = 40.0
-"""Time in which a reading fades. Larger: a change with temperature is followed late."""
+"""Time constant with which the fit forgets old readings, s. Larger: the fit follows a change of
+temperature late."""
 SMOOTH_S = 1.0
-"""Time in which the resting voltage follows."""
+"""Time constant of the low-pass filter on the resting voltage, s."""
 LAG_S = 0.3
-"""Time by which a reading is behind its thrust."""
+"""Time constant with which the voltage reading follows a change of thrust, s."""
 STEADY_LOAD = 0.06
-"""Share of full thrust: if it has changed by more, it does not belong to the reading."""
+"""Largest difference between the current load and the filtered load, as a share of full thrust. A
+reading with a larger difference belongs to an earlier thrust and is not used."""
 COUNTED_SHARE = 0.05
-"""Charge below which the voltage alone tells what is spent."""
+"""Charge below which the count of the consumed charge is not used: the voltage curve is so steep
+there that the readings alone determine the consumed charge."""
 LEAST_LOAD = 0.2
-"""Load from which on a reading shows the sag."""
+"""Smallest load, as a share of full thrust, at which a reading contributes to the fitted sag."""
 LEAST_LOADED_S = 1.0
-"""Time of such readings that an estimate needs."""
+"""Time of readings under load that an estimate requires, s."""
 BATTERY_FRESH_S = 1.0
-"""An older reading counts as none."""
+"""Age at which a voltage reading is no longer used, s."""
 
 
 @dataclass(frozen=True)
 class EnergyState:
-    """The battery as fitted so far.
+    """State of the battery fit after the newest reading.
 
-    Shares are of the full charge, loads of full thrust. `fit_sums`, of least squares: sag^2, sag *
-    hunger, hunger^2, and the two right sides.
+    Charges are shares of the full charge; loads are shares of full thrust. `fit_sums` holds the
+    normal equations of the least-squares fit: the sums of sag^2, sag * hunger and hunger^2, then
+    the two right-hand sides.
     """
 
-    ground_v: float | None = None  # resting, before take-off; estimated if read under load first
-    used_share: float = 0.0  # by the count of the thrust, for a battery as assumed
-    load: float = 0.0  # as the reading follows it
-    mean_load: float = 0.0  # over the last seconds in the air
+    # resting voltage before take-off, estimated if the first reading was under load
+    ground_v: float | None = None
+    used_share: float = 0.0  # charge consumed by the assumed current alone
+    load: float = 0.0  # load, low-pass filtered with `LAG_S` as the reading is
+    mean_load: float = 0.0  # mean over the last seconds in the air
     rest_v: float | None = None  # estimated resting voltage now
-    loaded_s: float = 0.0  # how long there were readings under load
-    unknown_s: float = 0.0  # since the last reading
+    loaded_s: float = 0.0  # total time of readings under load
+    unknown_s: float = 0.0  # time since the last reading
     fit_sums: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -75,11 +85,12 @@ class EnergyState:
 
 @dataclass(frozen=True)
 class Drive:
-    """Motors with their supply.
+    """Motor type and its power supply.
 
     Attributes:
-        full_a: current of four motors at full thrust, A; proportional to the thrust below.
-        low_power_v: voltage below which the firmware reports low power, unless `pm.lowVoltage`
+        full_a: current of the four motors at full thrust, A; at lower thrust, the current is
+            assumed proportional to the thrust.
+        low_power_v: voltage below which the firmware reports low power, V, unless `pm.lowVoltage`
             is set.
     """
 
@@ -89,12 +100,13 @@ class Drive:
 
 BRUSHED = Drive(full_a=4.4, low_power_v=3.2)
 BRUSHLESS = Drive(full_a=7.3, low_power_v=3.35)
-"""The current is not published. Taken is that of the brushed motors for each newton (0.80 N at full
-thrust, 0.48 N brushed): an upper bound, since the brushless ones are built to be more efficient."""
+"""The current of the brushless motors is not published. The value assumes the same current per
+newton as the brushed motors (0.80 N at full thrust, 0.48 N brushed). It is an upper bound because
+brushless motors are designed to be more efficient."""
 
 
 def drive_of(telemetry: Telemetry) -> Drive:
-    """The vehicle's motors: those that start by an arming request only are brushless."""
+    """Return the vehicle's drive: motors that start only after an arming request are brushless."""
     return BRUSHED if telemetry.has_bit(AUTO_ARM) else BRUSHLESS
 
 
@@ -104,8 +116,8 @@ def drive_of(telemetry: Telemetry) -> Drive:
 def read_battery(
     old: EnergyState, telemetry: Telemetry, age_s: float, dt_s: float, battery_mah: float
 ) -> EnergyState:
-    """The state after the reading of a sample, `dt_s` after the one before; a reading that is
-    `age_s` old counts as none if that is too old."""
+    """Return the state after the battery reading in a sample that follows the previous one by
+    `dt_s`. A reading whose age `age_s` exceeds `BATTERY_FRESH_S` counts as missing."""
     reading_v = telemetry.battery_v if age_s <= BATTERY_FRESH_S else math.nan
     drive = drive_of(telemetry)
     return update_energy(old, dt_s, reading_v, telemetry.thrust, battery_mah, drive)
@@ -119,9 +131,12 @@ def update_energy(
     battery_mah: float,
     drive: Drive,
 ) -> EnergyState:
-    """The state `dt_s` later, under a commanded thrust 0..65535, for a battery of `battery_mah`.
+    """Return the state `dt_s` later, with the commanded thrust (0..65535) and a capacity of
+    `battery_mah`.
 
-    A `battery_v` that no cell can have, or NaN, counts as no reading."""
+    A `battery_v` that is NaN or that no cell can have counts as missing. The estimate then falls
+    with the charge that the thrust consumes.
+    """
     load = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
@@ -131,7 +146,8 @@ def update_energy(
     if load >= LEAST_LOAD:
         known = dt_s / 3.0 if state.mean_load else 1.0
         state = replace(state, mean_load=_towards(state.mean_load, load, known))
-    if not is_battery_reading(battery_v):  # the last estimate, less what the thrust takes
+    # reduce the last estimate by the charge that the thrust consumes
+    if not is_battery_reading(battery_v):
         state = replace(state, unknown_s=state.unknown_s + dt_s)
         if state.rest_v is None:
             return state
@@ -158,8 +174,9 @@ def update_energy(
 
 
 def fit_sag_model(state: EnergyState) -> tuple[float, float]:
-    """The voltage sag under full thrust, V, and the factor (hunger) by which the charge falls
-    faster than counted: a least-squares fit to the readings, regularised and bounded."""
+    """Return the sag at full thrust, V, and the factor (hunger) by which the charge falls faster
+    than counted: a least-squares fit to the readings, regularized by the typical values and
+    bounded."""
     a, b, c, p, q = state.fit_sums
     a += SAG_WITHIN_V**-2
     c += HUNGER_WITHIN**-2
@@ -170,12 +187,12 @@ def fit_sag_model(state: EnergyState) -> tuple[float, float]:
 
 
 def charge_from_rest_v(rest_v: float) -> float:
-    """The share of its charge, 0..1, that a cell of resting voltage `rest_v` has."""
+    """Return the charge (0..1) of a cell with the resting voltage `rest_v`."""
     return min(1.0, max(0.0, _along(VOLTS, SHARES, rest_v)))
 
 
 def rest_v_from_charge(share: float) -> float:
-    """The resting voltage, V, of a cell with `share` (0..1) of its charge."""
+    """Return the resting voltage, V, of a cell with the charge `share` (0..1)."""
     return _along(SHARES, VOLTS, share)
 
 
@@ -187,7 +204,8 @@ def _along(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> float:
 def _summed(
     state: EnergyState, dt_s: float, battery_v: float
 ) -> tuple[float, float, float, float, float]:
-    """`EnergyState.fit_sums` with one more reading, as deviations from the usual values."""
+    """Return `EnergyState.fit_sums` after one more reading, as deviations from the typical
+    values."""
     assert state.ground_v is not None
     begun = charge_from_rest_v(state.ground_v)
     counted = max(min(begun, COUNTED_SHARE), begun - state.used_share)
@@ -205,7 +223,7 @@ def _summed(
 
 
 def full_thrust_share_per_s(battery_mah: float, drive: Drive) -> float:
-    """Share of the charge that a second of full thrust takes."""
+    """Return the share of the full charge that one second of full thrust consumes."""
     return drive.full_a / (3.6 * battery_mah)
 
 

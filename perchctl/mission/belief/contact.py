@@ -1,16 +1,16 @@
-"""What carries, presses or holds the vehicle, and the evidence for it.
+"""Evidence that something supports, presses or holds the vehicle.
 
-Without a force sensor a contact shows in three readings together. A vehicle in the air accelerates
-by thrust less weight; one that is carried or pressed reads 1 g and does not move, whatever its
-thrust is. So thrust far from hover thrust, at 1 g and at rest, is a contact: with more of it the
-vehicle presses, with less something carries it. Where it is, and what it was flown to do, then tell
-a magnet from the floor, and both from something else.
+Without a force sensor, a contact shows in three readings together. A vehicle in the air accelerates
+by thrust minus weight. A supported or pressed vehicle reads 1 g and does not move, whatever its
+thrust. Thrust far from hover thrust, at 1 g and at rest, is therefore a contact: with more thrust
+the vehicle presses, with less something supports it. The vehicle's position and its maneuver then
+distinguish the magnet from the floor, and both from another object.
 
-One threshold decides whether the thrust exceeds hover thrust (`exceeds_hover_thrust`). A vehicle
-at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
-height (`CONTACT`), against an obstacle if its setpoint is above (`BLOCKED`), and against something
-unknown without a position (`CARRIED`, which also covers too little thrust). `HANGING`,
-`MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to carry the vehicle
+One threshold decides whether the thrust exceeds hover thrust (`exceeds_hover_thrust`). A vehicle at
+rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
+height (`CONTACT`), against an obstacle if its setpoint is above it (`BLOCKED`), and against an
+unknown object without a position (`CARRIED`, which also covers too little thrust). `HANGING`,
+`MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to support the vehicle
 (`is_carried_by_other_than_thrust`).
 """
 
@@ -27,79 +27,87 @@ from perchctl.vehicle import FLYING, FULL_THRUST
 # --- thrust ---
 PRESSING_RATIO = 1.08
 """Multiple of hover thrust above which a vehicle at rest is pressing: more than five standard
-deviations of hover thrust learned in quiet flight. Larger: a weak press proves nothing. Smaller: a
-gust or a sagging battery looks like a press."""
+deviations of the hover thrust learned in quiet flight. Larger: a weak press goes undetected.
+Smaller: a gust or a sagging battery looks like a press."""
 PRESS_SATURATED_PART = 0.98
-"""Share of full thrust above which it is not known how much more the vehicle would take."""
+"""Share of full thrust above which the motors are saturated, so that the thrust no longer shows how
+much the vehicle needs."""
 MOST_RAW = 60000.0
-"""The most raw thrust that the firmware gives."""
+"""Largest raw thrust that the firmware applies, 0..65535."""
 PROVABLE = 0.99
-"""Share of a raw press's thrust that always counts as pressing. Larger: a reading just below the
-order proves nothing. Smaller: a heavy vehicle seems to press while it hovers."""
+"""Share of a raw press's ordered thrust that always counts as pressing. Larger: a reading just
+below the ordered thrust goes undetected. Smaller: a heavy vehicle seems to press while it
+hovers."""
 LITTLE_LEFT = 0.93
-"""Share of full thrust: if hovering takes more, more thrust is no sign of a press. Smaller: heavy
-vehicles are never seen to press."""
+"""Hover thrust, as a share of full thrust, above which more thrust is no evidence of a press.
+Smaller: a press is never detected on a heavy vehicle."""
 MOST_HOLDING = 0.8
-"""Share of hover thrust: with more, the air under the ceiling may hold the vehicle."""
+"""Share of hover thrust up to which thrust cannot hold the vehicle in the air; above it, the ground
+effect of the ceiling may."""
 STILL_MOTORS_THRUST = 5000
-"""Raw thrust at which the motors stand still, and less."""
+"""Largest raw thrust, 0..65535, at which the motors stand still."""
 LEAST_HOVER = 1000
-"""Thrust below which nothing flies."""
+"""Raw thrust, 0..65535, below which nothing flies."""
 
 # --- motion and place ---
 MOTIONLESS_MPS = 0.05
-"""Vertical speed below which the vehicle does not move. Larger: a slow sink counts as hanging."""
+"""Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow sink looks like
+hanging."""
 QUIET_MPS = 0.3
-"""Speed up to which thrust is hover thrust."""
+"""Largest speed at which the thrust is hover thrust, m/s."""
 QUIET_CLIMB_MPS = 0.27
-"""Vertical speed up to which thrust is hover thrust."""
+"""Largest vertical speed at which the thrust is hover thrust, m/s."""
 QUIET_G = 0.1
-"""Distance from 1 g up to which thrust is hover thrust."""
+"""Largest deviation of the specific force from 1 g at which the thrust is hover thrust, g."""
 CARRIED_ON_MPS = 0.1
-"""A pressed vehicle's estimated height may run away by this. Larger: a contact is believed far from
-the target. Smaller: a true one is not proven when the target has not been seen for long."""
+"""Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
+target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
 PRESSED_M = 0.08
-"""A setpoint this far above a still vehicle presses it. Larger: a blocked climb is seen late."""
+"""Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
+climb is detected late."""
 TOUCHES_M = 0.001
-"""By so much the touch itself moves the gear."""
+"""Distance by which the touch itself moves the gear, m."""
 SHAKEN_M = 0.002
-"""Spread that the impact on the ceiling adds to a deck's position."""
+"""Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 SLIDES_MPS = 0.01
-"""Spread that a deck's position gains each second without a sighting."""
+"""Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
 DRIFTED_M = 0.02
-"""A slip counts although the estimate has drifted up by this."""
+"""Upward drift of the estimate in spite of which a slip is still detected, m."""
 DESCENDED_M = 0.1
-"""A descent this far below its start has come down."""
+"""Distance below its start at which a descent counts as under way, m."""
 HELD_WITHIN_M = 0.1
-"""A descent that has not come down this far is held where it began."""
+"""Distance from its start within which a vehicle in a descent may still be held there, m."""
 OFF_FLOOR_M = 0.3
-"""Height above which what carries the vehicle is not the floor."""
+"""Height above which the floor cannot be the support, m."""
 OFF_GROUND_M = 0.15
-"""Height above which a blocked vehicle has left the ground."""
+"""Height above which a blocked vehicle has left the ground, m."""
 STANDING_BELOW_M = 0.1
-"""Height below which a vehicle may still stand on the ground, rather than press."""
+"""Height below which a vehicle may still stand on the ground instead of pressing, m."""
 AT_TARGET_M = 0.15
-"""A gear this near to the target's height may hang on its magnet."""
+"""Largest height difference to the target at which the vehicle may hang on its magnet, m."""
 NEAR_TARGET_M = 0.3
-"""A gear this near to the target's height does not stand on the floor."""
+"""Height difference to the target within which the vehicle cannot stand on the floor, m."""
 FALLING_MPS = -0.05
-"""Vertical speed at which a released vehicle that reads light falls."""
+"""Vertical speed below which a released vehicle with a low specific force is falling, m/s."""
 SINKING_SLOWLY_MPS = -0.15
-"""A vehicle at full thrust that sinks faster falls; it is not too weak."""
+"""Vertical speed below which a vehicle at full thrust is falling instead of being too weak to
+climb, m/s."""
 
 # --- time ---
 SUPERVISOR_S = 5.0
-"""Time after which motors that were stopped count as off: the flying bit outlives them by 2 s."""
+"""Time after a stop order from which the motors count as off, s: the flying bit stays set for 2
+s."""
 HANGING_S = 1.0
-"""Time in which a magnet's hold is proven."""
+"""Time that the proof of a magnet's hold takes, s."""
 
 
-# --- Where the gear is under the target ---
+# --- Offset of the gear from the target ---
 
 
 def contact_offset(b: Belief) -> ContactOffset:
-    """The gear's distance from the target's axis, and its sigma, which with decks grows after the
-    last sighting: the estimate drifts, and the impact on the ceiling shakes it."""
+    """Return the gear's offset from the target's axis, with its standard deviation. With decks, the
+    deviation grows after the last sighting because the estimate drifts and the impact on the
+    ceiling disturbs it."""
     reckoning = b.reckoning
     sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if b.profile.positioning.source.is_deck and b.position_valid:
@@ -108,8 +116,8 @@ def contact_offset(b: Belief) -> ContactOffset:
 
 
 def last_touch_offset(b: Belief) -> ContactOffset | None:
-    """The `contact_offset` of the last touch, in a retreat only; None with a fresh sighting, or
-    once motion capture shows that the vehicle has left the place of that touch."""
+    """Return the `contact_offset` of the last touch, during a retreat only. None with a fresh
+    sighting, or once motion capture shows that the vehicle has left the position of that touch."""
     if not b.sent.maneuver.retreats or b.contact is None or b.target.is_fresh:
         return None
     x_m, y_m, _ = b.telemetry.position_m
@@ -121,15 +129,17 @@ def last_touch_offset(b: Belief) -> ContactOffset | None:
 
 
 def newest_contact_offset(b: Belief) -> ContactOffset:
-    """The offset of the last touch where that still counts, else of now."""
+    """Return the offset of the last touch while it is valid, otherwise the current offset."""
     return last_touch_offset(b) or contact_offset(b)
 
 
 def possible_contact_tolerance_m(b: Belief) -> float:
-    """The height difference (m) between gear and target up to which what is felt may be a contact.
+    """Return the height difference (m) between gear and target up to which a support may be a
+    contact.
 
-    It is capped, and so tells an obstacle from the target; the proof of a contact (`CONTACT`) asks
-    for less with a positioning system, and by the target alone allows a height that has run away.
+    The tolerance is capped so that it separates an obstacle from the target. The proof of a contact
+    (`CONTACT`) uses a smaller one with a positioning system; with the target alone, it allows for
+    drift of the estimated height.
     """
     planner = b.profile.planner
     drift_mps = CARRIED_ON_MPS if b.by_target else planner.landing.drift_mps
@@ -142,22 +152,23 @@ def is_at_contact_height(b: Belief) -> bool:
 
 
 def is_at_target(b: Belief) -> bool:
-    """True if the gear is surely in the magnet's reach."""
+    """True if the gear is certainly within the magnet's reach."""
     near = contact_offset(b).is_within(b.profile.planner.perch.contact_xy_m)
     return near and is_at_contact_height(b)
 
 
-# --- What the thrust shows ---
+# --- Evidence from the thrust ---
 
 
 def max_press_thrust(profile: Profile) -> float:
-    """The largest thrust that a press can have, 0..65535."""
+    """Return the largest thrust that a press can reach, 0..65535."""
     perch = profile.planner.perch
     return min(float(perch.thrust), MOST_RAW) if perch.mode == "raw" else FULL_THRUST
 
 
 def is_hover_thrust(b: Belief) -> bool:
-    """True if the thrust is hover thrust: nothing carries, presses or accelerates the vehicle."""
+    """True if the thrust equals hover thrust: nothing supports, presses or accelerates the
+    vehicle."""
     tel, setpoint = b.telemetry, b.sent.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
@@ -177,10 +188,10 @@ def is_hover_thrust(b: Belief) -> bool:
 
 
 def is_carried_by_other_than_thrust(b: Belief) -> bool:
-    """True if the thrust could not carry the vehicle.
+    """True if the thrust is too small to support the vehicle.
 
-    Position mode goes no lower than `LEAST_POSITION_THRUST`, which is more than `hold_ratio` of the
-    hover thrust where the motors are strong: then that is what proves the hold.
+    The firmware's position mode does not go below `LEAST_POSITION_THRUST`. With strong motors this
+    is more than `hold_ratio` times the hover thrust, and then it is the limit.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
     if MOST_HOLDING * b.hover_thrust >= LEAST_POSITION_THRUST:
@@ -189,8 +200,8 @@ def is_carried_by_other_than_thrust(b: Belief) -> bool:
 
 
 def exceeds_hover_thrust(b: Belief) -> bool:
-    """True if the thrust exceeds hover thrust, or is close to its limit: during a press by raw
-    thrust the ordered thrust, otherwise full thrust."""
+    """True if the thrust exceeds hover thrust or is close to its limit. The limit is the ordered
+    thrust during a press by raw thrust, otherwise full thrust."""
     most = PRESS_SATURATED_PART * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
         most = PROVABLE * max_press_thrust(b.profile)
@@ -207,11 +218,11 @@ def is_pressing(b: Belief) -> bool:
     )
 
 
-# --- Conditions that count over time ---
+# --- Conditions that must last for some time ---
 
 
 def is_slipping(b: Belief) -> bool:
-    """True if it falls away from the proven contact, by position or by acceleration."""
+    """True if the vehicle falls away from the proven contact, by position or by acceleration."""
     complete, tel = b.profile.planner.complete, b.telemetry
     if b.contact_z_m is None or not b.is_sinking(complete.slip_mps):
         return False
@@ -220,7 +231,7 @@ def is_slipping(b: Belief) -> bool:
 
 
 def is_still(b: Belief) -> bool:
-    """True if it does not move, and something carries it: the accelerometer reads one g."""
+    """True if the vehicle is motionless and supported: the accelerometer reads 1 g."""
     return b.reads_one_g and (
         abs(b.telemetry.velocity_mps[2]) < MOTIONLESS_MPS or not b.position_valid
     )
@@ -229,8 +240,8 @@ def is_still(b: Belief) -> bool:
 def _is_in_contact(b: Belief) -> bool:
     """True if position, acceleration and thrust together show a contact (fault 40).
 
-    The gear has stopped at the target's height, the accelerometer reads one g, and the thrust is
-    above what hovering takes: the ceiling must carry the difference.
+    The gear has stopped at the target's height, the accelerometer reads 1 g, and the thrust exceeds
+    hover thrust, so the ceiling must take the difference.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MOTIONLESS_MPS and b.position_valid
@@ -255,7 +266,7 @@ def _magnet_holds(b: Belief) -> bool:
 
 
 def _is_weight_hanging(b: Belief) -> bool:
-    """True if the motors stand still, and the vehicle hangs where it made contact."""
+    """True if the motors stand still and the vehicle hangs where it made contact."""
     return (
         b.sent.released_s is not None
         and (b.telemetry.thrust <= STILL_MOTORS_THRUST or not b.thrust_is_known)
@@ -265,8 +276,9 @@ def _is_weight_hanging(b: Belief) -> bool:
 
 
 def _is_hanging(b: Belief) -> bool:
-    """True if something holds it up: it is still, off the floor, on a thrust that could not carry
-    it. Without a position a magnet looks like the floor; the slow release suits both."""
+    """True if something holds the vehicle up: it is motionless, off the floor, at a thrust too
+    small to support it. Without a position, a magnet cannot be distinguished from the floor; the
+    slow release is safe for both."""
     tel, complete = b.telemetry, b.profile.planner.complete
     if not b.position_valid:
         return is_carried_by_other_than_thrust(b) and is_still(b)
@@ -282,15 +294,15 @@ def _is_hanging(b: Belief) -> bool:
 
 
 def _is_down(b: Belief) -> bool:
-    """True if the motors are off, and the supervisor agrees, or has not changed its word long."""
+    """True if the motors are off and the supervisor confirms it, or its flying bit is overdue."""
     stopped_s = b.sent.stopped_s
     long_off = stopped_s is not None and b.obs.t_s - stopped_s > SUPERVISOR_S
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
 
 def _is_on_floor(b: Belief) -> bool:
-    """True if it does not move on a thrust that could not carry it, low or come down: a drifting
-    estimate may place the floor anywhere."""
+    """True if the vehicle is motionless at a thrust too small to support it, and is low or has come
+    down. The height alone is not enough: a drifting estimate may place the floor anywhere."""
     near_target = b.obs.target is not None and abs(b.target.error_z_m) <= NEAR_TARGET_M
     came_down_m = b.sent.began_m[2] - b.telemetry.position_m[2]
     came_down = b.sent.maneuver.descends and came_down_m > DESCENDED_M
@@ -300,8 +312,8 @@ def _is_on_floor(b: Belief) -> bool:
 
 
 def _is_blocked(b: Belief) -> bool:
-    """True if it is pressed against something: the setpoint is above, the thrust at its limit or
-    above what hovering takes, and nothing moves."""
+    """True if the vehicle presses against an obstacle: the setpoint is above it, the thrust exceeds
+    hover thrust or is at its limit, and nothing moves."""
     setpoint, tel = b.sent.setpoint, b.telemetry
     if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
@@ -310,8 +322,8 @@ def _is_blocked(b: Belief) -> bool:
 
 
 def _is_carried_by_feel(b: Belief) -> bool:
-    """True if accelerometer and thrust alone show that something carries or presses it: by much
-    more or much less thrust than hovering takes it would rise or sink in the air."""
+    """True if accelerometer and thrust alone show that something supports or presses the vehicle:
+    in the air, thrust this far above or below hover thrust would make it climb or sink."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
         0 < hover < LITTLE_LEFT * FULL_THRUST
@@ -356,11 +368,12 @@ SUPPORT_CONDITIONS = (
 
 
 def counts(b: Belief, condition: Condition[Belief]) -> bool:
-    """True if what the condition rests on is fresh in this tick.
+    """True if the data that the condition depends on is fresh in this tick.
 
-    By the target alone a press is proven by the place of the last sighting, for a while. In a
-    descent `HANGING` begins a release, which goes on over fresh telemetry only: late telemetry may
-    begin it, and so may a missing position, or the vehicle would hang there until it is cut.
+    With the target alone, the position of the last sighting can prove a press for a while. During a
+    descent, `HANGING` starts a release. Late telemetry or a missing position may start it, too, or
+    the vehicle would hang there until its motors are cut; the release continues only with fresh
+    telemetry.
     """
     if condition is HANGING and b.sent.maneuver.descends:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
@@ -375,7 +388,8 @@ def counts(b: Belief, condition: Condition[Belief]) -> bool:
 
 
 def has_slipped(b: Belief) -> bool:
-    """True if the vehicle has slipped off its contact: debounced, but at once in free fall."""
+    """True if the vehicle has slipped off its contact: after a dwell time, or at once in free
+    fall."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = b.sent.released_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and b.imu_proves and b.climb_mps < FALLING_MPS:
