@@ -1,7 +1,8 @@
-"""Conditions that count once they have held for a while, and what that rests on.
+"""Conditions that become evidence after they have been true for some time.
 
-A condition is true or false in one tick. It is evidence only after it has been true without a
-break, so that one wrong sample proves nothing; `since` holds from when on each has been true.
+A condition is true or false in one tick. It counts as evidence only after it has been true without
+interruption for a dwell time, so that a single wrong sample proves nothing. `Since` maps each true
+condition to the time at which it became true.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ Seen = TypeVar("Seen", contravariant=True)
 
 
 class Rests(Enum):
-    """What a condition rests on. It does not count while that is old or unknown."""
+    """Data that a condition depends on. The condition does not count while that data is old or
+    unknown."""
 
     NOTHING = "nothing that could be old"
     TELEMETRY = "fresh telemetry"
@@ -24,14 +26,15 @@ class Rests(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Condition(Generic[Seen]):
-    """Something that is true or false in one tick: `holds`, a function of what is known then.
+    """A predicate on the current knowledge, evaluated once per tick by `holds`.
 
     Attributes:
-        name: in words, for whoever reads a memory.
-        lasts: it is the vehicle's own, whatever the maneuver: a change of phase or a hold does not
-            begin it anew.
-        rests_on: what has to be fresh for it to count; what may stop the motors or end a flight
-            rests on telemetry at least.
+        name: readable name, for `repr`.
+        holds: function that returns True if the condition is true in this tick.
+        lasts: True if the condition describes the vehicle independently of its maneuver: a change
+            of phase or a hold does not reset its start time.
+        rests_on: data that must be fresh for the condition to count. A condition that may stop the
+            motors or end a flight depends at least on fresh telemetry.
     """
 
     name: str
@@ -43,16 +46,17 @@ class Condition(Generic[Seen]):
         return f"<condition: {self.name}>"
 
 
-Since = Mapping[Condition, float]  # type: ignore[type-arg]  # of several kinds
+Since = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions of several types
 
 
 def update_since(
     old: Since, conditions: Iterable[Condition[Seen]], seen: Seen, now_s: float
 ) -> dict[Condition[Seen], float]:
-    """When each of the conditions that hold now began to hold."""
+    """Return the start time of each condition that is true for `seen`: the time in `old` if the
+    condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
     return {each: old.get(each, now_s) for each in conditions if each.holds(seen)}
 
 
 def lasting(since: Since) -> dict[Condition, float]:  # type: ignore[type-arg]
-    """The entries that outlast a change of phase, or a hold."""
+    """Return the entries that survive a change of phase or a hold."""
     return {each: began_s for each, began_s in since.items() if each.lasts}

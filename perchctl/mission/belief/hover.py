@@ -1,10 +1,10 @@
-"""Measurements for the hover-thrust filter (`perchctl.mission.belief.thrust`).
+"""Measure hover thrust for the filter in `perchctl.mission.belief.thrust`.
 
-Hover thrust is the reference for every proof of contact and for a descent by thrust. In quiet
-flight the filter measures the thrust itself (`learn_in_quiet_flight`); in a descent by thrust it
-measures thrust divided by specific force (`learn_in_descent`). Before either has happened,
+Hover thrust is the reference for every proof of contact and for a descent by raw thrust. In quiet
+flight, the measurement is the thrust itself (`learn_in_quiet_flight`). In a descent by raw thrust,
+it is the thrust divided by the specific force (`learn_in_descent`). Before either has happened,
 `best_estimate` falls back on the accelerometer, with a larger standard deviation. The estimate is
-wrong while something carries part of the weight unnoticed, and after a long descent by the scale
+wrong while something supports part of the weight undetected, and after a long descent by the scale
 error of the accelerometer.
 """
 
@@ -17,40 +17,46 @@ from perchctl.mission.belief.thrust import FELT_SIGMA, LEAST_POSITION_THRUST, Ho
 from perchctl.values import replace
 
 DESCENT_DRIFT = 0.067
-"""Random walk of the hover thrust in a descent by thrust, as a share per square root of a second.
-Larger: vibration changes the thrust. Smaller: in wind the vehicle sinks too fast for longer."""
+"""Random walk of the hover thrust in a descent by raw thrust, as a share per square root of a
+second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks too fast for
+longer."""
 UNSURE_SIGMA = 0.12
-"""Standard deviation, as a share, of an estimate by the accelerometer alone when the vehicle may
-have been carried. Larger: a descent may correct it further. Smaller: a wrong one persists."""
+"""Standard deviation, as a share, of an estimate from the accelerometer alone while the vehicle may
+have been supported. Larger: a descent may correct the estimate further. Smaller: a wrong estimate
+persists."""
 DESCENT_SIGMA = 0.04
 """Smallest standard deviation, as a share, at the start of a descent. Larger: contact with an
-obstacle teaches a wrong value. Smaller: with a weak battery the vehicle sinks too fast."""
+obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
 MOST_SIGMAS = 3.0
-"""Largest correction in a descent, in standard deviations at its start. Larger and smaller: as for
-`DESCENT_SIGMA`."""
+"""Largest correction during a descent, in standard deviations at its start. Larger: contact with an
+obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
 QUIET_WITHIN = 0.2
-"""Largest share by which quiet thrust may differ from the estimate; beyond it, the ceiling or a
-hand holds the vehicle. Larger: a held vehicle teaches a wrong value. Smaller: a real change is
-rejected."""
+"""Largest difference, as a share, between the thrust in quiet flight and the estimate; a larger one
+means that the ceiling or a hand holds the vehicle. Larger: a held vehicle corrupts the estimate.
+Smaller: a real change is rejected."""
 ROTOR_LAG_S = 0.06
-"""Time constant with which the rotors follow an order (docs/firmware.md, real flights 50 to 80 ms).
-Larger or smaller: a step of the thrust teaches a wrong hover thrust."""
+"""Time constant with which the rotors follow an ordered thrust, s (docs/firmware.md; 50 to 80 ms in
+real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
 LATEST_S = 1.0
-"""Older telemetry shows nothing of the present thrust."""
+"""Age beyond which telemetry says nothing about the present thrust, s."""
 LEAST_FELT_G = 0.7
-"""Thrust divided by the specific force is hover thrust while the force is between this and
-`MOST_FELT_G`. Smaller: a blow or a fall teaches it."""
+"""Smallest specific force at which thrust divided by specific force measures hover thrust, g.
+Smaller: a fall corrupts the estimate."""
 MOST_FELT_G = 1.3
+"""Largest specific force at which thrust divided by specific force measures hover thrust, g.
+Larger: a blow corrupts the estimate."""
 LEAST_PROPORTIONAL_PART = 0.5
 """Share of the first hover thrust below which thrust is not proportional to force."""
 LEAST_DIVISOR_G = 0.75
-"""Bounds of the specific force that a single sample's thrust is divided by."""
+"""Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
 MOST_DIVISOR_G = 1.5
+"""Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
+it."""
 
 
 def best_estimate(b: Belief) -> HoverThrust:
-    """Return the estimate; without one, the mean by the accelerometer; without that, the value of
-    the newest sample."""
+    """Return the filter's estimate; without one, the accelerometer's mean; without that, the value
+    of the newest sample. The fallbacks have the standard deviation `UNSURE_SIGMA`."""
     if b.hover.thrust > 0.0:
         return b.hover
     tel = b.telemetry
@@ -60,8 +66,8 @@ def best_estimate(b: Belief) -> HoverThrust:
 
 
 def lagged_thrust(b: Belief, dt_s: float) -> float:
-    """The thrust, 0..65535, that the rotors give `dt_s` after the sample before: a first-order lag
-    behind what is read."""
+    """Return the thrust, 0..65535, that the rotors produce `dt_s` after the previous sample: the
+    reported thrust through a first-order lag with the time constant `ROTOR_LAG_S`."""
     before, read = b.lagged_thrust, b.telemetry.thrust
     if before is None:
         return read
@@ -69,20 +75,21 @@ def lagged_thrust(b: Belief, dt_s: float) -> float:
 
 
 def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
-    """The estimate after a tick in which the thrust is hover thrust; `dt_s` since the sample
-    before, 0 if this one is not new."""
+    """Return the estimate after a tick in which the thrust equals hover thrust. `dt_s` is the time
+    since the previous sample, 0 if the telemetry has no new one."""
     thrust, old = b.telemetry.thrust, b.hover
     if old.thrust == 0.0:
         return HoverThrust(b.imu.hover_thrust or thrust, FELT_SIGMA)
     if abs(thrust / old.thrust - 1.0) > QUIET_WITHIN:
-        return old  # held by the ceiling, or by a hand
+        return old  # the ceiling or a hand holds the vehicle
     return old.with_measured(thrust, dt_s)
 
 
 def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
-    """The estimate after a tick of a descent by thrust, `dt_s` as in `learn_in_quiet_flight`;
-    unchanged where the floor or a magnet may carry a part of the weight, or the telemetry shows
-    nothing of it."""
+    """Return the estimate after a tick of a descent by raw thrust; `dt_s` as in
+    `learn_in_quiet_flight`. The estimate does not change while the floor or a magnet may support
+    part of the weight, or while the telemetry is too old or outside the range in which thrust is
+    proportional to force."""
     tel, old = b.telemetry, best_estimate(b)
     thrust = tel.thrust if b.lagged_thrust is None else b.lagged_thrust
     first, sigma = old.first or (old.thrust, max(DESCENT_SIGMA, old.sigma))

@@ -1,4 +1,5 @@
-"""What the planner has the vehicle do: the context in which its evidence is read."""
+"""Describe the maneuver that the planner flies: the context in which the belief reads its
+evidence."""
 
 from __future__ import annotations
 
@@ -11,26 +12,29 @@ from perchctl.vehicle import PositionSetpoint
 
 @dataclass(frozen=True, kw_only=True)
 class Maneuver:
-    """What the vehicle is flown to do, as far as evidence depends on it.
+    """The purpose of the flight in this phase, as far as the evidence depends on it.
 
-    The same reading means something else in another maneuver: a vehicle that stands still on little
-    thrust hangs after a press, and stands on the floor in a descent. Each phase declares its
+    The same reading has different meanings in different maneuvers: a motionless vehicle at low
+    thrust hangs after a press, but stands on the floor in a descent. Each phase declares its
     maneuver; the belief knows no phases.
 
     Attributes:
-        in_the_open: nothing but air should touch the vehicle. The velocity's bias and the mounting
-            are learned, and a stale position holds it (`hold_reason`).
-        by_camera: it is moved by what the camera sees. Old telemetry, a jump of the estimate, a
-            large variance or a late loop hold it.
-        needs_pictures: it must not go on without them: so does an old picture.
-        learns_hover: it flies quietly, so that its thrust teaches the hover thrust.
-        nears_target: it climbs up to the target, near which hover thrust is not learned: the air
-            under the ceiling carries a part of it.
-        presses: it is meant to touch the target. By the target alone a contact may be proven by the
-            place of the last sighting. Nothing holds it: a hold would leave it pressed.
-        retreats: it moves away from where an attempt ended, so that the last touch still counts.
-        descends: it comes down. What carries it may be the floor, and hanging is told from standing
-            by where it began.
+        in_the_open: nothing but air should touch the vehicle. The belief learns the velocity bias
+            and checks the mounting, and a stale position makes the vehicle hold (`hold_reason`).
+        by_camera: the camera guides the vehicle. Old telemetry, a jump of the estimate, a large
+            variance or a late loop make it hold.
+        needs_pictures: the vehicle must not continue without pictures; an old picture makes it
+            hold.
+        learns_hover: the vehicle flies quietly, so that its thrust measures hover thrust.
+        nears_target: the vehicle climbs to the target. Close to the target, hover thrust is not
+            learned because the ground effect of the ceiling supports part of the weight.
+        presses: the vehicle is meant to touch the target. With the target alone, the position of
+            the last sighting may prove a contact. No hold applies because a hold would leave the
+            vehicle pressed.
+        retreats: the vehicle leaves the position where an attempt ended, so the last touch still
+            counts.
+        descends: the vehicle descends. The support may be the floor; the start of the descent
+            distinguishes hanging from standing.
     """
 
     in_the_open: bool = False
@@ -45,22 +49,22 @@ class Maneuver:
 
 @dataclass(frozen=True, kw_only=True)
 class Sent:
-    """What the planner has ordered until now, all that the belief knows of it.
+    """The orders that the planner has sent so far; the belief knows no other state of the planner.
 
-    Times are on the loop's clock, places in the world of the state estimate.
+    Times are on the loop's clock; positions are in the world frame of the state estimate.
     """
 
     maneuver: Maneuver
-    began_m: Vector = (0.0, 0.0, 0.0)  # where the maneuver began
+    began_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
-    raw_thrust: int | None = None  # ordered last; None in position mode
-    released_s: float | None = None  # begin of the release by raw thrust
+    raw_thrust: int | None = None  # last order; None in position mode
+    released_s: float | None = None  # start of the release by raw thrust
     stopped_s: float | None = None  # first order to stop the motors
-    floor_felt_s: float | None = None  # a descent by thrust felt the floor
+    floor_felt_s: float | None = None  # time at which a descent by raw thrust detected the floor
 
     @property
     def is_level_descent(self) -> bool:
-        """True while it comes down by raw thrust, its motors turning."""
+        """True while the vehicle descends by raw thrust with its motors turning."""
         return self.maneuver.descends and self.raw_thrust is not None and self.is_motor_borne
 
     @property
@@ -69,6 +73,7 @@ class Sent:
         return self.released_s is None and self.stopped_s is None
 
     def moved(self, setpoint: PositionSetpoint | None, by_m: Vector) -> Sent:
-        """The same orders after the estimate's world has moved, with the setpoint that is left."""
+        """Return the same orders with the start of the maneuver shifted by `by_m`, the motion of
+        the estimate's world frame, and with `setpoint` in the new frame."""
         x, y, z = self.began_m
         return replace(self, setpoint=setpoint, began_m=(x + by_m[0], y + by_m[1], z + by_m[2]))

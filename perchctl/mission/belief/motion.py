@@ -1,23 +1,24 @@
-"""The vehicle's motion by accelerometer and attitude alone.
+"""The vehicle's motion from accelerometer and attitude alone.
 
 The accelerometer reads the specific force f in body axes. With the attitude R of the same sample
-(yaw-pitch-roll), less the offset o that it read at rest, the acceleration in world axes is
+(yaw-pitch-roll) and the offset o that the accelerometer read at rest, the acceleration in world
+axes is
 
     a = R (f - o) - g
 
 and the velocity since the first sample is its integral by the trapezoid rule:
 
-    sample ──> freeze ──> silence? ──yes──> begin anew: a fall may hide in the gap
+    sample ──> freeze ──> silence? ──yes──> start over: the gap may hide a fall
                             │ no
                             v
-              offset at rest, tilt by corrections ──> a, v
+       offset at rest, tilt due to corrections ──> a, v
                             │
                             v
               fall, impact, steady speed, push, hover thrust: one detector each
 
-Nothing here knows a position, a phase or a command. A detector notes when it last fired, so that
-its evidence has an age. `v` drifts by 0.1 m/s each second for each 0.01 rad by which the attitude
-is wrong: it is compared over short times only.
+This module uses no positions, phases or commands. Each detector records when it last fired, so that
+its evidence has an age. `v` drifts by 0.1 m/s per second for each 0.01 rad of attitude error, so it
+is compared over short times only.
 """
 
 from __future__ import annotations
@@ -36,87 +37,105 @@ Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 
 GAP_S = 0.2
-"""Silence in which a vehicle falls 20 cm, more than it may and still hang. Larger: a fall hides in
-it. Smaller: two lost packets count as a silence."""
+"""Time without telemetry that counts as a silence, s. In this time a vehicle falls 20 cm, more than
+is possible for one that still hangs. Larger: a silence can hide a fall. Smaller: two lost packets
+count as a silence."""
 NO_FALL_MPS = 0.25
-"""Speed that a hanging vehicle can gain across a silence, by noise of the estimate. Larger: a short
-fall passes for none."""
+"""Largest speed that noise of the estimate can add to a hanging vehicle across a silence, m/s.
+Larger: a short fall goes undetected."""
 NO_FALL_M = 0.25
-"""Distance across a silence beyond what the speed before it explains. Larger: as `NO_FALL_MPS`."""
+"""Largest distance across a silence that the speed before it does not explain, m. Larger: a short
+fall goes undetected."""
 SINKS_MPS = -0.3
-"""Reached 5 cm into a fall; what hangs is never faster. Closer to 0: noise counts as a fall."""
+"""Vertical speed that a hanging vehicle never reaches, m/s; a fall reaches it after 5 cm. Closer to
+0: noise counts as a fall."""
 FROZEN_READING_S = 0.2
-"""The same reading for so long counts as a silence. Smaller: coarse readings freeze by chance."""
+"""Time of identical readings that counts as a silence, s. Smaller: coarse readings freeze by
+chance."""
 FALL_G = 0.6
-"""Specific force below which a vehicle falls, g. Larger: the press's release counts as a fall."""
+"""Specific force below which a vehicle falls, g. Larger: the release of a press counts as a
+fall."""
 FALL_S = 0.1
-"""A fall reads light for so long; a rebound is shorter. Larger: 5 cm more of fall."""
+"""Time for which a falling vehicle reads less than `FALL_G`, s; a rebound is shorter. Larger: a
+fall is detected 5 cm later."""
 IMU_SINK_MPS = -0.25
-"""Downward speed, gained within `SINK_MEMORY_S`, at which it comes down whatever the offsets are.
-Closer to 0: vibration counts as a fall."""
+"""Downward speed, gained within `SINK_MEMORY_S`, at which the vehicle falls whatever the
+accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
 SINK_MEMORY_S = 1.5
-"""Time in which a gained downward speed is forgotten. Larger: an offset adds up to a fall."""
+"""Time constant with which a gained downward speed is forgotten, s. Larger: an offset accumulates
+to a fall."""
 OFFSET_MEMORY_S = 3.0
-"""Time in which the vertical offset is learned. Smaller: a slow fall is learned as an offset."""
+"""Time constant with which the vertical offset is learned, s. Smaller: a slow fall is learned as an
+offset."""
 IMPACT_G = -0.3
-"""A deceleration harder than this is an impact on the ceiling, not a fall. Closer to 0: a fall's
-first samples are cut off."""
+"""Vertical acceleration beyond which a downward reading is an impact on the ceiling and not a fall,
+g. Closer to 0: the first samples of a fall are cut off."""
 BLOW_MPS = 0.22
-"""Upward speed gained within `BLOW_S` that only the floor gives. Smaller: thrust is a floor."""
+"""Upward speed gained within `BLOW_S` that only the floor can cause, m/s. Smaller: an increase of
+thrust counts as the floor."""
 BLOW_S = 0.1
-"""Time in which a blow is forgotten. Larger: thrust adds up to a blow."""
+"""Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to a
+blow."""
 BEFORE_BLOW_S = 0.05
-"""A blow shows up to this long after it began; the speed before it is looked up so far back."""
+"""Longest delay between the start of a blow and its detection, s; the speed before the blow is
+taken from this far back."""
 BOUNCES_S = 0.5
-"""What follows a blow within this time is a bounce of it."""
+"""Time after a blow within which a further one is a bounce, s."""
 STEADY_MPS = 0.06
-"""Vertical speeds this close are one speed. Larger: a slow sink counts as standing still."""
+"""Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
+counts as standing still."""
 STEADY_ASIDE_MPS = 0.15
-"""The same sideways, to the mean of the last `ASIDE_MEMORY_S`; wider, since the wind shakes it."""
+"""Largest difference between the lateral velocity and its mean over `ASIDE_MEMORY_S` that counts as
+constant, m/s; larger than `STEADY_MPS` because the wind shakes the vehicle."""
 ASIDE_MEMORY_S = 0.15
-"""Time of the mean sideways speed."""
+"""Time constant of the mean lateral velocity, s."""
 REST_MEMORY_S = 0.5
-"""Time in which the offsets are learned at rest. Smaller: vibration of the floor is learned."""
+"""Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
+of the floor is learned."""
 PUSHED_G = 0.06
-"""Sideways specific force that only a push gives. Smaller: drag in flight counts as a push."""
+"""Lateral specific force that only a push causes, g. Smaller: drag in flight counts as a push."""
 PUSHED_S = 1.5
-"""A push shows in the state estimate up to this much later."""
+"""Longest delay with which a push shows in the state estimate, s."""
 PUSH_MEMORY_S = 0.05
-"""Time of the mean sideways force: turning motors shake single samples as hard as a push."""
+"""Time constant of the mean lateral force, s: running motors shake single samples as hard as a
+push."""
 CORRECTED_MPS = 0.08
-"""Sideways speed that the estimate gains in one sample by a correction, not by motion."""
+"""Lateral speed gained between two samples above which the gain is a correction of the estimate and
+not a motion, m/s."""
 CORRECTED_MPS2 = 5.0
-"""The same for each second between two samples."""
+"""Increase of that threshold for each second between the two samples, m/s^2."""
 CORRECTED_MEMORY_S = 6.0
-"""Time in which the firmware's own filter takes a wrong tilt back."""
+"""Time constant with which the firmware's own filter removes a wrong tilt, s."""
 HOVER_MEMORY_S = 0.5
-"""Time in which the hover thrust follows. Larger: a sagging battery is noticed later."""
+"""Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
 LEAST_FLYING = 0.4
-"""Share of full thrust below which nothing hovers."""
+"""Share of full thrust below which no vehicle hovers."""
 HOVER_SATURATED_PART = 0.95
-"""Share of full thrust from which on the thrust for 1 g is not known."""
+"""Share of full thrust above which the motors are saturated and the thrust for 1 g is unknown."""
 UNCORRECTED_M2PS2_PER_S = 5e-4
-"""Half of the growth of the vertical speed's variance while nothing corrects it."""
+"""Least growth of the variance of the vertical speed that shows a missing correction, (m/s)^2 per
+second: half of its growth without any corrections."""
 UNCORRECTED_S = 0.45
-"""Growth for so long is certain. Smaller: a pause between two ranges counts."""
+"""Time of uninterrupted growth after which corrections have certainly stopped, s. Smaller: a pause
+between two range measurements counts."""
 
 
 @dataclass(frozen=True)
 class FusionAge:
-    """For how long nothing has corrected the state estimate, by its variance of vertical speed,
-    which only ever grows while no measurement is fused."""
+    """Time since the last correction of the state estimate, from its variance of vertical speed:
+    without measurements, the variance only grows."""
 
-    variance_m2ps2: float | None = None  # the newest
-    changed_s: float = -math.inf  # when that variance came
-    none_since_s: float = math.inf  # since when it has only grown
+    variance_m2ps2: float | None = None  # newest variance
+    changed_s: float = -math.inf  # time at which that variance arrived
+    none_since_s: float = math.inf  # time since which the variance has only grown
 
     def age_s(self, now_s: float) -> float:
-        """Age of the last correction if corrections have certainly ceased; else 0."""
+        """Age of the last correction, s, if corrections have certainly stopped; otherwise 0."""
         certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
         return now_s - self.none_since_s if certain else 0.0
 
     def update(self, sample: Telemetry) -> FusionAge:
-        """The age with one more sample; unchanged by one without a new variance."""
+        """Return the age after one more sample; unchanged if the sample has no new variance."""
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -128,38 +147,41 @@ class FusionAge:
 
 @dataclass(frozen=True)
 class Impact:
-    """A blow from below, such as a touchdown's."""
+    """A blow from below, for example at a touchdown."""
 
-    t_s: float = -math.inf  # -inf: there was none
-    estimated_mps: float = 0.0  # vertical speed just before it, by the state estimate
-    felt_mps: float = 0.0  # the same by `ImuMotion.velocity_mps`
-    peak_g: float = 0.0  # the largest specific force read in it, along the body's z axis
-    z_m: float = 0.0  # where the state estimate had the vehicle
+    t_s: float = -math.inf  # -inf: no impact yet
+    estimated_mps: float = 0.0  # vertical speed just before the blow, from the state estimate
+    felt_mps: float = 0.0  # vertical speed just before the blow, from `ImuMotion.velocity_mps`
+    peak_g: float = 0.0  # largest specific force during the blow along the body's z axis
+    z_m: float = 0.0  # height in the state estimate at the blow
 
 
-# --- The detectors: each a small value with a law of its own (tests/mission/test_detectors.py) ---
+# --- Detectors: small values with one law each (tests/mission/test_detectors.py) ---
 
 
 @dataclass(frozen=True)
 class FreezeDetector:
-    """How long readings have stood still. A vehicle in the air never reads the very same twice."""
+    """Time for which readings have not changed. A vehicle in the air never reads identical values
+    twice."""
 
-    frozen_s: float = 0.0  # for how long the accelerometer has read the very same
-    attitude_frozen_s: float = -math.inf  # the same of the attitude; -inf before a change
-    place_frozen_s: float = -math.inf  # the same of position and velocity
+    frozen_s: float = 0.0  # time of identical accelerometer readings
+    # time of identical attitude readings; -inf before the first change
+    attitude_frozen_s: float = -math.inf
+    place_frozen_s: float = -math.inf  # time of identical position and velocity readings
 
     @property
     def attitude_age_s(self) -> float:
-        """Seconds for which the attitude has read the same while the accelerometer changed."""
+        """Time, s, for which the attitude has not changed while the accelerometer has."""
         return max(0.0, self.attitude_frozen_s - self.frozen_s)
 
     @property
     def place_age_s(self) -> float:
-        """Seconds of the same position and velocity readings while the accelerometer changed."""
+        """Time, s, for which position and velocity have not changed while the accelerometer has."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
     def compare(self, last: Telemetry | None, new: Telemetry) -> Self:
-        """The detector with one more sample; the first is compared with nothing."""
+        """Return the detector after one more sample; the first sample has no predecessor to
+        compare."""
         return replace(
             self,
             frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
@@ -170,25 +192,27 @@ class FreezeDetector:
 
 @dataclass(frozen=True)
 class FallDetector:
-    """When the vehicle last fell, or came down and met the floor.
+    """Time at which the vehicle last fell, or came down and reached the floor.
 
-    With the vertical acceleration a, less its slowly learned offset, and cut off at an impact's,
+    Let a be the vertical acceleration minus its slowly learned offset, with decelerations harder
+    than `IMPACT_G` cut off. The downward speed gained recently is
 
         sink' = min(0, sink + a dt - sink dt / SINK_MEMORY_S)
 
-    is the downward speed that was gained lately. The vehicle fell if that is beyond `IMU_SINK_MPS`,
-    or if it has read less than `FALL_G` for longer than a rebound does. A sink that is so slow that
-    the offset learns it goes unnoticed.
+    The vehicle fell if that speed is beyond `IMU_SINK_MPS`, or if the accelerometer has read less
+    than `FALL_G` for longer than a rebound lasts. A sink that is slow enough for the offset to
+    learn it goes undetected.
     """
 
-    fell_s: float = -math.inf  # when it last fell, or came down and met the floor
-    light_since_s: float = math.inf  # the accelerometer has read less than `FALL_G`
+    fell_s: float = -math.inf  # last fall, or descent to the floor
+    # time since which the accelerometer has read less than `FALL_G`
+    light_since_s: float = math.inf
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
 
     def with_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
-        """The detector after `dt_s` of vertical acceleration `up_mps2`, with a specific force of
-        `reads_g` along the body's z axis at its end."""
+        """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `reads_g` is the
+        specific force along the body's z axis at the end of that time."""
         offset = self.offset_mps2 + (
             max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2)) - self.offset_mps2
         ) * min(1.0, dt_s / OFFSET_MEMORY_S)
@@ -208,17 +232,17 @@ class FallDetector:
 
 @dataclass(frozen=True)
 class ImpactDetector:
-    """The newest blow from below, such as a touchdown's: within a moment it gains more upward speed
-    than any thrust gives. Of a blow and its bounces the hardest counts."""
+    """The newest blow from below, for example at a touchdown: in a short time it adds more upward
+    speed than any thrust can. The peak force is the hardest of the blow and its bounces."""
 
     blow_mps: float = 0.0
     blow_s: float = -math.inf
-    last_moment: tuple[Impact, ...] = ()  # what a blow that begins now has ended
-    blow: Impact = Impact()  # the newest from below
+    last_moment: tuple[Impact, ...] = ()  # states just before a blow that begins now
+    blow: Impact = Impact()  # newest blow from below
 
     def with_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
-        """The detector after `dt_s` of vertical acceleration `up_mps2`; `now` is this moment, which
-        a blow may have ended, `z_m` where the state estimate has the vehicle."""
+        """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `now` is the state
+        at that time, which a blow may have ended; `z_m` is the height in the state estimate."""
         gained_mps = max(0.0, self.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
         recent = (m for m in self.last_moment if now.t_s - m.t_s <= BEFORE_BLOW_S)
         last_moment = (*recent, now)
@@ -234,8 +258,9 @@ class ImpactDetector:
 def _newest_impact(
     old: Impact, now: Impact, z_m: float, last_moment: tuple[Impact, ...], gained_mps: float
 ) -> Impact:
-    """The newest blow, which has gained `gained_mps` by now; of its bounces the hardest counts. The
-    onboard estimate has the whole of a blow before its second sample arrives."""
+    """Return the newest blow, which has gained `gained_mps` so far, with the hardest peak of its
+    bounces. The speeds are minima over the last moment because the onboard estimate already
+    includes the whole blow before its second sample arrives."""
     follows = now.t_s - old.t_s <= BOUNCES_S
     if gained_mps > BLOW_MPS:
         begun = Impact(
@@ -258,12 +283,13 @@ def _newest_impact(
 
 @dataclass(frozen=True)
 class SteadySpeed:
-    """Since when the vertical speed has stayed what it is, and the sideways speed near its mean."""
+    """Time since which the vertical speed has been constant and the lateral velocity close to its
+    mean."""
 
-    steady_s: float = math.inf  # since when the vertical speed has stayed what it is
+    steady_s: float = math.inf  # time since which the vertical speed has been constant
     steady_mps: float = 0.0
-    steady_aside_s: float = math.inf  # the same of the sideways speed
-    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # the mean of the last moment
+    steady_aside_s: float = math.inf  # time since which the lateral velocity has been constant
+    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # mean over `ASIDE_MEMORY_S`
 
     def with_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """The detector after `dt_s`, at a velocity in world axes."""
@@ -287,14 +313,14 @@ class SteadySpeed:
 
 @dataclass(frozen=True)
 class PushDetector:
-    """When something last pushed the vehicle sideways: the mean specific force across its z axis is
-    more than drag in flight makes."""
+    """Time of the last lateral push: the mean specific force across the body's z axis exceeded the
+    drag of any flight."""
 
-    aside_g: tuple[float, float] = (0.0, 0.0)  # mean sideways force, body axes
-    pushed_s: float = -math.inf  # when something last pushed it sideways
+    aside_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
+    pushed_s: float = -math.inf  # time of the last lateral push
 
     def with_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
-        """The detector after `dt_s`, with what the accelerometer reads then and read at rest."""
+        """Return the detector after `dt_s`; `offset_g` is the accelerometer's offset at rest."""
         keeps = math.exp(-dt_s / PUSH_MEMORY_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
         mean_x_g, mean_y_g = self.aside_g
@@ -306,28 +332,31 @@ class PushDetector:
         return replace(self, aside_g=aside_g, pushed_s=new.t_s if pushes else self.pushed_s)
 
 
-# --- All of it ---
+# --- All detectors together ---
 
 
 @dataclass(frozen=True)
 class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushDetector):
-    """The vehicle's motion by accelerometer and attitude alone; loop times are -inf for never."""
+    """The vehicle's motion from accelerometer and attitude alone; a loop time of -inf means
+    never."""
 
-    t_s: float = -math.inf  # of the newest sample
-    velocity_mps: Vector = ZERO  # since the first sample, world axes
-    offset_g: Vector = ZERO  # what the accelerometer read too much at rest, body axes
+    t_s: float = -math.inf  # time of the newest sample
+    velocity_mps: Vector = ZERO  # velocity gained since the first sample, world axes
+    offset_g: Vector = ZERO  # offset of the accelerometer at rest, body axes
     silent_s: float = -math.inf  # end of the newest silence
     gap_s: float = -math.inf  # end of the newest silence that may hide a fall
-    started_s: float = -math.inf  # first heard again after it had started anew
-    sunk_m: float = 0.0  # by the estimate, while the accelerometer has stood still
-    hover_thrust: float = 0.0  # for each measured g in flight
-    misled_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch turned by corrections
+    started_s: float = -math.inf  # first sample after the vehicle restarted
+    sunk_m: float = 0.0  # descent by the estimate while the accelerometer was frozen
+    hover_thrust: float = 0.0  # mean thrust per measured g in flight
+    misled_rad: tuple[float, float] = (0.0, 0.0)  # errors of roll and pitch due to corrections
     turning_radps: tuple[float, float] = (0.0, 0.0)
-    corrections: FusionAge = FusionAge()  # of the estimate beside this motion
-    off_s: float = math.inf  # since when the motors have been off; inf while they turn
+    # corrections of the state estimate, which this motion does not use
+    corrections: FusionAge = FusionAge()
+    off_s: float = math.inf  # time since which the motors have been off; inf while they turn
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-        """The motion with one more sample; `last`: the sample before it, None at the first."""
+        """Return the motion after one more sample; `last` is the previous sample, None at the
+        first."""
         dt_s = math.inf if last is None else new.t_s - last.t_s
         started_anew = last is not None and new.start != last.start
         motion = replace(
@@ -354,8 +383,9 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
     def acceleration_mps2(
         sample: Telemetry, offset_g: Vector, tilt_off_rad: tuple[float, float] = (0.0, 0.0)
     ) -> Vector:
-        """Acceleration in world axes by force and attitude of a sample, less the accelerometer's
-        offset and the error of roll and pitch, `tilt_off_rad`."""
+        """Return the acceleration in world axes from the specific force and attitude of a sample,
+        corrected for the accelerometer's offset and for the error of roll and pitch,
+        `tilt_off_rad`."""
         roll_rad, pitch_rad = sample.roll_rad - tilt_off_rad[0], sample.pitch_rad - tilt_off_rad[1]
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
@@ -374,7 +404,8 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
 
 
 def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-    """The motion with the first sample, or with one that continues none."""
+    """Return the motion after the first sample, or after one that does not continue the previous
+    one."""
     motion = replace(
         motion,
         steady_s=new.t_s,
@@ -408,8 +439,9 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
 def _integrate(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[ImuMotion, float]:
-    """The motion with its velocity carried on by the trapezoid rule, and the vertical acceleration
-    over the sample, m/s2. Offsets are learned while the motors are off and nothing flies."""
+    """Return the motion with its velocity integrated by the trapezoid rule, and the mean vertical
+    acceleration between the two samples, m/s^2. The accelerometer's offsets are learned while the
+    motors are off and the vehicle does not fly."""
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
         offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
@@ -431,9 +463,10 @@ def _integrate(
 def _tilt_by_corrections(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """How far corrections of the estimate have turned roll and pitch, rad, and the vehicle's own
-    rates, rad/s. A sideways speed gained at once is a correction: what the attitude turns by in
-    that sample, beyond its rates before, is no motion, and fades as the firmware takes it back."""
+    """Return the errors of roll and pitch due to corrections of the estimate, rad, and the
+    vehicle's own rates, rad/s. A lateral speed gained within one sample is a correction: the
+    rotation in that sample, beyond the previous rates, is not a motion of the vehicle. The error
+    decays as the firmware removes it."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
     kept = 1.0 - dt_s / CORRECTED_MEMORY_S

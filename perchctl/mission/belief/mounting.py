@@ -1,8 +1,9 @@
-"""Checks that the camera is mounted as the profile says: the target stands still in the world.
+"""Verify that the camera is mounted as the profile says: the target must stand still in the world.
 
-Where `camera.mount` is turned about the vehicle's upward axis, the target moves by (1 - M) of the
-motion of the place where that axis meets the target's plane, M being the turn as a complex number:
-one least squares over a decimetre gives it (docs/mission.md, "The mounting").
+If `camera.mount` is wrong by a rotation about the vehicle's upward axis, the target moves by (1 -
+M) times the motion of the point where that axis meets the target's plane; M is the rotation as a
+complex number. A least-squares fit over a decimetre of motion determines M (docs/mission.md, "The
+mounting").
 """
 
 from __future__ import annotations
@@ -15,32 +16,38 @@ from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-MOUNTING_WINDOW_S = 3.0  # older sights are left out: the estimate drifts
+MOUNTING_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
 MOUNTING_LEAST_SIGHTS = 10
 JUDGED_M, PROVEN_M = 0.12, 0.3
-"""Motion of the axis from which on the mounting is judged, and beyond which it is proven."""
+"""Motion of the axis, m, above which the mounting is judged and above which it is proven."""
 STANDS_STILL, MOVES_ALONG = 0.35, 0.6
-"""Of the vehicle's motion. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
+"""Share of the vehicle's motion by which the target moves: below the first it stands still, above
+the second it moves along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
 LEAST_SPREAD_M = 0.05
-MOST_UNEXPLAINED = 0.45  # of the target's spread
-LEAST_TURN = 0.5  # length of M; about 0 is a world that drifts
-LEAST_TURN_RAD = math.radians(65.0)  # a lesser one leads to the target in a bow
+MOST_UNEXPLAINED = 0.45  # share of the target's spread
+LEAST_TURN = 0.5  # magnitude of M; near 0, the world frame drifts
+# with a smaller rotation, the vehicle still reaches the target on a curve
+LEAST_TURN_RAD = math.radians(65.0)
 SIGHTS_IN_A_ROW = 4
 JUMPS, SETTLES_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
-"""Metres, seconds: a target that moves so much farther than twice the vehicle has been moved."""
+"""`JUMPS` are pairs of a distance, m, and a time, s: a target that moves by more than the distance
+plus twice the vehicle's motion within the time was moved. `SETTLES_S` is the pause after a move,
+s."""
 ESTIMATE_JUMP_M = 0.05
-"""A vehicle that moves farther between two sights, beyond `ESTIMATE_JUMP_MPS`, is in a new world.
-Larger: sights from before and after a jump of the estimate are compared."""
+"""Motion of the vehicle between two sightings, m, beyond `ESTIMATE_JUMP_MPS`, above which the
+estimate has jumped. Larger: sightings from before and after a jump are compared."""
 ESTIMATE_JUMP_MPS = 1.5
-"""The same for each second between them. Smaller: a fast vehicle drops its sights."""
+"""Increase of that limit for each second between the sightings, m/s. Smaller: the sightings of a
+fast vehicle are dropped."""
 _LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 
 @dataclass(frozen=True)
 class MountSample:
-    """Positions of vehicle and target at `t_s`, as world x + iy in m.
+    """Positions of vehicle and target at `t_s` in the world, as x + iy in m.
 
-    `lean_m`: from the vehicle to where its upward axis meets the target's plane.
+    `lean_m` is the vector from the vehicle to the point where its upward axis meets the target's
+    plane.
     """
 
     t_s: float
@@ -50,12 +57,13 @@ class MountSample:
 
     @property
     def aim_m(self) -> complex:
-        """Where the vehicle's upward axis meets the target's plane."""
+        """Point where the vehicle's upward axis meets the target's plane."""
         return self.vehicle_m + self.lean_m
 
 
 def mount_sample(t_s: float, telemetry: Telemetry, target_m: Array) -> MountSample:
-    """The sample of a target at `target_m` (3,), world, and of the vehicle as in `telemetry`."""
+    """Return the sample for a target at `target_m` (3,), world, and the vehicle's pose in
+    `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
     lean_m = (float(target_m[2]) - z) * up
@@ -65,27 +73,28 @@ def mount_sample(t_s: float, telemetry: Telemetry, target_m: Array) -> MountSamp
 
 @dataclass(frozen=True)
 class MountingMonitor:
-    """The sights since the target came into view, and what they show of the mounting."""
+    """The sightings since the target came into view, and their verdict on the mounting."""
 
     sights: tuple[MountSample, ...] = ()
     paused_until_s: float = -math.inf
-    mounting_fits: bool = False  # the target has stood still over `PROVEN_M`: the check is over
+    mounting_fits: bool = False  # the target has stood still over `PROVEN_M`: the check is complete
     target_still: bool = False  # the target has stood still so far
-    doubts: int = 0  # sights in a row that speak against the mounting
-    turn_rad: float = 0.0  # the turn that would make the target stand still
+    doubts: int = 0  # successive sightings that contradict the mounting
+    turn_rad: float = 0.0  # rotation of the mounting with which the target would stand still
 
     @property
     def is_wrong(self) -> bool:
-        """True once enough sights in a row speak against the mounting."""
+        """True once enough successive sightings contradict the mounting."""
         return self.doubts >= SIGHTS_IN_A_ROW
 
     @property
     def is_unconfirmed(self) -> bool:
+        """True while no motion has shown yet that the target stands still."""
         return not (self.mounting_fits or self.target_still)
 
 
 def update_monitor(old: MountingMonitor, sight: MountSample) -> MountingMonitor:
-    """The monitor with one more sight of a measured target."""
+    """Return the monitor after one more sighting of a measured target."""
     if old.mounting_fits or old.is_wrong:
         return old
     kept = tuple(s for s in old.sights if sight.t_s - s.t_s <= MOUNTING_WINDOW_S)

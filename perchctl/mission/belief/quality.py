@@ -1,4 +1,5 @@
-"""Whether what is known is good enough to fly by, and conditions that say it is not."""
+"""Decide whether the belief is good enough to fly by, and define the conditions that say it is
+not."""
 
 from __future__ import annotations
 
@@ -10,17 +11,17 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
 KNOCKED_MPS = 0.5
-"""Sideways speed that no draught gives. Larger: a blow during the press is noticed late."""
+"""Lateral speed that no draught causes, m/s. Larger: a blow during the press is noticed late."""
 OTHERWISE_MPS = 0.15
-"""Velocity that the estimate alone has gained; true positions make at most 0.07. Larger: positions
-in other axes lead farther before they are noticed."""
+"""Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
+most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
 BELOW_M = 0.3
-"""No target on the ceiling can be so far below the vehicle."""
+"""Distance below the vehicle that excludes a target on the ceiling, m."""
 UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 
 
 def _moves_otherwise(b: Belief) -> bool:
-    """True if the estimate follows a motion capture against the accelerometer."""
+    """True if the estimate follows motion-capture positions that contradict the accelerometer."""
     by_capture = b.profile.positioning.source.is_mocap
     return by_capture and math.hypot(*b.reckoning.beside_mps) > OTHERWISE_MPS
 
@@ -30,7 +31,7 @@ def _is_tilted(b: Belief) -> bool:
 
 
 def _battery_is_low(b: Belief) -> bool:
-    """True if the firmware reports low power, or a measured voltage is low."""
+    """True if the firmware reports low power, or if the measured voltage is below `min_load_v`."""
     tel = b.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
     low = known and tel.battery_v < b.profile.safety.min_load_v
@@ -52,7 +53,8 @@ QUALITY_CONDITIONS = (TILTED, KNOCKED, UNSURE, TARGET_BELOW, BATTERY_LOW, MOVES_
 
 
 def hold_reason(b: Belief, maneuver: Maneuver) -> str:
-    """Why the vehicle must stay where it is in this tick of the maneuver, or the empty string."""
+    """Return why the vehicle must hold its position in this tick of the maneuver, or an empty
+    string."""
     safety = b.profile.safety
     if maneuver.in_the_open and b.position_is_stale:
         return position_loss_text(b)
@@ -72,7 +74,7 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 
 def position_loss_text(b: Belief) -> str:
-    """Text: for how long no external position was sent, and why."""
+    """Return for how long no external position was sent, and why."""
     if b.is_displaced:
         return "pushed aside while the target was not seen"
     age_s, why = b.position_age_s, b.obs.position_problem
@@ -85,7 +87,7 @@ def position_loss_text(b: Belief) -> str:
 
 
 def unsure_text(b: Belief) -> str:
-    """Text: the variance by which the estimate is unsure, and the most that is allowed."""
+    """Return which variance is too large, and the limit."""
     safety = b.profile.safety
     what, variance, unit = "velocity", b.velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2
@@ -98,5 +100,5 @@ def unsure_text(b: Belief) -> str:
 
 
 def no_picture_reason(b: Belief) -> str:
-    """Text: why there is no picture, or for how long there was none."""
+    """Return why there is no picture, or for how long there was none."""
     return b.obs.camera_problem or f"no picture for {b.obs.camera_age_s:.1f} s"

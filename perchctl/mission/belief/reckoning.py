@@ -1,17 +1,18 @@
-"""Dead reckoning: the vehicle's motion carried on by the accelerometer from the last good position.
+"""Dead reckoning: integrate the accelerometer from the last good position.
 
-While a position corrects the state estimate, the reckoned velocity v is drawn to the estimate's e
-and the bias b, the excess of accelerometer and attitude, is learned from the difference:
+While positions correct the state estimate, the reckoned velocity v is drawn to the estimated
+velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
     v += (dv_imu - b dt)                          each sample
     v += (e - v) dt / SPEED_MEMORY_S              while e is believed
     b += (dv_imu - de - b dt) / BIAS_MEMORY_S     while e is believed
 
-Without one, v runs on by the first line alone. The gear's place under the target runs on with v
-from the last sighting, and its standard deviation grows with the time since and the way flown. All
-of it is wrong by what the bias has changed since the position was lost: 0.1 m/s2 is 0.45 m after
-3 s. The gains are fixed; a Kalman filter of velocity, bias and the pictures' positions is no better
-(`benchmarks/reckoning.py`), since what limits both is that change.
+Without positions, only the first line applies. The gear's offset from the target is integrated with
+v from the last sighting; its standard deviation grows with the time since then and with the
+distance flown. All results are wrong by the change of the bias since the position was lost: 0.1
+m/s^2 becomes 0.45 m after 3 s. The gains are fixed. A Kalman filter of velocity, bias and the
+positions from pictures is no better (`benchmarks/reckoning.py`) because the same change limits
+both.
 """
 
 from __future__ import annotations
@@ -33,84 +34,98 @@ from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
 SPEED_MEMORY_S = 3.0
-"""Time in which the reckoned velocity is drawn to a believed estimate's. Larger: an old error of it
-stays. Smaller: a wrong estimate is followed."""
+"""Time constant with which the reckoned velocity approaches a believed estimate, s. Larger: an old
+error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 BIAS_MEMORY_S = 4.0
-"""Time in which the bias is learned. Larger: a wind that has turned is followed late. Smaller: a
-gust is taken for a bias."""
+"""Time constant with which the bias is learned, s. Larger: a change of the wind is followed late.
+Smaller: a gust is learned as a bias."""
 MOST_BIAS_MPS2 = 1.5
-"""A wind of 4 m/s, which the firmware takes for a tilt, makes 1.2 m/s2. Larger: wrong positions
-teach a bias that no attitude has."""
+"""Largest bias, m/s^2; a wind of 4 m/s, which the firmware takes for a tilt, causes 1.2. Larger:
+wrong positions can add a bias that no attitude error has."""
 MOST_WRONG_MPS2 = 2.0
-"""In one sample; more is a blow, or a correction of the estimate, and no bias. Larger: a kick of 40
-ms teaches one. Smaller: a gust is not learned."""
+"""Largest difference in one sample from which the bias is learned, m/s^2; a larger one is a blow or
+a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not learned."""
 CLIMB_SPARE_MPS = 0.1
-"""Speed by which it may climb faster than reckoned. Larger: the magnet seems near too early."""
+"""Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
+in reach too early."""
 MOST_CLIMB_MPS = 1.0
-"""Climb in a silence, by the position mode's own limit."""
+"""Largest climb during a silence, m/s: the limit of the position mode."""
 MAGNET_REACH_M = 0.04
-"""A gear this close below the target may have been caught by its magnet. Larger: a vehicle in the
-air is treated as one that may hang. Smaller: a caught one is treated as flying."""
+"""Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
+vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
 BOUNCE_WITHIN_M = 0.1
-"""So near below the target the vertical speed follows the estimate: a bounce off the ceiling falls
-between two samples of telemetry, and the firmware integrates it at 1 kHz. Larger: what late
-pictures do to the estimate is taken over. Smaller: a bounce is missed by up to 0.3 m/s."""
+"""Distance below the target within which the reckoned vertical speed follows the estimate, m: a
+bounce off the ceiling falls between two telemetry samples, but the firmware integrates it at 1 kHz.
+Larger: errors of the estimate due to late pictures are adopted. Smaller: a bounce is missed by up
+to 0.3 m/s."""
 MISSED_MEMORY_S = 1.0
-"""In so long positions correct a speed that the estimate has missed. Larger: what a wrong attitude
-adds in seconds looks like a blow. Smaller: a blow just before the last sighting is forgotten."""
+"""Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
+velocity that a wrong attitude accumulates over seconds looks like a blow. Smaller: a blow just
+before the last sighting is forgotten."""
 MOST_VELOCITY_BIAS_MPS = 0.6
-"""A wind of 4 m/s makes 0.4 m/s. Larger: a vehicle that moves counts as still while its position
-creeps. Smaller: it is never steady in a wind."""
+"""Largest bias of the estimated velocity, m/s; a wind of 4 m/s causes 0.4. Larger: a moving vehicle
+counts as still while its position creeps. Smaller: the vehicle is never steady in wind."""
 VELOCITY_MEMORY_S = 2.0
-"""In so long the bias of the estimated velocity is learned. Larger: a wind that has turned makes
-the vehicle seem to move for longer. Smaller: noise of the position is taken for a bias."""
+"""Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
+of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
+bias."""
 BESIDE_MEMORY_S = 0.5
-"""Time in which a velocity that the estimate alone has gained is forgotten."""
+"""Time constant with which a velocity gained by the estimate alone is forgotten, s."""
 STEP_M = 0.005
-"""Motion of the estimated position beyond its speed that is a step. Smaller: noise is one."""
+"""Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
+counts as a step."""
 STEP_MPS = 0.2
-"""The same for each second between two samples."""
+"""Increase of that threshold for each second between two samples, m/s."""
 UNSEEN_S = 0.15
-"""After a longer silence a step may be the vehicle's motion."""
+"""Longest time between two samples for a step, s; after a longer one, the step may be the vehicle's
+motion."""
 CARRIED_S = 0.05
-"""A position is carried on for at most so long."""
+"""Longest time for which the position in a sample is regarded as current, s."""
 BIAS_SIGMA_MPS2 = 0.06
-"""Spread of the bias behind a reckoned place. Smaller: contacts are claimed too precisely."""
+"""Standard deviation of the bias for a reckoned position, m/s^2. Smaller: the offset of a contact
+is claimed too precisely."""
 SPEED_SIGMA_MPS = 0.01
-"""The same of the speed at the last sighting."""
+"""Standard deviation of the velocity at the last sighting, m/s. Smaller: the offset of a contact is
+claimed too precisely."""
 BLOW_SHARE = 0.3
-"""Share of the way flown unseen that adds to the spread of a reckoned place."""
+"""Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
+position."""
 LED_PER_S = 1.5
-"""Acceleration, m/s2, that positions in other axes feign for each m/s by which they lead."""
+"""Apparent acceleration, m/s^2, that positions in wrong axes cause per m/s of `beside_mps`."""
 MOST_SILENT_MOVE_S = 0.5
-"""Longest step of the reckoned height; a longer one is a silence."""
+"""Longest integration step of the reckoned height, s; a longer one is a silence."""
 
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Velocity of the vehicle and place of its gear under the target, world axes, carried on by the
-    accelerometer. `beside_mps`: sideways velocity that the state estimate alone has gained."""
+    """Velocity of the vehicle and offset of its gear from the target, world axes, integrated from
+    the accelerometer since the last good position or sighting."""
 
-    imu: ImuMotion | None = None  # the motion up to which it is reckoned
+    imu: ImuMotion | None = None  # motion up to which this value is integrated
     velocity_mps: Vector = ZERO
-    bias_mps2: Vector = ZERO  # excess of accelerometer and attitude
-    mean_lateral_mps2: tuple[float, float] = (0.0, 0.0)  # what the accelerometer reads sideways
+    bias_mps2: Vector = ZERO  # error of accelerometer and attitude
+    mean_lateral_mps2: tuple[float, float] = (0.0, 0.0)  # mean lateral reading of the accelerometer
     estimated_mps: Vector = ZERO
-    beside_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the estimate alone
-    missed_mps: tuple[float, float] = (0.0, 0.0)  # recently gained by the accelerometer alone
-    below_m: float = math.inf  # gear below the target; inf if unseen or fallen
-    nearest_m: float = math.inf  # the same with a climb in silences; a fall only adds to it
-    unsure_s: float = -math.inf  # end of the newest silence that may have led to the magnet
-    aside_m: tuple[float, float] = (0.0, 0.0)  # from the gear to the target's axis
-    aside_sigma_m: float = math.inf  # standard deviation of that; inf if unknown
-    sight_s: float = -math.inf  # exposure of the sight that it is carried on from
-    stepped_m: tuple[float, float] = (0.0, 0.0)  # steps of the estimate since
-    stepped_s: float = -math.inf  # the newest of them
+    # lateral velocity gained recently by the state estimate alone
+    beside_mps: tuple[float, float] = (0.0, 0.0)
+    # lateral velocity gained recently by the accelerometer alone
+    missed_mps: tuple[float, float] = (0.0, 0.0)
+    below_m: float = math.inf  # distance of the gear below the target; inf if unseen or fallen
+    # lower bound of `below_m`: allows for climbs in silences, and falls only add to it
+    nearest_m: float = math.inf
+    # end of the newest silence after which the magnet may hold the vehicle
+    unsure_s: float = -math.inf
+    aside_m: tuple[float, float] = (0.0, 0.0)  # lateral offset from the gear to the target's axis
+    aside_sigma_m: float = math.inf  # standard deviation of `aside_m`; inf if unknown
+    sight_s: float = -math.inf  # exposure of the sighting from which the offset is integrated
+    # sum of the steps of the estimated position since that sighting
+    stepped_m: tuple[float, float] = (0.0, 0.0)
+    stepped_s: float = -math.inf  # time of the newest step
     struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
-    velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # sideways, of the estimated velocity
-    mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # of the estimate, over the last seconds
-    mean_position_m: tuple[float, float] | None = None  # the same of its position
-    held_s: float = 0.0  # in the open and by positions, in all
+    velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
+    mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
+    mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
+    held_s: float = 0.0  # total time in the open under position control
 
 
 def advance_reckoning(
@@ -123,13 +138,12 @@ def advance_reckoning(
     corrected: bool = False,
     pushed: bool = False,
 ) -> DeadReckoning:
-    """The reckoning one tick later.
+    """Return the reckoning one tick later.
 
-    `corrected`: positions have come lately, and correct the estimated velocity;
-    `believed`: the sample's estimated velocity is true, with `pushed` its vertical part only: what
-    pushes a vehicle sideways, the firmware's estimator does not see until a position corrects it;
-    `diverged`: that velocity may be in other axes, so the reckoned velocity is kept even after a
-    silence.
+    `corrected`: positions have arrived recently and correct the estimated velocity. `believed`: the
+    sample's estimated velocity is correct. With `pushed`, only its vertical part is: the firmware's
+    estimator does not see a lateral push until a position corrects it. `diverged`: the estimated
+    velocity may be in wrong axes, so the reckoned velocity is kept even after a silence.
     """
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
@@ -147,8 +161,9 @@ def advance_reckoning(
 def _begin_anew(
     old: DeadReckoning, imu: ImuMotion, estimated: Vector, *, believed: bool, diverged: bool
 ) -> DeadReckoning:
-    """The reckoning at the first sample, after a silence, or while the attitude stands still: the
-    velocity is the estimate's, or what the estimate has gained since."""
+    """Return the reckoning at the first sample, after a silence, or while the attitude is frozen.
+    The velocity is the estimated one if believed; otherwise it changes by as much as the estimate
+    has since."""
     velocity_mps = estimated if believed else ZERO
     if diverged:
         vx, vy, vz = old.velocity_mps
@@ -172,7 +187,8 @@ def _begin_anew(
     if old.imu is None:
         return unknown
     if imu.silent_s > old.imu.t_s:
-        # Not with motors that were off around the silence, nor started anew.
+        # Motors that were off on both sides of the silence, or a restarted vehicle, cannot have
+        # climbed under power.
         off = old.imu.off_s <= old.imu.t_s and imu.off_s <= imu.t_s
         flew = not (off or imu.started_s > old.imu.t_s)
         climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
@@ -200,7 +216,7 @@ def _carry_on(
     corrected: bool,
     pushed: bool,
 ) -> DeadReckoning:
-    """The reckoning one sample after `before`, by the equations above."""
+    """Return the reckoning one sample after `before`, by the equations in the module docstring."""
     estimated, dt_s = sample.velocity_mps, imu.t_s - before.t_s
     if not dt_s > 0.0:
         return old
@@ -259,13 +275,13 @@ def _carry_on(
 
 
 def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> DeadReckoning:
-    """The reckoning with the bias of the estimated velocity, from two samples of a flight in which
-    positions hold the vehicle in the open.
+    """Return the reckoning with the bias of the estimated velocity learned from two samples, during
+    a flight in the open under position control.
 
-    In a steady wind the firmware takes the air's drag for a tilt, and its estimate reads up to
-    0.4 m/s while the vehicle stands still in the air. The bias is the estimated velocity less what
-    the estimated position moves by, both through the same low pass. It is wrong for some
-    `VELOCITY_MEMORY_S` after the wind has changed.
+    In a steady wind, the firmware takes the drag of the air for a tilt, and its estimate reads up
+    to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
+    velocity of the estimated position, both through the same low-pass filter. It is wrong for about
+    `VELOCITY_MEMORY_S` after a change of the wind.
     """
     dt_s = new.t_s - last.t_s
     if not 0.0 < dt_s <= GAP_S:
@@ -292,9 +308,9 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
 def learn_bias_at_rest(
     old: DeadReckoning, before: ImuMotion | None, now: ImuMotion
 ) -> DeadReckoning:
-    """The reckoning of a vehicle that something holds still: all acceleration sideways between the
-    two motions is bias. The attitude's error, and the bias with it, changes within a second there,
-    since the wind that the estimate has taken for a tilt no longer moves the vehicle."""
+    """Return the reckoning for a vehicle that is held still: all lateral acceleration between the
+    two motions is bias. The attitude error, and the bias with it, changes within a second after the
+    contact, since the wind that the estimate has taken for a tilt no longer moves the vehicle."""
     if before is None or not 0.0 < now.t_s - before.t_s <= GAP_S or now.silent_s > before.t_s:
         return old
     dt_s = now.t_s - before.t_s
@@ -306,20 +322,21 @@ def learn_bias_at_rest(
 
 
 def forget_means(old: DeadReckoning) -> DeadReckoning:
-    """The reckoning after a time in which the velocity's bias could not be learned: the bias stays,
-    and the means begin anew."""
+    """Return the reckoning after an interruption of the velocity-bias learning: the bias is kept,
+    and the low-pass filters restart."""
     return old if old.mean_position_m is None else replace(old, mean_position_m=None)
 
 
 def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """The reckoning with its bias corrected for an attitude that wrong positions have tilted."""
+    """Return the reckoning with its bias corrected for the tilt error due to wrong positions."""
     (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
     return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
 
 def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) -> DeadReckoning:
-    """The reckoning with one more step of the estimated position: the part of the way between two
-    samples that the velocity does not explain. After a gap in the samples no step is added."""
+    """Return the reckoning with one more step of the estimated position: the part of its motion
+    between two samples that the velocity does not explain. After a gap in the samples, no step is
+    added."""
     dt_s = _position_s(sample) - _position_s(last)
     if not 0.0 < dt_s <= UNSEEN_S:
         return old
@@ -336,14 +353,15 @@ def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) ->
 
 
 def _position_s(sample: Telemetry) -> float:
-    """Time of the position, carried on by at most `CARRIED_S`."""
+    """Return the time of the sample's position; a lag of up to `CARRIED_S` counts as none."""
     return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
 def add_sighting(
     old: DeadReckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
 ) -> DeadReckoning:
-    """The reckoning restarted at a sight; `aside_m` +- `sigma_m`: world x, y, gear to target."""
+    """Return the reckoning restarted at a sighting: `aside_m` (world x, y) with the standard
+    deviation `sigma_m`, and `below_m`, are the offset from the gear to the target."""
     return replace(
         old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
     )

@@ -1,4 +1,4 @@
-"""The target as it is believed: in the world, and from the gear."""
+"""The belief about the target: its position in the world and relative to the gear."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ from perchctl.values import replace
 from perchctl.vision import TargetEstimate
 
 FAR_BELOW_M = 0.5
-"""A target this far above the gear does not hold the vehicle. Larger: what has fallen off seems to
-hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to hold."""
+"""Height above the gear beyond which the target cannot hold the vehicle, m. Larger: a vehicle that
+has fallen off seems to hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to
+hold."""
 SEEN_MEMORY_S = 0.1
-"""Time constant of the low pass of the velocity by pictures. Larger: a descent by it swings.
-Smaller: the noise of single detections moves the vehicle."""
+"""Time constant of the low-pass filter on the velocity from pictures, s. Larger: a descent with
+that velocity oscillates. Smaller: the noise of single detections moves the vehicle."""
 SEEN_GAP_S = 1.0
-"""Longest time between two detections whose difference is a velocity. Larger: a motion that is over
-counts. Smaller: a few lost pictures leave it unknown."""
+"""Longest time between two detections from which a velocity is computed, s. Larger: a motion that
+has ended still counts. Smaller: a few lost pictures leave the velocity unknown."""
 LEAST_SEEN_S = 0.3
-"""Time for which the target has to be detected until its motion counts. Smaller: the low pass has
-not settled yet."""
+"""Time for which the target must be detected before the velocity is used, s. Smaller: the low-pass
+filter has not settled."""
 MOST_SEEN_MPS = 1.5
-"""Largest velocity between two detections; more is a step of the pose. Larger: such a step counts
-as motion. Smaller: a fast motion goes unseen."""
+"""Largest velocity between two detections, m/s; a larger one is a step of the pose. Larger: a step
+counts as motion. Smaller: a fast motion is ignored."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TargetBelief:
-    """Where the target is. Everything is unknown until it was seen once.
+    """Position of the target. Every value is unknown until the first measurement.
 
     Attributes:
-        world_m, world_yaw_rad: position in the world of the state estimate, (3,), and heading; None
-            while unknown.
-        error_xy_m, error_z_m, error_yaw_rad: from the gear to the target, in the level frame;
+        world_m, world_yaw_rad: position (3,) in the world frame of the state estimate, and heading;
+            None while unknown.
+        error_xy_m, error_z_m, error_yaw_rad: offset from the gear to the target in the level frame;
             infinite while unknown.
         contact_goal_z_m: height of the body at which the gear touches the target.
-        age_s: time since the exposure of the last frame in which it was measured.
-        is_tracked: it is seen, or coasts within the filter's n_max frames.
-        is_fresh: it was measured as lately as the latency allows; `is_small_fresh`: so was the
-            small marker.
+        age_s: time since the exposure of the last frame that measured the target.
+        is_tracked: the target is visible, or the filter coasts for at most n_max frames.
+        is_fresh: the last measurement is as recent as the latency allows.
+        is_small_fresh: the last measurement of the small marker is as recent as the latency allows.
     """
 
     world_m: Array | None = None
@@ -57,15 +58,15 @@ class TargetBelief:
 
     @property
     def is_far_above(self) -> bool:
-        """True if the camera sees the target too far above to hold the vehicle."""
+        """True if the camera sees the target so far above that it cannot hold the vehicle."""
         return self.world_m is not None and self.error_z_m > FAR_BELOW_M
 
     @classmethod
     def of(
         cls, target: TargetEstimate | None, t_s: float, latency_s: float, profile: Profile
     ) -> TargetBelief:
-        """The belief at `t_s` by the pipeline's estimate, whose pictures are `latency_s` old when
-        they arrive."""
+        """Return the belief at `t_s` from the pipeline's estimate; `latency_s` is the age of a
+        picture on arrival."""
         if target is None:
             return cls()
         goal_z_m = math.inf
@@ -89,18 +90,19 @@ class TargetBelief:
 
 @dataclass(frozen=True)
 class TargetMotion:
-    """The vehicle's velocity by pictures of a target that stands still, for want of telemetry.
+    """The vehicle's velocity from pictures of a stationary target, for use without telemetry.
 
     The vehicle moves by -de/dt, where e is the target's position from the gear in the level frame;
-    a first-order low pass smooths it. Only roll and pitch, which level e, come from telemetry: old
-    ones add e_z dphi/dt sideways while the vehicle tilts, and little vertically. The velocity is
-    wrong if the target moves, and sideways if the camera is mounted otherwise than assumed.
+    a first-order low-pass filter smooths it. Only roll and pitch, which level e, come from the
+    telemetry: old ones add e_z dphi/dt to the lateral velocity while the vehicle tilts, and little
+    to the vertical one. The velocity is wrong if the target moves; its lateral part is wrong if the
+    camera's mounting differs from the profile.
 
     Attributes:
         t_s: exposure of the newest detection.
-        since_s: exposure of the first in a row without a gap.
-        e_m: the newest position of the target, (ahead, left, up).
-        velocity_mps: of the vehicle, (ahead, left, up).
+        since_s: exposure of the first detection after the last gap.
+        e_m: newest position of the target from the gear (ahead, left, up), m.
+        velocity_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
     t_s: float = -math.inf
@@ -110,11 +112,11 @@ class TargetMotion:
 
     @property
     def is_known(self) -> bool:
-        """True if the target was detected for long enough to tell the velocity."""
+        """True if the target was detected for long enough to determine the velocity."""
         return self.t_s - self.since_s >= LEAST_SEEN_S
 
     def with_detection(self, target: TargetEstimate) -> TargetMotion:
-        """The motion after a frame that measured the target."""
+        """Return the motion after a frame that measured the target."""
         x_m, y_m, z_m = (float(v) for v in target.e_m)
         e_m, t_s = (x_m, y_m, z_m), target.measured_s
         dt_s = t_s - self.t_s

@@ -16,20 +16,20 @@ from dataclasses import dataclass
 from perchctl.values import replace
 
 LEAST_POSITION_THRUST = 20000
-"""The least thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
+"""Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
 THRUST_NOISE = 0.02
-"""Standard deviation, as a share, of measurements averaged over one second: position control varies
-the thrust by 1 to 2 % for half a second. Larger: a sagging battery is followed late. Smaller: these
-variations are learned."""
+"""Standard deviation, as a share, of measurements averaged over one second; position control varies
+the thrust by 1 to 2 % for half a second. Larger: the filter follows a sagging battery late.
+Smaller: the filter learns these variations."""
 OPEN_DRIFT = 0.01
 """Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
-a lasting push is learned. Smaller: a sagging battery is followed late."""
+the filter learns a lasting push. Smaller: it follows a sagging battery late."""
 FELT_SIGMA = 0.03
-"""Standard deviation, as a share, of an estimate by the accelerometer in flight, from its scale
-error. Larger: early quiet flight, just after take-off, counts more. Smaller: it counts less."""
+"""Standard deviation, as a share, of an estimate from the accelerometer in flight, due to its scale
+error. Larger: early quiet flight, just after take-off, has more weight. Smaller: it has less."""
 ROUGH_SIGMA = 0.05
-"""Standard deviation, as a share, above which the estimate is too rough to descend without
-telemetry. Larger: the vehicle comes down too fast. Smaller: it waits in the air for longer."""
+"""Standard deviation, as a share, above which the estimate is too rough for a descent without
+telemetry. Larger: the vehicle descends too fast. Smaller: it waits in the air for longer."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class HoverThrust:
 
     @property
     def is_rough(self) -> bool:
-        """True if neither quiet flight nor a descent has measured it well enough."""
+        """True if neither quiet flight nor a descent has measured the hover thrust well enough."""
         return self.sigma > ROUGH_SIGMA
 
     def after(self, dt_s: float, drift: float) -> HoverThrust:
@@ -56,13 +56,13 @@ class HoverThrust:
         return replace(self, sigma=math.sqrt(self.sigma**2 + drift**2 * dt_s))
 
     def aged(self, dt_s: float) -> HoverThrust:
-        """Return the estimate `dt_s` later without a measurement. The standard deviation grows, at
+        """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
         most to that of the accelerometer's estimate, which is always available in flight."""
         sigma = self.after(dt_s, OPEN_DRIFT).sigma
         return replace(self, sigma=min(sigma, max(self.sigma, FELT_SIGMA)))
 
     def with_measured(self, thrust: float, dt_s: float) -> HoverThrust:
-        """Return the estimate after a measurement that stands for `dt_s`, or the same for 0."""
+        """Return the estimate after a measurement of weight `dt_s`, in seconds; unchanged for 0."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma):

@@ -1,15 +1,15 @@
-"""The belief one tick later: `update_belief(belief, observation, sent, profile)`.
+"""Compute the belief one tick later: `update_belief(belief, observation, sent, profile)`.
 
     observation ──> target, gaps, jumps, heading, thrust
                                     │
                                     v
-                  dead reckoning ──> place under the target, magnet's reach
+                  dead reckoning ──> offset from the target, magnet's reach
                                     │
                                     v
-                  conditions since when ──> hover thrust, battery, mounting
+                  start times of conditions ──> hover thrust, battery, mounting
 
-Conditions are judged by the hover thrust of the tick before, so that a press cannot teach the
-reference by which it is proven.
+Conditions use the hover thrust of the previous tick, so that a press cannot change the reference
+that proves it.
 """
 
 from __future__ import annotations
@@ -57,24 +57,25 @@ from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawTh
 CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions of the belief."""
 CARRIED_WITHIN_M = 0.3
-"""What carries the vehicle so near below the target is the target."""
+"""Distance below the target within which any support is the target, m."""
 AT_REST_S = 0.3
-"""Time for which a vehicle at its contact has to be still to count as at rest."""
+"""Time for which a vehicle at its contact must be still to count as at rest, s."""
 MOST_LEARNED_S = 0.1
-"""Time since the sample before that one sample stands for at most. Larger: after a gap a single
-sample counts as much as a second of them."""
+"""Largest weight of one sample in the hover-thrust filter, s. Larger: after a gap, a single sample
+has the weight of many."""
 UNANSWERED_PART = 0.12
-"""Share of full thrust by which order and reading may differ: no ramp leads farther."""
+"""Difference between ordered and reported thrust that no ramp causes, as a share of full thrust."""
 STILL_THRUST = 1000
-"""Raw thrust on which the motors stand still and the stream of setpoints lives on."""
+"""Raw thrust below which the motors stand still while the setpoint watchdog stays satisfied."""
 SPREAD_KEEPS = 0.9
-"""Share of the target's spread that a frame keeps."""
+"""Share of the target's spread that remains after each frame."""
 
 
 def update_belief(belief: Belief, obs: Observation, sent: Sent, profile: Profile) -> Belief:
-    """The belief after one more observation; `sent`: what the planner has ordered until then.
+    """Return the belief after one more observation; `sent` holds the planner's orders so far.
 
-    Wrong for some seconds where the observation is: each part says what it rests on.
+    A wrong observation makes the belief wrong for some seconds; each part documents the data it
+    depends on.
     """
     b = replace(belief, obs=obs, profile=profile, sent=sent, shift_m=ZERO)
     b = _see_target(b)
@@ -95,12 +96,12 @@ def update_belief(belief: Belief, obs: Observation, sent: Sent, profile: Profile
 
 
 def has_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
-    """True if nothing was decided for longer than a position may be missing."""
+    """True if the planner has not run for longer than a position may be missing."""
     return belief.last is not None and obs.t_s - belief.t_s > profile.positioning.hold_s
 
 
 def give_up_position(b: Belief) -> Belief:
-    """The belief from which on only accelerometer and attitude are used, for good."""
+    """Return the belief that, permanently, uses only accelerometer and attitude."""
     return replace(
         b,
         dead_reckoned_s=b.obs.t_s,
@@ -110,24 +111,25 @@ def give_up_position(b: Belief) -> Belief:
 
 
 def forget_evidence(b: Belief) -> Belief:
-    """The belief after a change of maneuver: what has held until now begins anew, but what is the
-    vehicle's own."""
+    """Return the belief after a change of maneuver: all conditions restart, except for those that
+    last."""
     return replace(b, since=lasting(b.since))
 
 
 def after_command(b: Belief, command: Command) -> Belief:
-    """The belief once a command was sent: a setpoint ends what a raw thrust has left unanswered."""
+    """Return the belief after a command was sent. A setpoint ends the comparison with a raw
+    thrust."""
     if isinstance(command, (RawThrust, Idle)):
         return b
     return replace(b, unanswered_s=None)
 
 
-# --- What the observation shows at once ---
+# --- Direct consequences of the observation ---
 
 
 def _see_target(b: Belief) -> Belief:
-    """The belief with the target's place at a frame that measured it, its spread, and the motion
-    that pictures show."""
+    """Return the belief with the target's position and spread, and the velocity from pictures,
+    after a frame that measured the target."""
     target = b.obs.target
     if not b.obs.new_frame or target is None or not target.measured:
         return b
@@ -142,21 +144,22 @@ def _see_target(b: Belief) -> Belief:
 
 
 def _after_gap(b: Belief) -> Belief:
-    """The belief after a time in which nothing was decided: evidence begins anew."""
+    """Return the belief after a gap in which the planner did not run: all conditions restart."""
     imu = b.obs.imu
     kept: dict[Condition[Any], float] = lasting(b.since)
     off_s = max(imu.off_s, imu.silent_s)
     if DOWN in b.since and math.isfinite(off_s):
-        # All samples of the hang have come, and in none do the motors turn: else a loop that
-        # hangs in every turn would never see a landing end.
+        # All samples from the gap have arrived, and the motors are off in each. Without this
+        # exception, a loop with a gap in every tick would never see the end of a landing.
         kept[DOWN] = max(off_s, b.since[DOWN])
     return replace(b, since=kept, stale_s=b.obs.t_s if b.by_target else b.stale_s)
 
 
 def _move_with_estimate(b: Belief) -> Belief:
-    """The estimate's world has moved, the vehicle has not: ground, contact and all that is
-    remembered move with it. Not where samples are missing before the step, since the vehicle may
-    have moved, nor where external positions have come again and the step ends a drift."""
+    """Return the belief after a jump of the estimate's world frame, which has not moved the
+    vehicle. Ground, contact and all other remembered positions move with the frame. They stay if
+    samples are missing before the jump, since the vehicle may have moved, or if external positions
+    have just returned and the jump ends a drift."""
     obs, last = b.obs, b.last
     jump_s = obs.t_s if b.jump_s is None else b.jump_s
     if last is None:
@@ -190,7 +193,8 @@ def _moved(place_m: Vector, by_m: Vector) -> Vector:
 
 
 def _compare_thrust(b: Belief) -> Belief:
-    """The belief with since when the measured thrust differs from an ordered raw thrust."""
+    """Return the belief with the time since which the reported thrust differs from an ordered
+    one."""
     order = b.sent.raw_thrust
     if order is None:
         return b
@@ -205,8 +209,8 @@ def _compare_thrust(b: Belief) -> Belief:
 
 
 def _reckon(b: Belief) -> Belief:
-    """The belief with the reckoning one tick later, and what follows from it: the time in the
-    magnet's reach, and the height of a vehicle without a position."""
+    """Return the belief with the reckoning one tick later, the time within the magnet's reach, and
+    the height of a vehicle without a position."""
     new = _carried_on(b)
     new = _at_rest_on_contact(b, new)
     new = _by_pictures(b, new)
@@ -221,7 +225,7 @@ def _reckon(b: Belief) -> Belief:
 
 
 def _carried_on(b: Belief) -> DeadReckoning:
-    """By accelerometer and estimate, with the biases that positions in the open teach."""
+    """Integrate accelerometer and estimate, and learn biases from positions in the open."""
     obs, source = b.obs, b.profile.positioning.source
     believed = b.position_valid and b.proves and b.dead_reckoned_s is None and b.jump_s is None
     new = advance_reckoning(
@@ -231,7 +235,7 @@ def _carried_on(b: Belief) -> DeadReckoning:
         believed=believed,
         diverged=b.diverged and not source.is_target,
         corrected=b.is_corrected,
-        # What moves it while no sighting corrects its estimate is no bias of the accelerometer.
+        # A motion that no sighting has corrected yet is not a bias of the accelerometer.
         pushed=source.is_target and not b.is_corrected,
     )
     in_the_open = b.sent.maneuver.in_the_open and b.height_m > STANDING_BELOW_M
@@ -245,7 +249,7 @@ def _carried_on(b: Belief) -> DeadReckoning:
 
 
 def _at_rest_on_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """At its contact, a vehicle that was steady for a while does not move."""
+    """Set the velocity to zero for a vehicle that has been steady at its contact."""
     obs = b.obs
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if b.contact_z_m is None or not new.below_m < MAGNET_REACH_M or not rests:
@@ -255,18 +259,18 @@ def _at_rest_on_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
     new = replace(new, velocity_mps=(x_mps, y_mps, 0.0) if blown else (0.0, 0.0, 0.0))
     if not blown:
         new = learn_bias_at_rest(new, b.reckoning.imu, obs.imu)
-    if obs.telemetry.thrust < 1:  # it hangs, and what hangs stays where it is
+    if obs.telemetry.thrust < 1:  # a hanging vehicle stays in place
         old = b.reckoning
         new = replace(new, aside_m=old.aside_m, aside_sigma_m=old.aside_sigma_m)
     return new
 
 
 def _by_pictures(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """With the velocity on which pictures and accelerometer agreed, once it is new."""
+    """Adopt the velocity on which pictures and accelerometer agree, once per new result."""
     felt, before = b.obs.felt, b.reckoning.imu
     if felt is None or not (before is None or felt.t_s > before.t_s):
         return new
-    # Late pictures have led the estimate's height astray, too.
+    # Late pictures make the estimated height diverge, too.
     climb_mps = felt.climb_mps if b.mismatch.later_s != 0.0 else None
     climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
     return replace(
@@ -277,8 +281,8 @@ def _by_pictures(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _with_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Restarted at a frame that measured the target; by deck or motion capture at each tick, by the
-    target's place in the world."""
+    """Restart at a frame that measured the target; with a deck or motion capture, also in each
+    tick, from the target's position in the world."""
     obs, target = b.obs, b.obs.target
     if target is None:
         return new
@@ -298,8 +302,8 @@ def _with_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _carried_at_target(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """By the target alone: what carries it near below the target is the target; late pictures show
-    it lower."""
+    """Correct the height with the target alone: a support just below the target is the target. Late
+    pictures make the vehicle seem lower."""
     near = b.by_target and not b.sent.maneuver.descends and new.below_m < CARRIED_WITHIN_M
     if not near or b.held_s(CARRIED) < b.profile.planner.perch.contact_dwell_s:
         return new
@@ -312,21 +316,23 @@ def _carried_at_target(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _reach_s(b: Belief, new: DeadReckoning) -> float | None:
-    """Since when the magnet may hold the vehicle."""
+    """Return the time since which the magnet may hold the vehicle."""
     reach_s = b.reach_s
-    if not b.sent.is_motor_borne:  # what is released or stopped moves no more
+    # a released or stopped vehicle does not move into or out of reach
+    if not b.sent.is_motor_borne:
         return reach_s
-    # After the floor was touched nothing climbs, whatever was reckoned since.
+    # A vehicle that has touched the floor does not climb, whatever the reckoning says.
     near = new.below_m < MAGNET_REACH_M and b.sent.floor_felt_s is None
     if b.contact_z_m is None and not near:
         return None
-    # Caught below the magnet it may be drawn to it again: an earlier fall proves nothing then.
+    # A vehicle caught below the magnet may be drawn to it again, so an earlier fall proves nothing.
     again = reach_s is not None and b.imu.fell_s > reach_s and new.below_m < MAGNET_REACH_M
     return b.obs.t_s if reach_s is None or again else reach_s
 
 
 def _climbed_m(b: Belief, new: DeadReckoning) -> float:
-    """The way up since the tick before of a vehicle without a position; 0 with one."""
+    """Return the climb since the previous tick of a vehicle without a position, m; 0 with a
+    position."""
     obs, before, last = b.obs, b.reckoning.imu, b.last
     if b.dead_reckoned_s is None or before is None:
         return 0.0
@@ -338,20 +344,20 @@ def _climbed_m(b: Belief, new: DeadReckoning) -> float:
     return new.velocity_mps[2] * dt_s
 
 
-# --- Evidence, and what is learned ---
+# --- Evidence and learning ---
 
 
 def _learn(b: Belief) -> Belief:
-    """The belief with its evidence, and with hover thrust, battery and mounting after the tick."""
+    """Return the belief with its conditions, hover thrust, battery and mounting after the tick."""
     obs, maneuver = b.obs, b.sent.maneuver
     held = bool(hold_reason(b, maneuver))
     fresh = [each for each in CONDITIONS if counts(b, each)]
     since: dict[Condition[Any], float] = update_since(b.since, fresh, b, obs.t_s)
     if held:
-        since = lasting(since)  # a held vehicle proves nothing
+        since = lasting(since)  # a hold interrupts the evidence
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last is None else b.last.t_s
-    sample_s = max(0.0, min(MOST_LEARNED_S, obs.telemetry.t_s - last_s))  # 0: nothing new
+    sample_s = max(0.0, min(MOST_LEARNED_S, obs.telemetry.t_s - last_s))  # 0: no new sample
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.nears_target or b.target.error_z_m > near_m
     b = replace(b, hover=b.hover.aged(dt_s), lagged_thrust=hover.lagged_thrust(b, sample_s))
