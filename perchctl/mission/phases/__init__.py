@@ -1,1 +1,1 @@
-"""The phases of a mission, one file each: entry, action, exits, and their constants."""
+"""The phases of a mission: one module each, with its entry, action, exits and constants."""

@@ -1,4 +1,4 @@
-"""Phase 4, ALIGN: move under the target at one height, and turn like it."""
+"""Phase 4, ALIGN: move under the target at constant height, and turn to its heading."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ ALIGNED = Condition[Context](
 
 
 def act(c: Context) -> Action:
-    """Move under the target at the height of the setpoint."""
+    """Move under the target at the setpoint's height."""
     return fly_under_target(c, (c.state.setpoint or hold_here(c)).z_m)
 
 
 def is_aligned(c: Context) -> bool:
-    """True once the vehicle has been aligned for long enough."""
+    """True once the vehicle has been aligned for `align.dwell_s`."""
     return c.held_s(ALIGNED) >= c.planner.align.dwell_s
 
 
 def lacks_charge_to_begin(c: Context) -> bool:
-    """True if an attempt or a retry is due, and the battery has not enough charge for it."""
+    """True if an attempt or a retry is about to begin and the battery has too little charge for
+    it."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
     return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
 

@@ -1,4 +1,4 @@
-"""Phase 1, APPROACH: take off and rise to the height from which the target is looked for."""
+"""Phase 1, APPROACH: take off and climb to the height at which the search begins."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
 LIFT_ABOVE_M = 0.1
-"""Height below which the vehicle may still stand: there the height is not corrected. Larger: a
-heavy vehicle hangs near the ground for longer. Smaller: what still stands jumps."""
+"""Height below which the vehicle may still stand on the ground, m; the height is not corrected
+there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
+stands jumps up."""
 APPROACH_PART = 0.7
-"""Share of the take-off height above which it flies to `planner.approach_xy_m`."""
+"""Share of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
 AT_HEIGHT_PART = 0.8
 """Share of the take-off height that counts as reached."""
 AT_HEIGHT_MPS = 0.25
-"""Speed up to which it hovers."""
+"""Largest speed that counts as hovering, m/s."""
 AT_HEIGHT_S = 0.3
-"""Time for which it has to hover."""
+"""Time for which the vehicle must hover, s."""
 
 AT_TAKEOFF_HEIGHT = Condition[Context](
     "at take-off height",
@@ -34,7 +35,7 @@ AT_TAKEOFF_HEIGHT = Condition[Context](
 
 
 def act(c: Context) -> Action:
-    """Rise from the ground on position setpoints, without which the firmware levels out."""
+    """Climb on position setpoints, so that the firmware levels the vehicle out if they stop."""
     planner, state, b = c.planner, c.state, c.belief
     assert b.ground_m is not None
     x, y, z = b.ground_m

@@ -1,4 +1,4 @@
-"""Phase 5, ASCEND: climb inside a cone under the target, and settle at the stand-off."""
+"""Phase 5, ASCEND: climb inside a cone below the target, and settle at the stand-off."""
 
 from __future__ import annotations
 
@@ -15,28 +15,31 @@ from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
 CLIMB_WITHIN = 0.7
-"""Share of the cone inside which it climbs. Larger: it leaves the cone and goes back to align."""
+"""Share of the cone's radius within which the vehicle climbs. Larger: it leaves the cone and
+returns to ALIGN."""
 MOST_LAG_M = 0.15
-"""The most that the setpoint is above the vehicle while it climbs. Larger: a weak vehicle is sent
-far above where it is."""
+"""Largest height of the setpoint above the vehicle during the climb, m. Larger: the setpoint runs
+far ahead of a weak vehicle."""
 LEAST_CLIMB_MPS = 0.02
-"""Speed at which the setpoint closes in on the stand-off."""
+"""Speed with which the setpoint approaches the stand-off, m/s."""
 
 
 def cone_m(c: Context) -> float:
-    """How far from the target's axis an ascent may be at the present height."""
+    """Return the radius of the cone at the present height, m: the largest offset from the target's
+    axis."""
     ascend = c.planner.ascend
     return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.error_z_m)
 
 
 def is_near_standoff(c: Context) -> bool:
-    """True if the gear is at the height at which an ascent settles."""
+    """True if the gear has reached the height at which the ascent settles."""
     ascend = c.planner.ascend
     return c.belief.target.error_z_m <= ascend.standoff_m + ascend.settle_z_m
 
 
 def _is_settled(c: Context) -> bool:
-    """True if it is slow under the target at the stand-off, by the small marker (fault 33)."""
+    """True if the vehicle is slow and below the target at the stand-off, by the small marker (fault
+    33)."""
     ascend, target = c.planner.ascend, c.belief.target
     return (
         target.is_fresh
@@ -55,13 +58,14 @@ SETTLED = Condition[Context]("settled", _is_settled)
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """A target that was aligned with is searched for from the beginning if it is lost."""
+    """Reset the search: if the aligned target is lost later, the search starts from the
+    beginning."""
     del before
     return replace(state, searched_places=0)
 
 
 def act(c: Context) -> Action:
-    """Climb only with a fresh target and well inside the cone; slower near the target."""
+    """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
     goal_z = target.contact_goal_z_m - ascend.standoff_m

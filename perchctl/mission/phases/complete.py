@@ -1,4 +1,5 @@
-"""Phase 7, COMPLETE: put the weight on the magnet, stop the motors, and watch."""
+"""Phase 7, COMPLETE: transfer the weight to the magnet, stop the motors, and monitor the
+vehicle."""
 
 from __future__ import annotations
 
@@ -20,14 +21,14 @@ from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
 OFF_S = 0.1
-"""Telemetry must show the motors off for this long before they count as off. Smaller: one wrong
-sample ends the flight. Larger: it ends later."""
+"""Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
+sample ends the flight. Larger: the flight ends later."""
 UNSTOPPED_S = 10.0
-"""Time beyond the watch after which motors whose thrust still reads are given up."""
+"""Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """The magnet holds it from here on, as far from the centre as the touch was."""
+    """Record the contact: the magnet holds the vehicle here, at the offset of the last touch."""
     belief = replace(
         state.belief,
         contact_z_m=before.telemetry.position_m[2],
@@ -37,7 +38,8 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """Release in two stages; stop the motors once the whole weight hangs; watch."""
+    """Release in two stages, stop the motors once the whole weight hangs, and monitor the
+    vehicle."""
     if c.state.stopped_s is not None:
         return stop_motors(c)
     holds = c.held_s(MAGNET_HOLDS) >= c.planner.complete.hold_dwell_s
@@ -45,12 +47,12 @@ def act(c: Context) -> Action:
 
 
 def stopped_for_s(c: Context) -> float:
-    """Seconds since the first order to stop the motors; -1 before that order."""
+    """Seconds since the first order to stop the motors; -1 before it."""
     return -1.0 if c.state.stopped_s is None else c.t_s - c.state.stopped_s
 
 
 def release_monitored(c: Context) -> bool:
-    """True if the motors have been off for as long as a perched vehicle is monitored."""
+    """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
     return stopped_for_s(c) >= c.planner.complete.watch_s and c.held_s(DOWN) >= OFF_S
 
 

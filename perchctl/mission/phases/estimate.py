@@ -1,4 +1,4 @@
-"""Phase 3, ESTIMATE: stay and look until the target's pose has settled."""
+"""Phase 3, ESTIMATE: hold the position and observe until the target's pose has settled."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from perchctl.mission.setpoints import Action, fly_to, hold_here
 from perchctl.mission.transition import Transition
 
 UNTRACKED_S = 1.0
-"""Time without the target after which it is searched for again."""
+"""Time without the target after which the search restarts, s."""
 
 UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
 ESTIMATED = Condition[Context](
@@ -21,7 +21,7 @@ ESTIMATED = Condition[Context](
 
 
 def act(c: Context) -> Action:
-    """Stay where it is."""
+    """Hold the setpoint."""
     return fly_to(c, c.state.setpoint or hold_here(c))
 
 

@@ -1,4 +1,4 @@
-"""The three phases that are never left: PERCHED, LANDED, and ABORTED with its motor stop."""
+"""The three final phases: PERCHED, LANDED, and ABORTED with its motor stop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ def rest(c: Context) -> Action:
 
 
 def abort(c: Context) -> Action:
-    """The motor stop, once; what hangs with its motors still would be locked without one."""
+    """Stop the motors once; without a stop, the firmware would lock a vehicle that hangs with still
+    motors."""
     if c.state.orders:
         return c.state, Idle()
     ends = StopMotors() if motors_are_still(c) or is_landing_over(c) else Idle()

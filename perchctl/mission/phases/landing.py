@@ -1,4 +1,4 @@
-"""LANDING: the way down, by `perchctl.mission.descent`, until the vehicle rests with motors off."""
+"""LANDING: fly the descent (`perchctl.mission.descent`) until the vehicle rests with motors off."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
 OFF_S = 0.1
-"""Telemetry must show the motors off for this long before they count as off. Smaller: one wrong
-sample ends the flight. Larger: it ends later."""
+"""Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
+sample ends the flight. Larger: the flight ends later."""
 LOOKED_S = 2.0
-"""Time in which a target far above shows, after the motors are off."""
+"""Time after the motors are off in which the camera may still show the target far above, s."""
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """Begin the way down with what the transition claims of positions, mounting and contact."""
+    """Start the descent, using the transition's claims about positions, mounting and contact."""
     claims, b = state.entry.claims, state.belief
-    # The mounting may be right and the motion capture's axes wrong, by which the landing would
-    # speed up until it tilts over.
+    # The mounting may be right and the axes of the motion capture wrong. Position control would
+    # then accelerate the landing until the vehicle tips over.
     capture = b.profile.positioning.source.is_mocap and b.mounting.is_wrong
     if Claim.POSITIONS_WRONG in claims or (Claim.MOUNTING_WRONG in claims and capture):
         reckoning = b.reckoning if b.diverged else discount_wrong_positions(b.reckoning)
         b = replace(b, diverged=True, reckoning=reckoning)
     if before.state.phase is Phase.RECOVER and Claim.HANGS not in claims:
-        b = replace(b, contact=None)  # nothing was felt to hold it there
-    # With a wrong mounting the setpoint is ahead, in a wrong direction.
+        b = replace(b, contact=None)  # no evidence of a support at that position
+    # With a wrong mounting, the setpoint leads in a wrong direction.
     setpoint = None if Claim.MOUNTING_WRONG in claims else state.setpoint
     return enter_landing(replace(state, belief=b, setpoint=setpoint), before.state)
 
 
 def rests_as(rest: RestState) -> Predicate:
-    """The predicate that the motors are off and the vehicle is in this rest state."""
+    """Return the predicate that the motors are off and the vehicle is in the rest state `rest`."""
     return lambda c: c.held_s(DOWN) >= OFF_S and find_rest_state(c) is rest
 
 
 def unconfirmed_reason(c: Context) -> str:
-    """Text: why the landing could not be confirmed, as far as the telemetry shows."""
+    """Return why the landing could not be confirmed, as far as the telemetry shows."""
     age_s, proof_age_s = c.belief.attitude_age_s, c.safety.proof_age_s
     if age_s > FRESH_S:
         cause = f"the newest telemetry is {age_s:.1f} s old"
@@ -57,7 +57,7 @@ def unconfirmed_reason(c: Context) -> str:
 
 
 def _hung_outcome(before: Outcome | None) -> Outcome | None:
-    """A vehicle that hangs has found its target after all."""
+    """Return the outcome of a vehicle that hangs: it has found its target after all."""
     return Outcome.ATTEMPTS_USED_UP if before is Outcome.TARGET_NOT_FOUND else before
 
 

@@ -1,13 +1,13 @@
 """Phase 6, PERCH: press the gear against the target until a contact is proven.
 
-ASCEND hands over a vehicle that has settled at the stand-off; PERCH has no entry action of its own.
-The setpoint rises through the target, or raw thrust presses (`planner.perch` of the profile,
-`PerchConfig`). A contact is proven by
-position, acceleration and thrust together (`CONTACT` in `belief/contact.py`): within the magnet's
-radius it leads to COMPLETE, beside it to RECOVER. So do a push from the side, a press that goes on
-unseen for too long, and one that touches nothing in time; each of these counts as a failed attempt.
-The rows of `safety.py` come first, among them those for a magnet that catches early, and for
-something in the way. No hold applies here: a hold would leave the vehicle pressed (`hold_reason`).
+ASCEND ends with the vehicle settled at the stand-off; PERCH has no entry action of its own. The
+setpoint rises through the target, or raw thrust presses (`planner.perch` in the profile,
+`PerchConfig`). Position, acceleration and thrust together prove a contact (`CONTACT` in
+`belief/contact.py`). A contact within the magnet's radius leads to COMPLETE. A contact outside it
+leads to RECOVER, and so does a push from the side, a press that lasts too long without a sighting,
+or a press without contact; each of these is a failed attempt. The rows in `safety.py` come first,
+among them those for a magnet that catches early and for an obstacle. No hold applies in this phase
+because a hold would leave the vehicle pressed (`hold_reason`).
 """
 
 from __future__ import annotations
@@ -29,17 +29,18 @@ from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
 KNOCKED_S = 0.04
-"""Time for which it has to move aside: more than one sample of telemetry."""
+"""Time for which the vehicle must move laterally, s: more than one telemetry sample."""
 BLIND_PRESS_S = 1.25
-"""The last centimetres are flown unseen; by the target alone, by dead reckoning. Larger: it presses
-beside the magnet. Smaller: a covered marker ends attempts that would perch."""
+"""Longest press after the last sighting, s, since the last centimetres are flown without the target
+in view; with the target alone, by dead reckoning. Larger: the vehicle presses outside the magnet's
+radius. Smaller: a covered marker ends attempts that would succeed."""
 
 
 def act(c: Context) -> Action:
     """Raise the setpoint through the target while x, y and heading keep following it.
 
-    The learned trim is frozen and the height correction is off (`lift=False`): against the ceiling
-    both would wind up. In raw mode the thrust is ordered instead.
+    The learned trim is frozen and the height correction is off (`lift=False`) because both would
+    wind up against the ceiling. In raw mode, order the thrust instead.
     """
     perch, target = c.planner.perch, c.belief.target
     if perch.mode == "raw":
@@ -58,7 +59,7 @@ def is_in_contact(c: Context) -> bool:
 
 
 def contact_reason(c: Context) -> str:
-    """Text: by what the contact is proven, and where."""
+    """Return what proves the contact, and its offset."""
     by = "position, acceleration and thrust"
     if not c.belief.position_valid:
         by = f"acceleration and thrust, {position_loss_text(c.belief)}"
@@ -95,7 +96,8 @@ PERCH = PhaseDefinition(
             "pushed aside under the target",
         ),
         back_off_row(
-            # Not in time, or not before the next turn of a loop as late as this one.
+            # The timeout includes the loop's lateness, since the next tick may be as late as this
+            # one.
             "no-contact",
             {Phase.PERCH},
             lambda c: c.in_phase_s + c.obs.loop_late_s > c.planner.perch.timeout_s,

@@ -1,4 +1,4 @@
-"""RECOVER: after an attempt that failed, leave what was touched, and hold below it until steady."""
+"""RECOVER: after a failed attempt, leave the contact and hold below it until steady."""
 
 from __future__ import annotations
 
@@ -35,30 +35,31 @@ from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
 CARRIED_RATIO = 0.85
-"""Share of the hover thrust with which a vehicle that slips sinks slowly, and needs no catch."""
+"""Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
+catch."""
 RECOVER_CLEAR_M = 0.05
-"""So far below the contact, or half of the way down, it has left."""
+"""Distance below the contact at which the vehicle has left it, m; at most half of the descent."""
 SEEN_LATELY_S = 3.0
-"""Age of a target under which the vehicle is still moved."""
+"""Largest age of a sighting at which the vehicle still follows the target, s."""
 ATTEMPTS_SEEN_S = 0.5
-"""Time for which it recovers before the last attempt ends the flight."""
+"""Time that the vehicle recovers before the last failed attempt ends the flight, s."""
 RECOVER_DOWN_MPS = 10.0
-"""A speed limit that limits nothing: the setpoint is where it leads."""
+"""Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
 
 STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """Begin with what was touched, and with a catch if the vehicle falls."""
+    """Record the last touch, and prepare a catch if the vehicle falls."""
     old, b, claims = before.state, before.belief, state.entry.claims
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or Claim.BLOCKED in claims
-    # What the motors carry most of hardly falls.
+    # A vehicle whose motors carry most of its weight hardly falls.
     falls = Claim.SLIPPED in claims and thrust < CARRIED_RATIO * b.hover_thrust
     belief = replace(
         state.belief,
         contact=_touched(before, claims),
-        # In the magnet's reach until it is seen below.
+        # The vehicle counts as within the magnet's reach until its position is below.
         contact_z_m=z_m if touched else b.contact_z_m,
     )
     return replace(
@@ -72,22 +73,21 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 
 
 def _touched(before: Context, claims: Claim) -> ContactOffset | None:
-    """Where the gear touched something as the attempt ended; None if nothing is known of a
-    touch."""
+    """Return the gear's offset at the touch that ended the attempt; None if no touch is known."""
     old, b = before.state, before.belief
-    if Claim.STILL_ATTACHED in claims:  # the contact was proven, and nothing has come off
+    if Claim.STILL_ATTACHED in claims:  # the contact was proven, and the vehicle has not come off
         return b.contact
-    if old.phase is Phase.RECOVER:  # pressed again before it had left
+    if old.phase is Phase.RECOVER:  # pressed again before it left the contact
         return b.contact if b.contact_z_m is not None else None
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
-    carried = proven or b.held_s(CARRIED) >= 0.0  # which has that dwell in itself
+    carried = proven or b.held_s(CARRIED) >= 0.0  # `CARRIED` includes that dwell time
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
         return contact_offset(b)
     return None
 
 
 def act(c: Context) -> Action:
-    """Hold in the air `descend_m` below where the attempt ended, in position mode all along."""
+    """Hold `descend_m` below the position where the attempt ended, in position mode throughout."""
     if (caught := catch_slip(c)) is not None:
         return caught
     recover = c.planner.recover
@@ -96,7 +96,7 @@ def act(c: Context) -> Action:
     if away is not None:
         return state, away
     if state.catch_above_m is not None:
-        x, y, z = c.telemetry.position_m  # from where it sinks no more
+        x, y, z = c.telemetry.position_m  # position where the fall has stopped
         entry = replace(state.entry, position_m=(x, y, z + recover.descend_m))
         state = replace(state, catch_above_m=None, setpoint=None, entry=entry)
     z = state.entry.position_m[2] - recover.descend_m
@@ -114,14 +114,14 @@ def act(c: Context) -> Action:
 
 
 def has_recovered(c: Context) -> bool:
-    """True if the vehicle has been steady for long enough, away from its contact."""
+    """True if the vehicle has been steady for `recover.dwell_s`, away from its contact."""
     dwell_s = c.planner.recover.dwell_s
     steady = c.held_s(STEADY) >= dwell_s and c.in_phase_s >= dwell_s
     return steady and c.belief.contact_z_m is None
 
 
 def unsteady_reason(c: Context) -> str:
-    """Text: what kept a recovering vehicle from being steady, as it was seen; no cause is known."""
+    """Return which observations kept the vehicle from being steady; their cause is unknown."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"it moves at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.position_valid and setpoint is not None:

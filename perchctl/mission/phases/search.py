@@ -1,4 +1,4 @@
-"""Phase 2, SEARCH: wait for the target, then climb a step, turn a step and wait again."""
+"""Phase 2, SEARCH: wait for the target, then climb one step, turn one step and wait again."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
 BLOCKED_ROOM_M = 0.1
-"""Distance that a search keeps below what blocked it."""
+"""Distance that the search keeps below an obstacle, m."""
 WARY_M = 0.2
-"""Way sideways to a target that was seen, while nothing confirms the camera's mounting. Larger: a
-turned camera leads it farther astray."""
+"""Largest lateral distance flown to a target seen before, while the camera's mounting is
+unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:
-    """Search from where the vehicle was sent."""
+    """Start the search at the vehicle's last setpoint."""
     setpoint = before.state.setpoint
     if setpoint is None:
         return state
@@ -32,8 +32,8 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """Wait, climb a step, turn a step, wait again; never above the limit. A target that was seen
-    before is looked for from under it."""
+    """Wait, climb one step, turn one step and wait again, never above the height limit. Search for
+    a target that was seen before from below its position."""
     search, state, b = c.planner.search, c.state, c.belief
     ground_m = b.ground_m
     assert ground_m is not None
@@ -60,7 +60,8 @@ def act(c: Context) -> Action:
 def _not_far(
     mount: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
 ) -> tuple[float, float]:
-    """The goal, world x and y (m), cut to `WARY_M` from the last sighting, else from `start`."""
+    """Return the goal, world x and y (m), limited to `WARY_M` from the last sighting, else from
+    `start`."""
     if mount.sights:
         start = (mount.sights[-1].vehicle_m.real, mount.sights[-1].vehicle_m.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]
@@ -69,7 +70,7 @@ def _not_far(
 
 
 def not_found_reason(c: Context) -> str:
-    """Text: that the target was not found, and why as far as known."""
+    """Return that the target was not found, and why if known."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refused
     return f"{text}: {why}" if why else text
