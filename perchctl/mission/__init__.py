@@ -1,4 +1,4 @@
-"""The mission's seven phases and its descent, a pure function of state and observation."""
+"""The seven phases of the mission and its descent: pure functions of state and observation."""
 
 import lazy_loader
 

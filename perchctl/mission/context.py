@@ -1,4 +1,4 @@
-"""One tick as the decisions see it."""
+"""The argument of all decisions: belief and planner state in one tick."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from perchctl.vehicle import Telemetry
 
 
 class Context:
-    """What is believed and what was decided: the argument of all rows and actions.
+    """Belief and planner state in one tick; the argument of all rows and actions.
 
     Attributes:
-        state: what the planner has decided, `PlannerState`.
-        belief: what is believed of vehicle and target, `Belief`; all about position, motion,
-            contact and target is asked there.
-        obs, profile: the observation and the profile that the belief rests on; `planner` and
-            `safety` are its sections, `telemetry` is the newest sample.
+        state: the decisions of the planner so far, `PlannerState`.
+        belief: the belief about vehicle and target, `Belief`: position, motion, contact and target.
+        obs, profile: observation and profile on which the belief is based; `planner` and `safety`
+            are sections of the profile, and `telemetry` is the newest sample.
         t_s: time on the loop's clock.
     """
 
@@ -36,7 +35,7 @@ class Context:
 
     @property
     def in_phase_s(self) -> float:
-        """Time since the phase began."""
+        """Time since the phase began, s."""
         return self.t_s - self.state.entry.t_s
 
     def held_s(self, condition: Condition[Any]) -> float:

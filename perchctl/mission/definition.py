@@ -1,4 +1,4 @@
-"""What makes up a phase: its entry, its action, its exits and the conditions that these count."""
+"""Define a phase by its maneuver, entry, action, exits and conditions."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ from perchctl.mission.transition import Transition
 
 
 def enter_as_it_is(state: PlannerState, before: Context) -> PlannerState:
-    """The entry of a phase that begins with nothing of its own."""
+    """Enter a phase that needs no preparation."""
     del before
     return state
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhaseDefinition:
-    """A phase in one value.
+    """A phase of the mission.
 
     Attributes:
-        maneuver: what the vehicle is flown to do in it, as far as evidence depends on it.
-        enter: the state with what the phase begins with, from the state that has just entered it
-            and the tick before the transition. `state.entry.claims` are the transition's.
-        act: the phase's new state and command in each tick.
-        exits: its own rows, in their order; the rows that hold in many phases stand before them.
-        conditions: its own conditions, which its exits count.
+        maneuver: maneuver flown in this phase, as far as the evidence depends on it.
+        enter: function that prepares the phase. It takes the state that has just entered the phase
+            and the context of the tick before the transition, and returns the new state.
+            `state.entry.claims` are the claims of the transition.
+        act: function that returns the new state and the command of each tick.
+        exits: the phase's own rows in their order; rows for many phases come before them.
+        conditions: the phase's own conditions, whose dwell times its exits use.
     """
 
     phase: Phase

@@ -1,19 +1,20 @@
-"""The one way down: for the planner's LANDING, the watchdog of a silent loop, and the rescue.
+"""The only descent: for the planner's LANDING, the watchdog of a silent loop, and the rescue.
 
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
-A descent, a release or a motor stop that has begun is completed even if the evidence changes. What
-still comes down does it by one of four policies, chosen in `descend` by what is known and fresh,
-and by whether the magnet may hold the vehicle (the table of docs/mission.md):
+A descent, a release or a motor stop that has begun is completed even if the evidence changes. A
+vehicle that still descends uses one of four policies. `descend` chooses it by which data is known
+and fresh, and by whether the magnet may hold the vehicle (see the table in docs/mission.md):
 
 - by position setpoints, straight down;
-- level, by raw thrust on the vertical speed, without a position;
-- by the vehicle's own landing, near the ground or where height, stream or loop are doubtful;
-- peeled off the magnet by a setpoint below; if it does not let go, the weight is hung on it.
+- level, by raw thrust controlled by the vertical speed, without a position;
+- by the firmware's own landing, near the ground or if height, telemetry or loop are doubtful;
+- peeled off the magnet by a setpoint below; if the magnet does not let go, the weight is
+  transferred to it.
 
-Nothing here climbs but a catch. The vehicle's own landing follows a trajectory by its clock and
-then stops the motors, wherever it is by then: it is ordered only where a position shows the vehicle
-away from the ceiling.
+Only a catch climbs. The firmware's own landing follows a trajectory on its own clock and then stops
+the motors, wherever the vehicle is by then. It is therefore ordered only if a position shows the
+vehicle away from the ceiling.
 """
 
 from __future__ import annotations
@@ -71,48 +72,50 @@ MANEUVER = Maneuver(descends=True)
 
 # --- by setpoints, and off the magnet ---
 PEEL_BELOW_M = 0.35
-"""The most that a setpoint is below the vehicle. Larger: what comes off the magnet falls."""
+"""Largest distance of a setpoint below the vehicle, m. Larger: a vehicle that comes off the magnet
+falls."""
 PEEL_S = 4.0
-"""If the vehicle has not come off the magnet by then, it stops pulling and hangs its weight on it.
-Larger: it pulls for longer, and falls if the magnet lets go late."""
+"""Time after which a vehicle that has not come off the magnet stops pulling and transfers its
+weight to it, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go late."""
 DROPPING_MPS = -0.35
-"""Vertical speed of a vehicle that falls off the magnet while it is peeled off."""
+"""Vertical speed below which a vehicle is falling off the magnet while it peels off, m/s."""
 STOP_BELOW_M = 0.05
-"""Height below which a descent by thrust stands, if it does not move."""
+"""Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
 RESTS_MPS = 0.1
-"""Vertical speed up to which it does not. Larger: motors stop while it still climbs or sinks."""
+"""Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
+still climbs or sinks."""
 ON_FLOOR_S = 0.5
-"""Time for which a vehicle has to stand still before its motors are stopped."""
+"""Time for which a vehicle must stand still before its motors are stopped, s."""
 
-# --- by the vehicle's own landing ---
+# --- by the firmware's own landing ---
 REPEAT_ORDER_S = 0.3
-"""Time between orders. Without its notify an order is not flown (docs/firmware.md, "Order without
-notify")."""
+"""Time between landing orders, s. Without its notify message, the firmware does not execute an
+order (docs/firmware.md, "Order without notify")."""
 LEAST_ORDERS = 3
-"""So many orders until the telemetry may show that it lands."""
+"""Number of landing orders before the telemetry can confirm that the vehicle lands."""
 MAX_ORDERS = 6
-"""No more."""
+"""Largest number of landing orders."""
 PLANNED_MPS = 0.35
-"""Mean speed of its quintic."""
+"""Mean speed of the quintic landing trajectory, m/s."""
 LANDING_MARGIN_S = 1.8
-"""Time that the quintic is given beyond that."""
+"""Time added to the quintic's duration, s."""
 PEAK_OF_MEAN = 1.875
-"""A quintic's largest speed over its mean."""
+"""Ratio of a quintic's peak speed to its mean speed."""
 MOST_DRIFT_M = 1.0
-"""The most that the height is thought to have drifted."""
+"""Largest assumed drift of the height, m."""
 FALLING_G = 0.5
-"""Specific force below which it falls: no floor carries it."""
+"""Specific force below which the vehicle falls, g: no floor supports it."""
 FALLEN_MPS = 1.0
-"""From 5 cm above the floor it drops no faster."""
+"""Largest speed of a drop from 5 cm above the floor, m/s."""
 FALLEN_BELOW_M = 0.4
-"""Motors that stop above are a cut in the air."""
+"""Height above which stopped motors mean a cut in the air and not a landing, m."""
 
 
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the way down without the mission's table, for watchdog and rescue; the
-    first call begins the landing. `state` is None if the planner has not run yet."""
+    """Fly one tick of the descent without the mission's table, for watchdog and rescue. The first
+    call begins the landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.on_ground(obs, profile)
     state = replace(state, belief=state.belief.seen(obs, profile))
     state = observe(begin_landing(state), obs, profile, MANEUVER)
@@ -120,7 +123,7 @@ def step_landing(
 
 
 def remember_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
-    """The state at the end of a tick that has decided on `command`, and the command."""
+    """Return the state at the end of a tick that has decided on `command`, and the command."""
     order = state.raw_order
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
@@ -129,7 +132,7 @@ def remember_command(state: PlannerState, command: Command) -> tuple[PlannerStat
 
 
 def begin_landing(state: PlannerState) -> PlannerState:
-    """The state in the phase LANDING; unchanged if the landing had begun before."""
+    """Return the state in the phase LANDING; unchanged if the landing has begun already."""
     if state.phase is Phase.LANDING:
         return state
     b, tel = state.belief, state.belief.telemetry
@@ -148,21 +151,21 @@ def begin_landing(state: PlannerState) -> PlannerState:
 
 
 def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
-    """The state at the begin of a landing; `before`: the state before it."""
+    """Return the state at the start of a landing; `before` is the state before the transition."""
     b, tel, old = state.belief, state.belief.telemetry, before.belief
     heard = b.attitude_age_s <= b.profile.safety.proof_age_s
     if heard and tel.has_bit(HL_ACTIVE) and not b.by_target and not b.diverged:
         state = replace(state, orders=LEAST_ORDERS, ordered_s=b.obs.t_s)
     elif heard and tel.thrust < 1 and before.stopped_s is None:
-        # The motors were stopped, or never turned: nothing spins them up again.
+        # The motors were stopped or never ran; no order may start them again.
         state = replace(state, stopped_s=b.obs.t_s)
     contact_z_m = old.contact_z_m
     pressed_unseen = state.pressed and b.by_target
     if contact_z_m is None and (before.phase is Phase.PERCH or pressed_unseen):
-        # It may be in the magnet's reach, also below a sheet that hangs above an unseen ceiling:
-        # it has to be seen below before it counts as free.
+        # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
+        # ceiling. It counts as free only after a sighting from below.
         contact_z_m = tel.position_m[2]
-    # Where it stands still in the air, what holds it there goes down with it.
+    # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
     state = anchor_in_wind(Context(state))
     within = contact_z_m is not None or b.reckoning.below_m < MAGNET_REACH_M
     lost = b.has_lost_its_position
@@ -176,7 +179,7 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """The landing's new state and command: by proof of a fall or of standing, else a descent."""
+    """Return the landing's new state and command: catch a fall, stop on the floor, or descend."""
     state = c.state
     if _falls_free(c):
         return _caught_again(c)
@@ -188,20 +191,22 @@ def act(c: Context) -> Action:
         return stop_motors(c)
     if c.state.released_s is not None:
         return _weight_on_magnet(c)
-    if c.state.orders:  # to change a landing of its own costs height
+    # changing to another policy during the firmware's own landing would cost height
+    if c.state.orders:
         return _own_landing(c)
     return _release(c) if c.held_s(HANGING) >= HANGING_S else descend(c)
 
 
 def descend(c: Context) -> Action:
-    """Come down by one of the four policies.
+    """Descend by one of the four policies.
 
-    Without a position the descent is level from the start. In the magnet's reach the setpoint is
-    lowered until the vehicle peels off; if it does not, its weight is put on the magnet. Elsewhere
-    it descends by setpoints to `handover_m` and from there by the firmware's own landing, or by
-    that landing at once if height, telemetry or loop cannot be relied on. With the target as the
-    positioning system there is no such landing, since its trajectory would follow the camera's
-    estimate to a floor of unknown height: from `handover_m` on the descent is level.
+    Without a position, the descent is level from the start. Within the magnet's reach, the setpoint
+    is lowered until the vehicle peels off; if it does not, its weight is transferred to the magnet.
+    Otherwise the vehicle descends by setpoints to `handover_m` and from there by the firmware's own
+    landing, or by that landing at once if height, telemetry or loop are unreliable. With the target
+    as the positioning system, the firmware's landing is not used because its trajectory would
+    follow the camera's estimate to a floor of unknown height; from `handover_m` on, the descent is
+    level.
     """
     b = c.belief
     if not b.knows_its_place:
@@ -223,8 +228,8 @@ def descend(c: Context) -> Action:
 
 
 def is_landing_over(c: Context) -> bool:
-    """True if a landing is over: its raw thrust is at its least, or its setpoint at the floor.
-    Without a stop the firmware would lock the vehicle."""
+    """True if a landing is over: its raw thrust is at the minimum, or its setpoint at the floor.
+    Without a stop, the firmware would lock the vehicle."""
     setpoint, ground_m = c.state.setpoint, c.belief.ground_m
     if setpoint is not None and ground_m is not None:
         low = setpoint.z_m <= ground_m[2] + c.planner.landing.handover_m
@@ -233,7 +238,7 @@ def is_landing_over(c: Context) -> bool:
     return 0.0 < c.state.descent.thrust <= LEAST_ORDERED_PART * c.belief.hover_thrust + 1.0
 
 
-# --- A fall, and what stands ---
+# --- Falls, and proof of standing ---
 
 
 def _falls_free(c: Context) -> bool:
@@ -249,7 +254,7 @@ def _falls_free(c: Context) -> bool:
 
 
 def _stands(c: Context) -> bool:
-    """True if it is on the floor, by proof."""
+    """True if the vehicle is proven to stand on the floor."""
     b = c.belief
     if b.proves and c.held_s(ON_FLOOR) >= ON_FLOOR_S:
         return True
@@ -259,7 +264,7 @@ def _stands(c: Context) -> bool:
 
 
 def _caught_again(c: Context) -> Action:
-    """The landing, begun anew below, with a catch."""
+    """Restart the landing at the present height, with a catch."""
     tel, b = c.telemetry, c.belief
     belief = replace(
         b, contact_z_m=None, reach_s=None, reckoning=replace(b.reckoning, below_m=math.inf)
@@ -282,7 +287,7 @@ def _caught_again(c: Context) -> Action:
 
 
 def _catch(c: Context) -> Action | None:
-    """A catch by position; None without a heading, or with positions that have diverged."""
+    """Catch the fall by position; None without a heading or with diverged positions."""
     return None if c.belief.heading_lost or c.belief.diverged else catch_slip(c)
 
 
@@ -290,7 +295,7 @@ def _catch(c: Context) -> Action | None:
 
 
 def _by_setpoints(c: Context) -> Action:
-    """Sink straight down at the landing's speed, from where the landing began."""
+    """Sink straight down from the start of the landing, at the landing's speed."""
     landing, state, b = c.planner.landing, c.state, c.belief
     here = hold_here(c)
     start = here
@@ -310,15 +315,16 @@ def _by_setpoints(c: Context) -> Action:
 
 
 def _level(c: Context) -> Action:
-    """Sink level by raw thrust; by setpoints for a while if no thrust to sink by is known."""
+    """Sink level by raw thrust; by setpoints for a while if no thrust for the descent is known."""
     return _by_setpoints(c) if waits_for_its_own_estimate(c) else descend_level(c)
 
 
 def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
-    """The order for the firmware's own landing from height `z_m`, a quintic from rest to rest.
+    """Return the order for the firmware's own landing from height `z_m`, a quintic from rest to
+    rest.
 
-    The goal is below the ground, by more the longer the flight (`flown_s`) and so the drift, and
-    never above the vehicle: at the trajectory's end the motors stop.
+    The goal is below the ground, by a drift that grows with the flight time `flown_s`, and never
+    above the vehicle: the motors stop at the end of the trajectory.
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
@@ -326,7 +332,7 @@ def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z
 
 
 def _own_landing(c: Context) -> Action:
-    """Order the vehicle's own landing until the telemetry shows that it is flown."""
+    """Order the firmware's own landing until the telemetry shows that the vehicle executes it."""
     tel, b = c.telemetry, c.belief
     state, away = leave_press(c)
     if away is not None and not b.is_doubtful and not state.orders:
@@ -334,7 +340,7 @@ def _own_landing(c: Context) -> Action:
     ends = state.orders >= LEAST_ORDERS and not (b.position_valid and b.height_m >= FALLEN_BELOW_M)
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if b.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has_bit(FLYING)):
-        return state, Idle()  # on the floor: another order would spin the motors up again
+        return state, Idle()  # on the floor, another order would start the motors again
     waited = math.inf if state.ordered_s is None else c.t_s - state.ordered_s
     seen = state.orders >= LEAST_ORDERS and b.imu_proves and tel.has_bit(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
@@ -345,13 +351,14 @@ def _own_landing(c: Context) -> Action:
 
 
 def _release(c: Context) -> Action:
-    """Put the weight on the magnet; by older samples than a perch takes."""
+    """Transfer the weight to the magnet, and accept older telemetry than a perch does."""
     return release_by_thrust(c, late_s=c.safety.telemetry_hold_s)
 
 
 def _weight_on_magnet(c: Context) -> Action:
-    """Put the whole weight on whatever carries it, and monitor that; without telemetry order what
-    carries most of it: what hangs stays, what has fallen does not rise."""
+    """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, order a
+    thrust that carries most of the weight: a hanging vehicle stays, and a fallen one does not
+    climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _release(c)
     part = LEAST_ORDERED_PART * c.belief.hover_thrust

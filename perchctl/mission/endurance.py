@@ -1,4 +1,4 @@
-"""How long the battery lasts, and whether that is enough for an attempt and a landing."""
+"""Predict how long the battery lasts, and whether it suffices for an attempt and a landing."""
 
 from __future__ import annotations
 
@@ -21,22 +21,23 @@ from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
 UNKNOWN_S = 5.0
-"""Without a reading for longer the charge is unknown."""
+"""Time without a reading after which the charge is unknown, s."""
 STANDOFF_SETTLING_S = 3.0
-"""Time of settling at the stand-off, as measured in simulated flights."""
+"""Time that settling at the stand-off takes, s, as measured in simulated flights."""
 TOUCHING_S = 1.0
-"""The same of the touch."""
+"""Time that the touch takes, s, as measured in simulated flights."""
 LANDING_S = 3.0
-"""The same of a landing's end, beyond its way down."""
+"""Time that the end of a landing takes beyond the descent, s, as measured in simulated flights."""
 PRESS_DIP_V = 0.3
-"""Below `safety.min_load_v`, for a press shorter than the debounce."""
+"""Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
+debounce time."""
 BACK_OFF_S = 3.0
-"""Time until the vehicle is steady after an attempt, and sees the target again."""
+"""Time after an attempt until the vehicle is steady and sees the target again, s."""
 
 
 def battery_outlook(c: Context) -> BatteryOutlook:
-    """Return how long the battery still lasts, and for how many attempts. An unknown charge counts
-    for at most the time that a vehicle without a reading may fly (fault 7)."""
+    """Return how long the battery lasts, and for how many attempts. An unknown charge counts for at
+    most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.belief.energy
     used_mah = energy.used_share * c.profile.vehicle.battery_mah
     load = (c.belief.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
@@ -49,14 +50,14 @@ def battery_outlook(c: Context) -> BatteryOutlook:
         enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
     spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
     left = c.planner.attempts - c.state.attempts
-    attempts = 0  # also where the figures are no numbers
+    attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
         attempts = 1 + math.floor(min(spare_s / again_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
 def hover_left_s(state: EnergyState, profile: Profile, load: float, drive: Drive) -> float | None:
-    """Seconds of hovering with `load`, a share of full thrust, until `battery-low` fires; None if
+    """Return the hover time, s, at `load` (share of full thrust) until `battery-low` fires; None if
     unknown."""
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
@@ -76,8 +77,8 @@ def hover_left_s(state: EnergyState, profile: Profile, load: float, drive: Drive
 
 
 def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
-    """The seconds that this attempt, each retry and the landing take, in this order, by the
-    height of the known target."""
+    """Return the times, s, that this attempt, each retry and the landing take, in this order, from
+    the height of the known target."""
     planner = c.planner
     up_m = max(0.0, c.belief.target.contact_goal_z_m - c.telemetry.position_m[2])
     touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
@@ -96,13 +97,14 @@ def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
 
 
 def is_short_of_charge(c: Context) -> bool:
-    """True if the charge is not enough for an attempt at a known target."""
+    """True if the charge is too low for an attempt at a known target."""
     gated = c.safety.energy_gate and c.belief.target.world_m is not None
     return gated and not c.state.battery.attempts
 
 
 def battery_shortfall(c: Context) -> str:
-    """Text: the seconds left, and those that an attempt, the landing and the reserve take."""
+    """Return the remaining time, and the times that an attempt, the landing and the reserve
+    take."""
     seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, attempt_retry_landing_s(c)
     has = "what the battery has left is not known"
     if seconds is not None:
@@ -114,7 +116,7 @@ def battery_shortfall(c: Context) -> str:
 
 
 def _grace_s(c: Context) -> float:
-    """Seconds that `battery-unknown` leaves to a vehicle whose reading is unknown."""
+    """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
     return c.safety.battery_stale_s - max(c.belief.energy.unknown_s, c.obs.battery_age_s)
 
 

@@ -1,14 +1,15 @@
-"""The descent by raw thrust: level, on the vertical speed alone, for a vehicle without a position.
+"""Descend level by raw thrust, controlled by the vertical speed alone, without a position.
 
-With the hover thrust T_h, the climb v (by accelerometer where no position shows it), the climb u
-that orders have given and no sample shows yet, and the wanted sink s,
+Let T_h be the hover thrust, v the climb rate (from the accelerometer if no position measures it), u
+the climb rate that recent orders have caused but no sample shows yet, and s the sink rate setpoint.
+Then
 
     T = T_h (1 - k (v + u + s)) / cos(tilt)
 
-is a proportional rate controller; k falls with the age of v, or the vehicle would swing. Where the
-telemetry is old and the target is seen, v is the climb that pictures show.
-What does not sink gets less and less thrust: it sinks, the magnet lets go, or the floor proves
-itself. Sideways the vehicle leans against the wind and brakes (`_braking`).
+is a proportional rate controller. The gain k falls with the age of v, otherwise the vehicle would
+oscillate. With old telemetry and the target in view, v is the climb rate from pictures. A vehicle
+that does not sink gets less and less thrust until it sinks, the magnet lets go, or the floor is
+detected. Laterally, the vehicle leans against the wind and brakes (`_braking`).
 """
 
 from __future__ import annotations
@@ -28,144 +29,150 @@ from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
 LEVEL_SINK_MPS = 0.7
-"""Wanted sink. By the gyroscope's offset the vehicle goes 2 m sideways in 4 s: larger lands harder
-where the floor is unseen, smaller farther aside."""
+"""Sink rate setpoint, m/s. The gyroscope's offset moves the vehicle 2 m laterally in 4 s. Larger:
+the vehicle lands harder if the floor is not detected. Smaller: it lands further from the target's
+axis."""
 LOW_SINK_MPS = 0.4
-"""The same near the floor."""
+"""Sink rate setpoint near the floor, m/s."""
 SLOW_BELOW_M = 0.6
-"""Height below which it sinks slower."""
+"""Height below which the vehicle sinks at `LOW_SINK_MPS`, m."""
 MOST_GAIN_S_PER_M = 0.5
-"""Part of the hover thrust for each m/s. Larger: it swings."""
+"""Largest gain, in shares of the hover thrust per m/s. Larger: the vehicle oscillates."""
 LEAST_GAIN_S_PER_M = 0.2
-"""The least of it, by old telemetry."""
+"""Smallest gain, with old telemetry, in shares of the hover thrust per m/s."""
 GAIN_AGE_S2_PER_M = 0.06
-"""Gain times age of the telemetry, between the two."""
+"""Product of gain and age of the vertical speed, between the smallest and the largest gain."""
 UNHEARD_PART = 0.98
-"""Share of the thrust that lets it come down without a vertical speed."""
+"""Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
 SEEN_SINK_MPS = 0.4
-"""Wanted sink by pictures, which do not show how far the floor is. Larger: it lands harder.
-Smaller: it drifts aside for longer."""
+"""Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
+vehicle lands harder. Smaller: it drifts for longer."""
 SEEN_LEAST_SINK_MPS = 0.2
-"""Sink by pictures below which it does not sink; single detections are off by half of that."""
+"""Sink rate from pictures below which the vehicle does not sink, m/s; the error of single
+detections is half of it."""
 BRAKE_BY_TARGET_RAD_PER_MPS = 0.15
-"""Lean against a sideways speed that pictures show. Larger: it swings, since what it leans looks
-like a way, too. Smaller: it drifts farther aside."""
+"""Lean per lateral speed from pictures. Larger: the vehicle oscillates, since the lean itself looks
+like a motion. Smaller: it drifts further."""
 ON_THE_SPOT_S = 0.6
-"""Time by setpoints at one place after which no speed is left."""
+"""Time at a constant setpoint after which no speed remains, s."""
 RAMP_PER_S = 0.25
-"""Share of the hover thrust by which what does not sink gets less, each second. Larger: the floor
-is met faster. Smaller: a magnet holds it for longer."""
+"""Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
+thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
+longer."""
 SEEN_RAMP_PER_S = 0.1
-"""The same by pictures, which show a sink only after a quarter of a second. Larger: it falls at
-first. Smaller: it stands on the floor for longer with turning motors."""
+"""Rate of that reduction with pictures, which show a sink only after a quarter of a second. Larger:
+the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
 LEAST_SINK_MPS = 0.05
-"""Sink below which it does not sink."""
+"""Sink rate below which the vehicle does not sink, m/s."""
 LEAST_ORDERED_PART = 0.4
-"""Share of the hover thrust below which no thrust is ordered."""
+"""Smallest ordered thrust, as a share of the hover thrust."""
 LEAST_COSINE = 0.8
-"""Bound of the tilt that the thrust makes up for."""
+"""Smallest cosine of the tilt for which the thrust is compensated."""
 BRAKE_RAD_PER_MPS = 0.25
-"""Lean against a sideways speed."""
+"""Lean per lateral speed."""
 MOST_BRAKE_RAD = 0.22
-"""The most of that; it takes 2.5 % of the thrust."""
+"""Largest lean due to the lateral speed, rad; it costs 2.5 % of the thrust."""
 MOST_LEAN_RAD = 0.2
-"""Against a wind of 6 m/s. Larger: a blow, or a wrong bias, throws the vehicle aside."""
+"""Largest lean against the wind, rad: a wind of 6 m/s. Larger: a blow or a wrong bias moves the
+vehicle far off."""
 BRAKED_AGE_S = 0.2
-"""An older speed is braked less, or it swings."""
+"""Age of the speed above which it is braked less, s; otherwise the vehicle would oscillate."""
 UNSURE_MPS = 0.05
-"""Sideways speed that is not known at the loss of the position."""
+"""Uncertainty of the lateral speed when the position is lost, m/s."""
 UNSURE_MPS2 = 0.1
-"""The same for each second since: an attitude error of 0.01 rad adds 0.1 m/s each second."""
+"""Growth of that uncertainty, m/s per second: an attitude error of 0.01 rad adds 0.1."""
 MOST_UNSURE_MPS = 0.3
-"""The most of it."""
+"""Largest uncertainty of the lateral speed, m/s."""
 LEVEL_FELT_S = 6.0
-"""Time after which the attitude error that pictures have shown is not the present one."""
+"""Time after which the attitude error that pictures have shown no longer applies, s."""
 CARRIED_G = 0.95
-"""Specific force from which on something carries a vehicle whose thrust is small."""
+"""Above this specific force, g, a vehicle at low thrust must be resting on something."""
 CARRIED_PART = 0.88
-"""Share of the hover thrust up to which its thrust is small."""
+"""Largest thrust that counts as low, as a share of the hover thrust."""
 AIRBORNE_G = 0.85
-"""Specific force below which it is in the air, however long it has come down."""
+"""Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
 TOUCH_PART = 0.5
-"""Share of the hover thrust right after the floor was felt."""
+"""Thrust right after the floor was detected, as a share of the hover thrust."""
 TOUCH_S = 0.25
-"""Time for which that lasts, and within which a blow belongs to it."""
+"""Time for which that thrust lasts, s; a blow within this time belongs to the touchdown."""
 TOUCH_BELOW_M = 0.7
-"""Height below which a blow from below is the floor's."""
+"""Height below which a blow from below is the floor's, m."""
 LEVEL_SPARE_S = 2.0
-"""Time beyond the way down's own after which it has come down, or hangs."""
+"""Time beyond the expected duration after which the vehicle has landed or hangs, s."""
 UNHEARD_SPARE_S = 0.8
-"""The same without a vertical speed."""
+"""The same margin without a measured vertical speed, s."""
 OWN_ESTIMATE_S = 1.5
-"""Time for which a vehicle that is not heard, and whose hover thrust is known only roughly, comes
-down by its own estimate."""
+"""Time for which a vehicle with old telemetry and a rough hover thrust descends by setpoints, on
+its own estimate, s."""
 LEVEL_MEAN_MPS = 0.35
-"""Mean speed of the way down, at least."""
+"""Least mean speed of the descent, m/s."""
 PEELED_M = 0.1
-"""The magnet has let go of a vehicle that is this far below its contact. Larger: one that has come
-off still seems to hang. Smaller: a drifting estimate lets one go that hangs."""
+"""Distance below the contact at which the magnet has let go, m. Larger: a vehicle that has come off
+still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 SEEN_BELOW_M = 0.2
-"""The same by pictures with an old attitude. Larger: it drifts aside for longer until it brakes.
-Smaller: a target seen at an angle counts as one above."""
+"""The same distance from pictures with an old attitude, m. Larger: the vehicle drifts for longer
+before it brakes. Smaller: a target seen at an angle seems to be above."""
 SEEN_STANDING_PART = 0.75
-"""Share of the hover thrust at which a vehicle that pictures show still stands: in the air it would
-sink by a metre a second. Larger: a slow start of the descent is taken for the floor. Smaller: its
-motors turn on the floor for longer."""
+"""Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
+in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
+Smaller: the motors run on the floor for longer."""
 MOST_STEP_S = 0.1
-"""Longest step between two ticks that the ramp counts."""
+"""Longest time between two ticks that the ramp integrates, s."""
 
 
 def _seen_motion(c: Context) -> TargetMotion | None:
-    """The motion that pictures show, if the telemetry is old and they are newer."""
+    """Return the motion from pictures if the telemetry is old and the pictures are newer; else
+    None."""
     b, seen = c.belief, c.belief.target_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
     return seen if old and seen.is_known and seen.t_s > b.telemetry.t_s else None
 
 
 def _is_seen_again(c: Context) -> bool:
-    """True if the telemetry is old, and the target is detected again but not for long enough to
-    tell the motion."""
+    """True if the telemetry is old and the target is detected again, but not yet for long enough to
+    determine the motion."""
     b, seen = c.belief, c.belief.target_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
     return old and not seen.is_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
 
 
 def _measured_s(c: Context) -> float:
-    """When the vertical speed was measured, by telemetry or pictures."""
+    """Return the time at which telemetry or pictures measured the vertical speed."""
     seen = _seen_motion(c)
     return c.telemetry.t_s if seen is None else seen.t_s - SEEN_MEMORY_S
 
 
 def _is_unmeasured(c: Context) -> bool:
-    """True if telemetry and pictures are too old to tell the vertical speed."""
+    """True if telemetry and pictures are too old to determine the vertical speed."""
     return _age_s(c) > hover.LATEST_S
 
 
 def _step_s(c: Context) -> float:
-    """Time since the tick before, as far as it counts."""
+    """Return the time since the previous tick, s, at most `MOST_STEP_S`."""
     return max(0.0, min(MOST_STEP_S, c.t_s - c.state.t_s))
 
 
 def _age_s(c: Context) -> float:
-    """Age of the vertical speed, a tick at least."""
+    """Return the age of the vertical speed, s: at least one tick."""
     return max(1e-3, _step_s(c), c.t_s - _measured_s(c))
 
 
 def waits_for_its_own_estimate(c: Context) -> bool:
-    """True if the vertical speed is not measured, and the hover thrust is known only roughly: for a
-    while setpoints are better."""
+    """True if the vertical speed is unknown and the hover thrust is rough: setpoints are better for
+    a while."""
     begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_rough
     return _is_unmeasured(c) and begins_rough and c.in_phase_s < OWN_ESTIMATE_S
 
 
 def descend_level(c: Context) -> Action:
-    """Sink level by raw thrust on the vertical speed, tilted against the sideways speed."""
+    """Sink level by raw thrust controlled by the vertical speed, tilted against the lateral
+    speed."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = _step_s(c), _age_s(c), _measured_s(c)
     measured_mps = _measured_climb_mps(c)
     climb_mps = measured_mps + descent.under_way_mps
     sinks, ramp_per_s = climb_mps <= -LEAST_SINK_MPS, RAMP_PER_S
-    if _seen_motion(c) is not None:  # on the floor the orders under way give no climb
+    if _seen_motion(c) is not None:  # on the floor, recent orders cause no climb
         sinks, ramp_per_s = measured_mps <= -SEEN_LEAST_SINK_MPS, SEEN_RAMP_PER_S
     hover_thrust = hover.best_estimate(b).thrust
     height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
@@ -175,10 +182,10 @@ def descend_level(c: Context) -> Action:
         thrust *= UNHEARD_PART
     floor_felt_s = _floor_felt_s(c, hover_thrust, height_m, sinks=sinks)
     touched_s = math.inf if floor_felt_s is None else c.t_s - floor_felt_s
-    # In the air the accelerometer reads what the thrust gives, on the floor one g.
+    # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
     falls = b.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
     if touched_s >= TOUCH_S and falls:
-        floor_felt_s = None  # it falls with its thrust: that was no floor
+        floor_felt_s = None  # the vehicle falls at low thrust, so it did not touch the floor
     carried = b.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover_thrust
     overdue = _is_overdue(c) and not (b.imu_proves and tel.acc_z_g < AIRBORNE_G)
     before = descent.thrust or hover_thrust
@@ -189,7 +196,7 @@ def descend_level(c: Context) -> Action:
     elif floor_felt_s is not None or carried or not sinks or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
     thrust = max(LEAST_ORDERED_PART * hover_thrust, min(MOST_RAW, thrust))
-    # The speed that orders have given since the newest sample.
+    # Speed that the orders since the newest sample have caused.
     shown_s = 0.0 if b.last is None else max(0.0, measured_s - descent.sample_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
     under_way_mps = descent.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
@@ -212,8 +219,8 @@ def descend_level(c: Context) -> Action:
 
 
 def _measured_climb_mps(c: Context) -> float:
-    """The vertical speed as it was measured last, by telemetry or pictures; 0 where setpoints held
-    the vehicle at one place since the last telemetry."""
+    """Return the last measured vertical speed, from telemetry or pictures; 0 if setpoints have held
+    the vehicle in place since the last telemetry."""
     seen = _seen_motion(c)
     if seen is not None:
         return seen.velocity_mps[2]
@@ -222,8 +229,8 @@ def _measured_climb_mps(c: Context) -> float:
 
 
 def _floor_felt_s(c: Context, hover_thrust: float, height_m: float, *, sinks: bool) -> float | None:
-    """When the floor was first felt: by a blow from below while it sank, or by pictures that show
-    it stand on a thrust which does not carry it."""
+    """Return when the floor was first detected: by a blow from below during a sink, or by pictures
+    of a motionless vehicle at a thrust too low to carry it."""
     descent, b, seen = c.state.descent, c.belief, _seen_motion(c)
     if descent.floor_felt_s is not None:
         return descent.floor_felt_s
@@ -234,9 +241,9 @@ def _floor_felt_s(c: Context, hover_thrust: float, height_m: float, *, sinks: bo
 
 
 def _rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: float) -> float:
-    """The rate controller's thrust, by the equation above."""
+    """Return the rate controller's thrust, by the equation in the module docstring."""
     b = c.belief
-    # Late pictures may show the floor half a metre too far.
+    # Late pictures may place the floor half a metre too low.
     low = height_m <= SLOW_BELOW_M or b.mismatch.later_s != 0.0
     sink_mps = LOW_SINK_MPS if low else LEVEL_SINK_MPS
     if _seen_motion(c) is not None:
@@ -248,8 +255,8 @@ def _rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: fl
 
 
 def _clear_contact_after_fall(c: Context) -> PlannerState:
-    """The state; without its contact once a position or pictures show the vehicle lower, or after a
-    fall."""
+    """Return the state, without its contact once a position or pictures show the vehicle lower, or
+    after a fall."""
     state, b, seen = c.state, c.belief, _seen_motion(c)
     if b.position_valid and b.dead_reckoned_s is None:
         return clear_contact_below(state, PEELED_M)
@@ -268,7 +275,8 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
 
 
 def _is_overdue(c: Context) -> bool:
-    """True if it was without a position for so long that it has come down, or hangs."""
+    """True if the vehicle has been without a position for so long that it must have landed or
+    hang."""
     state, b = c.state, c.belief
     if b.dead_reckoned_s is None and not b.diverged:
         return False
@@ -282,16 +290,17 @@ def _is_overdue(c: Context) -> bool:
 
 
 def _braking(c: Context) -> tuple[float, float]:
-    """Roll and pitch that stand against the wind and brake the sideways speed; level without a
+    """Return roll and pitch that balance the wind and brake the lateral speed; level without a
     heading.
 
-    The thrust acts along the body's z axis, so what the accelerometer reads across it is the air's
-    force w, m/s2. Level thrust g tan(tilt) has to give -w, and the estimated attitude is off by
-    b / g, where b is the excess of accelerometer and attitude: the estimated lean is (b - w) / g.
-    Both are the means of the time in which a position was known, and an offset of the
-    accelerometer is in both. What it reads now does not count: most of that is the drag of the
-    vehicle's own motion, which brakes it. Means of a shorter time than `BIAS_MEMORY_S` count less,
-    and those by wrong positions not at all: there the bias counts that pictures have shown lately.
+    The thrust acts along the body's z axis, so the lateral reading of the accelerometer is the
+    force w of the air per mass, m/s^2. Level thrust g tan(tilt) must provide -w. The estimated
+    attitude is wrong by b / g, where b is the bias of accelerometer and attitude, so the estimated
+    lean is (b - w) / g. Both are means over the time with a known position, and an offset of the
+    accelerometer is part of both. The present reading is not used: most of it is the drag of the
+    vehicle's own motion, which brakes it. Means over less than `BIAS_MEMORY_S` have less weight,
+    and means from wrong positions have none; then the bias that pictures have shown recently is
+    used.
     """
     b = c.belief
     if b.heading_lost or b.is_in_magnet_reach:
@@ -325,7 +334,7 @@ def _braking(c: Context) -> tuple[float, float]:
 
 
 def _in_heading(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
-    """World x and y as ahead and left of a vehicle with this heading."""
+    """Return world x and y as ahead and left of a vehicle with this heading."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 

@@ -1,4 +1,4 @@
-"""What the planner observes in one tick."""
+"""The planner's input in one tick."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from perchctl.vision import TargetEstimate
 @dataclass(frozen=True)
 class Mismatch:
     """An error of latency or mounting that explains why the target seems to move: pictures that are
-    `later_s` later than assumed, or a camera turned by `turn_rad` about the vehicle's upward axis;
-    the other is 0."""
+    `later_s` later than assumed, or a camera rotated by `turn_rad` about the vehicle's upward axis.
+    The other value is 0."""
 
     later_s: float = 0.0
     turn_rad: float = 0.0
@@ -22,12 +22,12 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class VisualInertialMotion:
-    """The vehicle's motion at `t_s` by pictures and accelerometer; pairs are world x and y."""
+    """The vehicle's motion at `t_s` from pictures and accelerometer; pairs are world x and y."""
 
     t_s: float
-    velocity_mps: tuple[float, float]  # sideways
-    bias_mps2: tuple[float, float]  # excess of accelerometer and attitude
-    climb_mps: float | None  # None if the delay that it rests on may be over
+    velocity_mps: tuple[float, float]  # lateral velocity
+    bias_mps2: tuple[float, float]  # bias of accelerometer and attitude
+    climb_mps: float | None  # climb rate; None if the latency it assumes may no longer apply
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,25 +35,30 @@ class Observation:
     """The planner's input in one tick. Times are on the loop's clock; ages are in seconds."""
 
     t_s: float
-    telemetry: Telemetry  #: the newest sample; its age is `t_s - telemetry.t_s`
-    target: TargetEstimate | None = None  #: the pipeline's, at `t_s`; None before the first
+    telemetry: Telemetry  #: newest sample; its age is `t_s - telemetry.t_s`
+    target: TargetEstimate | None = None  #: pipeline's estimate at `t_s`; None before the first one
     new_frame: bool = False  #: a good frame was processed in this tick
-    camera_age_s: float = 0.0  #: since the last good frame arrived
+    camera_age_s: float = 0.0  #: time since the last good frame arrived
     camera_problem: str | None = None  #: None, or one sentence
     link_problem: str | None = None  #: None, or one sentence
     battery_age_s: float = 0.0
-    jumped: bool = False  #: the state estimate moved farther than any flight could
-    turned_rad: float = 0.0  #: step of the estimated heading beyond what a vehicle can turn
-    loop_late_s: float = 0.0  #: how late this tick began
-    disagreeing_frames: int = 0  #: in a row, in which the markers contradicted each other
+    jumped: bool = False  #: the state estimate moved further than any flight could
+    turned_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
+    loop_late_s: float = 0.0  #: delay of the start of this tick
+    disagreeing_frames: int = 0  #: number of successive frames with contradicting markers
     operator: Operator = Operator.NONE
     log_problem: str | None = None  #: the flight log cannot be written
-    delay_s: float = 0.0  #: off the frames' times beyond the profile's latency (`measured`)
-    delay_sigma_s: float = 0.0  #: standard deviation of the latency (`measured`); 0 if it is given
-    target_refused: str | None = None  #: why the last target seen is another vehicle's
-    position_age_s: float = 0.0  #: of the newest external position sent; 0 where decks measure
-    position_problem: str | None = None  #: why none is sent; None while they are
-    position_beside_m: float = 0.0  #: from the estimate to the newest sight; 0 if that was believed
-    imu: ImuMotion = field(default_factory=ImuMotion)  #: by all samples up to `telemetry`
-    felt: VisualInertialMotion | None = None  #: sideways, as pictures and accelerometer agreed
-    mismatch: Mismatch | None = None  #: between the pictures and `imu`; None while they agree
+    #: latency beyond the profile's, subtracted from the frames' times (`measured`)
+    delay_s: float = 0.0
+    #: standard deviation of the latency (`measured`); 0 if it is configured
+    delay_sigma_s: float = 0.0
+    target_refused: str | None = None  #: why the last target in view belongs to another vehicle
+    position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
+    position_problem: str | None = None  #: why no external position is sent; None while they are
+    #: distance from the estimate to the newest sighting; 0 if it was accepted
+    position_beside_m: float = 0.0
+    imu: ImuMotion = field(default_factory=ImuMotion)  #: motion from all samples up to `telemetry`
+    #: newest motion on which pictures and accelerometer agreed
+    felt: VisualInertialMotion | None = None
+    #: disagreement of the pictures with `imu`; None if there is none
+    mismatch: Mismatch | None = None

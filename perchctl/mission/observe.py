@@ -1,4 +1,4 @@
-"""The planner's memory with one more observation taken in, before anything is decided on it."""
+"""Update the planner's memory with an observation, before any decision."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from perchctl.values import replace
 def observe(
     state: PlannerState, obs: Observation, profile: Profile, maneuver: Maneuver
 ) -> PlannerState:
-    """The state with its belief updated in `maneuver`. After a time in which nothing was decided a
-    catch is over; where the estimate has jumped, the places that were decided on move with it."""
+    """Return the state with its belief updated in `maneuver`. After a gap without ticks, a catch
+    ends. After a jump of the estimate, the remembered positions move with it."""
     if has_gap(state.belief, obs, profile):
-        # With a catch its setpoint far above is over: held, it would press.
+        # The setpoint of a catch is far above; keeping it would make the vehicle press.
         setpoint = state.setpoint if state.catch_above_m is None else None
         state = replace(state, since={}, catch_above_m=None, setpoint=setpoint)
     known = state.belief.last is not None
@@ -28,8 +28,8 @@ def observe(
 
 
 def _moved_with_estimate(state: PlannerState) -> PlannerState:
-    """The state after a jump. The vehicle's own landing follows a trajectory in the old world: it
-    is caught, and ordered anew."""
+    """Return the state after a jump of the estimate. The firmware's own landing follows a
+    trajectory in the old frame, so the vehicle is caught and the landing ordered again."""
     b, blocked_z_m = state.belief, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and b.telemetry.thrust >= 1:
         state = replace(

@@ -1,4 +1,4 @@
-"""The phases of a mission, what a transition claims, and how a flight can end."""
+"""The phases of a mission, the claims of transitions, and the outcomes of a flight."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import Enum, Flag, IntEnum, auto
 class Phase(Enum):
     """The paper's seven phases, recovery, landing, and the three final phases."""
 
-    __hash__ = object.__hash__  # by identity: each row of the table looks it up
+    __hash__ = object.__hash__  # identity hash, for speed: each row of the table looks phases up
 
     APPROACH = "APPROACH"
     SEARCH = "SEARCH"
@@ -35,21 +35,24 @@ class Phase(Enum):
 
     @property
     def is_over(self) -> bool:
-        """True for a phase that is never left."""
+        """True for the final phases."""
         return self in TERMINALS
 
 
-# Sets of phases that rows apply in. The first three are defined by what they leave out, so that the
-# gravest rows hold in a new phase before anybody thinks of it.
+# Sets of phases in which rows apply. The first ones are defined by the phases they exclude, so that
+# the most severe rows apply in a new phase by default.
 TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
-"""Phases that are never left."""
+"""Final phases."""
 AIRBORNE = frozenset(Phase) - TERMINALS
+"""Phases in which the motors may run."""
 FLYING_PHASES = AIRBORNE - {Phase.LANDING}
+"""Phases before the landing."""
 BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
+"""Phases before a contact is proven."""
 BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
-"""Phases that are flown by what the camera sees: those whose maneuver is `by_camera`."""
+"""Phases in which the camera guides the vehicle: their maneuver is `by_camera`."""
 IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
-"""Phases in which nothing but air should touch the vehicle: `in_the_open` in their maneuver."""
+"""Phases in which nothing but air should touch the vehicle: their maneuver is `in_the_open`."""
 MAGNET_MAY_CATCH = BY_CAMERA | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
 SEVEN_PHASES = (
@@ -61,11 +64,11 @@ SEVEN_PHASES = (
     Phase.PERCH,
     Phase.COMPLETE,
 )
-"""The paper's, in their order."""
+"""The seven phases of the paper, in their order."""
 
 
 class Severity(IntEnum):
-    """How grave a transition is. From `LAND` on, a flight's severity only rises."""
+    """Severity of a transition. From `LAND` on, a flight's severity never falls."""
 
     CONTINUE = 0
     HOLD = 1
@@ -74,12 +77,12 @@ class Severity(IntEnum):
     STOP = 4
 
     def escalate(self, transition: Severity) -> Severity:
-        """The flight's severity after a transition of the given severity."""
+        """Return the flight's severity after a transition of severity `transition`."""
         return max(self, transition) if self >= Severity.LAND else transition
 
 
 class Outcome(Enum):
-    """Why the flight ended, each with one exit code."""
+    """Why the flight ended; each outcome has one exit code."""
 
     PERCHED = "perched"
     TARGET_NOT_FOUND = "target not found"
@@ -90,32 +93,32 @@ class Outcome(Enum):
 
 
 class Claim(Flag):
-    """What a row claims of the vehicle, beside why it leaves the phase. The next phase begins with
-    it, and whoever needs to know asks for the claim, never for a row by its name."""
+    """What a row claims about the vehicle, in addition to its reason. The next phase starts from
+    the claims. Code that needs such a fact tests the claim, never the name of a row."""
 
     NONE = 0
     BLOCKED = auto()
-    """Something solid is just above the vehicle."""
+    """An obstacle is just above the vehicle."""
     SLIPPED = auto()
     """The vehicle falls off its contact."""
     STILL_ATTACHED = auto()
-    """The contact was proven, and nothing has come off it."""
+    """The contact was proven, and the vehicle has not come off."""
     HANGS = auto()
-    """It hangs where it last touched the target."""
+    """The vehicle hangs where it last touched the target."""
     HELD_BY_OTHER = auto()
-    """Something holds it where the target is not."""
+    """Something other than the target holds the vehicle."""
     POSITIONS_WRONG = auto()
     """External positions lead position control away from its setpoint."""
     MOUNTING_WRONG = auto()
-    """The camera is mounted otherwise than the profile says, or the positions' axes are wrong."""
+    """The camera's mounting differs from the profile, or the axes of the positions are wrong."""
     PROFILE_SUSPECT = auto()
-    """The profile's camera or positioning may be wrong: whoever reads the report should look."""
+    """The profile's camera or positioning section may be wrong and should be checked."""
     UNCONFIRMED = auto()
-    """Nothing proved in time how the landing ended."""
+    """The end of the landing could not be confirmed in time."""
 
 
 class Operator(IntEnum):
-    """The operator's command, which only rises: `LAND`, and `STOP`, which cuts the motors."""
+    """The operator's command, which never decreases: `LAND`, then `STOP`, which cuts the motors."""
 
     NONE = 0
     LAND = 1

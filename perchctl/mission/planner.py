@@ -1,11 +1,13 @@
 """The perching planner: `step_mission(state, observation, profile) -> (state, command)`.
 
-Pure: no clock, no input but its arguments, so a log replays to the same commands. One tick:
+Pure: it uses no clock and no input but its arguments, so a log replays to identical commands. One
+tick:
 
     observation ──> belief ──> decision (table) ──> action (phase) ──> command
 
-Before each command ask: what if it is the last packet? A position setpoint left alone levels out
-after 0.5 s and is cut after 2 s (docs/firmware.md, "When setpoints stop").
+For each command, consider that it may be the last packet that arrives. After a position setpoint
+without a successor, the firmware levels out after 0.5 s and cuts the motors after 2 s
+(docs/firmware.md, "When setpoints stop").
 """
 
 from __future__ import annotations
@@ -53,8 +55,8 @@ def step_mission(
 
 
 def _believe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """The state with the observation taken in, and with what follows from it for the phase: how
-    often the target was confirmed, its conditions, a hold, and what the battery is enough for."""
+    """Return the state updated with the observation: belief, number of confirmed frames, conditions
+    of the phase, hold, and battery outlook."""
     maneuver = PHASES[state.phase].maneuver
     state = observe(state, obs, profile, maneuver)
     confirmed, target = state.confirmed, obs.target
@@ -68,10 +70,10 @@ def _believe(state: PlannerState, obs: Observation, profile: Profile) -> Planner
 
 
 def _enter(c: Context, row: Transition) -> PlannerState:
-    """The state as its row leads it into the next phase."""
+    """Return the state after the transition of `row` into the next phase."""
     state = c.state
-    # An ordered press has wound the integrators up, whatever thrust is read; a fall that is just
-    # being caught turns at full thrust in the air.
+    # An ordered press has wound up the integrators, whatever thrust is reported. A fall that is
+    # being caught runs at full thrust without pressing.
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
     presses = state.phase is Phase.PERCH or is_pressing(c.belief)
     new = replace(
@@ -103,9 +105,10 @@ def _enter(c: Context, row: Transition) -> PlannerState:
 
 
 def act(c: Context) -> Action:
-    """The phase's new state and command for this tick."""
+    """Return the phase's new state and command for this tick."""
     state = c.state
-    # A fall is caught and a press ended although the vehicle is held: the setpoint is above.
+    # A fall is caught and a press ended even during a hold, since the setpoint is above the
+    # vehicle.
     leaves = state.phase is Phase.RECOVER and (state.pressed or state.catch_above_m is not None)
     if state.hold and state.setpoint is not None and not leaves:
         lift = state.phase is not Phase.APPROACH or c.belief.height_m > LIFT_ABOVE_M

@@ -1,6 +1,6 @@
-"""The records of a flight: events, ticks, and each turn of the loop whole and exact.
+"""The records of a flight: its events, and each tick of the loop, complete and exact.
 
-From a flight's turns it can be decided again (`perchctl.analysis`).
+From the `Turn` records, the decisions of a flight can be replayed (`perchctl.analysis`).
 """
 
 from __future__ import annotations
@@ -25,28 +25,29 @@ TurnRole = Literal["waiting", "redone", "flown", "failed"]
 class EventKind(Enum):
     """The kind of an `Event`."""
 
-    PHASE = "phase"  # a phase was entered
-    HOLD = "hold"  # the vehicle is held in place
-    NOTE = "note"  # something worth a line
+    PHASE = "phase"  # the mission entered a phase
+    HOLD = "hold"  # the vehicle holds its position
+    NOTE = "note"  # other noteworthy information
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in a flight, for its log and its displays."""
+    """An event of the flight, for its log and the displays."""
 
     t_s: float
     kind: EventKind
-    reason: str  # a sentence without its end
-    phase: Phase | None = None  # the one entered, or the one that was flown
-    row: str = ""  # the table's transition; empty at the start and where there was none
+    reason: str  # a sentence without its full stop
+    phase: Phase | None = None  # phase that was entered, or the current one
+    row: str = ""  # transition of the table; empty at the start and if there was none
     severity: Severity = Severity.CONTINUE
-    simulated: str = ""  # what the simulated scenario did that led to it
-    rest: RestState | None = None  # where a rescue found the vehicle; None in all other events
-    claims: Claim = Claim.NONE  # the transition's
+    simulated: str = ""  # fault of the simulated scenario that caused it
+    rest: RestState | None = None  # rest state found by a rescue; None in all other events
+    claims: Claim = Claim.NONE  # claims of the transition
 
     @classmethod
     def of_rescue(cls, t_s: float, error: BaseException, rest: RestState, text: str) -> Event:
-        """The note on a vehicle's fate after an error in flight, as the rescue found it."""
+        """Return the note on the vehicle's rest state after an error in flight, as the rescue found
+        it."""
         reason = f"{type(error).__name__} in flight: {text}"
         return cls(t_s, EventKind.NOTE, reason, rest=rest)
 
@@ -54,7 +55,7 @@ class Event:
     def of_tick(
         cls, before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
     ) -> list[Event]:
-        """The events of one tick; `before`: the state before it, None in the first tick."""
+        """Return the events of one tick; `before` is the previous state, None in the first tick."""
         events: list[Event] = []
         if before is None:
             before = PlannerState.on_ground(obs, profile)
@@ -81,13 +82,13 @@ class Event:
 
 @dataclass(frozen=True)
 class SentCommand:
-    """A command that no turn of the loop decided, handed to the link at `t_s` on the loop's clock;
-    whether it arrived is unknown.
+    """A command that no tick of the loop decided, handed to the link at `t_s` on the loop's clock.
+    Whether it arrived is unknown.
 
-    `by`: ``watchdog`` while the loop is silent, and the operator's stop; ``rescue`` after an error;
-    ``reconnect``, an order once more over a link that was lost; ``preflight``, the arming of a
-    vehicle that does not arm itself; ``farewell``, its disarming, and the zero setpoint that closes
-    the link.
+    `by` names the sender: ``watchdog`` while the loop is silent, also for the operator's stop;
+    ``rescue`` after an error; ``reconnect`` for an order repeated after a lost link; ``preflight``
+    for arming a vehicle that does not arm itself; ``farewell`` for disarming it, and for the zero
+    setpoint that closes the link.
     """
 
     t_s: float
@@ -97,38 +98,39 @@ class SentCommand:
 
 @dataclass(frozen=True)
 class ExternalPositions:
-    """External positions sent to the vehicle: how many, at what rate, the newest and its age."""
+    """The external positions sent to the vehicle: number, rate, and the newest one with its age."""
 
-    age_s: float  # of the newest
+    age_s: float  # age of the newest position
     problem: str | None  # why none is sent now
     sent: int
     rate_hz: float
-    place: ExternalPosition | None  # the newest
+    place: ExternalPosition | None  # newest position
 
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """A `perchctl.vision.Frame` as its source gave it, without its picture."""
+    """A `perchctl.vision.Frame` from the camera, without its picture."""
 
     index: int
     t_s: float
     t_arrival_s: float
     fields: PictureKind | None = None
     repeated: bool = False
-    checksum: int | None = None  # the picture's; None if it was not searched, or not recorded
+    # checksum of the picture; None if it was not searched or not recorded
+    checksum: int | None = None
 
 
 @dataclass(frozen=True)
 class TurnInputs:
-    """The samples that the link, and the frame that the camera gave in one turn. `late`: samples
-    that came while camera or vision hung; `look`: the frame was to be searched; `sends_sights`: the
-    target's sights were the vehicle's position; `drops_sightings`: the sights before this turn were
-    forgotten, since positions had led astray."""
+    """The samples from the link and the frame from the camera in one tick. `late` are samples that
+    arrived while camera or vision blocked the loop. `look`: the frame was meant to be searched.
+    `sends_sights`: the sightings of the target were the vehicle's position. `drops_sightings`:
+    earlier sightings were discarded because positions had diverged."""
 
-    samples: tuple[Telemetry, ...] = ()  # in the order in which they came
-    late: tuple[Telemetry, ...] = ()  # those that came while camera or vision hung
+    samples: tuple[Telemetry, ...] = ()  # in the order of arrival
+    late: tuple[Telemetry, ...] = ()  # arrived while camera or vision blocked the loop
     frame: FrameRecord | None = None
-    problem: str | None = None  # problem, ended, live: the source's own
+    problem: str | None = None  # problem, ended, live: reported by the camera source
     ended: bool = False
     live: bool = True
     look: bool = True
@@ -147,38 +149,39 @@ class UnfilteredPose:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Turn:
-    """One turn of the loop, whole and exact.
+    """One tick of the loop, complete and exact.
 
-    `role`: ``waiting`` before take-off; ``flown``; ``redone``: decided before a hang was noticed,
-    not sent, and decided anew in the next turn; ``failed``: the planner raised on it.
-    `phase` to `reason` are the planner's after its decision.
+    `role` is ``waiting`` before take-off; ``flown``; ``redone`` for a decision that was made before
+    the loop noticed that it had been blocked, not sent, and made again in the next tick; or
+    ``failed`` if the planner raised an exception. The fields `phase` to `reason` show the planner's
+    state after its decision.
     """
 
-    number: int  # from 0; a gap is a turn that is missing
+    number: int  # counts from 0; a gap is a missing tick
     role: TurnRole
     began_s: float
-    t_s: float  # for which it was decided; later than `began_s` where it hung
+    t_s: float  # time of the decision; later than `began_s` if the loop was blocked
     taken: TurnInputs
     poses: dict[str, UnfilteredPose] = field(default_factory=dict)
     observation: Observation | None = None  # None while waiting
-    command: Command | None = None  # None while waiting, and of one that failed
+    command: Command | None = None  # None while waiting, and for a failed tick
     phase: Phase | None = None
     row: str = ""
     held: bool = False
     attempts: int = 0
     outside: ExternalPositions | None = None
     outcome: Outcome | None = None
-    reason: str | None = None  # None: of a log before version 4, without outcome, too
-    error: str | None = None  # name of what the planner raised
+    reason: str | None = None  # None in logs before version 4, which also lack the outcome
+    error: str | None = None  # name of the planner's exception
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tick:
-    """A flown turn with the planner's whole state and the pipeline's output, of which the log keeps
-    only parts.
+    """A flown tick with the planner's whole state and the pipeline's output; the log keeps only
+    parts of both.
 
-    `output` is None where no new frame was searched; `consistency`: errors of latency and mounting,
-    if worked out in this turn.
+    `output` is None if no new frame was searched. `consistency` holds the errors of latency and
+    mounting if they were estimated in this tick.
     """
 
     turn: Turn
@@ -206,7 +209,7 @@ class Tick:
 
     @property
     def target(self) -> TargetEstimate | None:
-        """The estimate that the planner steered by."""
+        """The target estimate that the planner used."""
         return self.observation.target
 
     @property
@@ -219,26 +222,27 @@ class Tick:
 
     @property
     def telemetry_age_s(self) -> float:
-        """The age of the oldest part of the newest telemetry."""
+        """Age of the oldest part of the newest telemetry, s."""
         return self.t_s - self.telemetry.t_s + self.telemetry.behind_s
 
     @property
     def delay_used_s(self) -> float:
-        """What is taken off the frames' times."""
+        """Latency that is subtracted from the frames' times, beyond the profile's, s."""
         return self.observation.delay_s
 
     @property
     def outside(self) -> ExternalPositions | None:
-        """None where decks measure the position."""
+        """The external positions; None with decks."""
         return self.turn.outside
 
 
 class Watcher(Protocol):
-    """Receiver of ticks and events: flight log, panel, live page. One that raises is detached, and
-    the flight goes on without it; an attribute `name` names it in the message."""
+    """Receiver of ticks and events: flight log, panel or live page. A watcher that raises an
+    exception is detached, and the flight continues without it; its attribute `name` appears in the
+    message."""
 
     def tick(self, tick: Tick) -> None:
-        """Handle a turn that was flown."""
+        """Handle a flown tick."""
         return
 
     def event(self, event: Event) -> None:
@@ -247,5 +251,5 @@ class Watcher(Protocol):
 
     @property
     def problem(self) -> str | None:
-        """Why the watcher lost records; None while it has lost none."""
+        """Why the watcher lost records; None if it has lost none."""
         return None

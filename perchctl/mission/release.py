@@ -1,8 +1,8 @@
-"""What happens at the ceiling: a press, its end, the release onto the magnet, a stop and a catch.
+"""Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
-In position mode the onboard controller never goes below `LEAST_POSITION_THRUST`. Raw thrust goes on
-to where the motors stand still (docs/firmware.md, "Release in raw mode"): the whole weight is put
-on the magnet and monitored, and only then the motors are stopped.
+In position mode, the onboard controller never goes below `LEAST_POSITION_THRUST`. Raw thrust
+continues down to motors at rest (docs/firmware.md, "Release in raw mode"): the whole weight is
+transferred to the magnet and monitored before the motors are stopped.
 """
 
 from __future__ import annotations
@@ -21,55 +21,57 @@ from perchctl.mission.state import PlannerState
 from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
-# --- the end of a press ---
+# --- end of a press ---
 CONTACT_LEFT_M = 0.08
-"""So far below what it pressed against, the vehicle has left it."""
+"""Distance below the contact at which the vehicle has left it, m."""
 PULLED_MPS = -0.3
-"""Vertical speed at which it falls off: then the setpoint is where it is."""
+"""Vertical speed below which the vehicle is falling off, m/s; the setpoint then stays at the
+vehicle."""
 UNWIND_M = 1.0
-"""Distance of the setpoint below a vehicle that still presses, to unwind the onboard integrators.
-Smaller: they take seconds."""
+"""Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
+integrators. Smaller: unwinding takes seconds."""
 UNWIND_AWAY_M = 0.25
-"""The same once it has left. Larger: it falls."""
+"""The same distance once the vehicle has left the contact, m. Larger: the vehicle falls."""
 UNPRESS_LIMIT_S = 4.0
-"""After this time `leave_press` ends, whether or not the vehicle has come away."""
+"""Time after which `leave_press` ends, whether or not the vehicle has come off, s."""
 
-# --- the release ---
+# --- release ---
 LOWEST_PART = 0.9
-"""Share of the holding thrust down to which a press by raw thrust is lowered."""
+"""Share of the holding thrust down to which the raw thrust of a press is lowered."""
 UNREAD_S = 1.5
-"""Longer hang if the thrust is not read as ordered."""
+"""Additional hang time if the reported thrust does not follow the ordered one, s."""
 
-# --- the stop ---
+# --- stop ---
 STOPS = 5
-"""Orders to stop: a lost notify locks a hanging vehicle."""
+"""Number of stop orders: a single lost notify message would lock a hanging vehicle."""
 STOP_PERIOD_S = 0.1
-"""Time between them."""
+"""Time between stop orders, s."""
 STOP_AGAIN_S = 0.5
-"""Time after which one more is sent while the telemetry shows thrust."""
+"""Time after which one more stop order is sent while the telemetry shows thrust, s."""
 
-# --- the catch ---
+# --- catch ---
 CATCH_STILL_ABOVE_M = 1.0
-"""Distance of the setpoint above a falling vehicle whose motors stand still."""
+"""Height of the setpoint above a falling vehicle whose motors stand still, m."""
 CATCH_TURNING_ABOVE_M = 0.2
-"""The same of motors that turn: by all the thrust there is they would carry it to the ceiling."""
+"""Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
+the ceiling."""
 TURNING_PART = 0.5
-"""Share of hover thrust above which the motors turn."""
+"""Share of hover thrust above which the motors count as running."""
 CATCH_LEAST_S = 0.1
-"""Bounds of a catch's time."""
+"""Shortest duration of a catch, s."""
 CATCH_LIMIT_S = 2.0
+"""Longest duration of a catch, s."""
 CATCH_END_MPS = -0.1
-"""The catch ends once the vehicle sinks more slowly than this: the thrust is above the weight
-then."""
+"""Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
 MOST_BRAKED_MPS = 1.0
-"""No blow that the vehicle survives leaves more speed."""
+"""Largest lateral speed that is braked, m/s; no blow that the vehicle survives leaves more."""
 POSITION_GAIN_PER_S = 2.0
-"""The firmware's `posCtlPid.xKp` and `yKp`."""
+"""Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
 
 
 def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
-    """The state, and a setpoint below the vehicle until it is away from what it pressed against and
-    the onboard integrators have come down; None after that, or if nothing was pressed."""
+    """Return the state, and a setpoint below the vehicle until it has left the contact and the
+    onboard integrators have unwound; None after that, or if the vehicle was not pressed."""
     state, tel = c.state, c.telemetry
     x, y, z = state.entry.position_m
     if not state.pressed:
@@ -91,7 +93,7 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 
 def lower_thrust(c: Context) -> Action:
-    """The release's first stage: lower the setpoint, or a press's raw thrust, in steps."""
+    """First stage of the release: lower the setpoint, or the raw thrust of a press, in steps."""
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
@@ -111,9 +113,9 @@ def lower_thrust(c: Context) -> Action:
 
 
 def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
-    """The release's second stage: raw thrust down to still motors, and the stop when the whole
-    weight has hung long enough. Telemetry that is no proof, and older than `late_s`, restarts the
-    stage."""
+    """Second stage of the release: reduce raw thrust until the motors stand still, and stop them
+    once the whole weight has hung for long enough. Telemetry that is too old as evidence and older
+    than `late_s` restarts the stage."""
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.imu_proves and b.attitude_age_s > late_s:
         return hold_by_position(c)
@@ -133,7 +135,8 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
 
 
 def hold_by_position(c: Context) -> Action:
-    """Hold by position while telemetry is old, to stay in contact or to catch an unseen fall."""
+    """Hold by position while the telemetry is old, to stay in contact or to catch an undetected
+    fall."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
     if b.contact_z_m is not None and b.position_valid:
@@ -143,14 +146,14 @@ def hold_by_position(c: Context) -> Action:
 
 
 def motors_are_still(c: Context) -> bool:
-    """True if raw thrust has brought the motors to a stop."""
+    """True if raw thrust has brought the motors to rest."""
     released_s = c.state.released_s
     return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Action:
-    """Send stop and notify `STOPS` times, since a lost notify locks a hanging vehicle; send more
-    while telemetry shows thrust."""
+    """Send stop and notify `STOPS` times because one lost notify would lock a hanging vehicle; send
+    more while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
         return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
@@ -162,13 +165,14 @@ def stop_motors(c: Context) -> Action:
 
 
 def catch_goal_above_m(hover_thrust: float, thrust: float) -> float:
-    """How far above a falling vehicle its setpoint must be, by its present `thrust`."""
+    """Return the height of the setpoint above a falling vehicle, m, for its present `thrust`."""
     turning = thrust > TURNING_PART * hover_thrust
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
 
 
 def catch_slip(c: Context) -> Action | None:
-    """The setpoint far above that stops a slip; None after the fall, or with old telemetry."""
+    """Return the setpoint far above that catches a slip; None after the fall, or with old
+    telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_above_m is None or not b.imu_proves:
         return None
@@ -183,7 +187,7 @@ def catch_slip(c: Context) -> Action | None:
 
 
 def _braked_place_m(c: Context) -> tuple[float, float]:
-    """The setpoint that takes out a sideways speed which the estimate misses."""
+    """Return the x and y of a setpoint that brakes a lateral speed missing from the estimate."""
     tel, reckoned_mps = c.telemetry, c.belief.reckoning.velocity_mps
     missed_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in missed_mps)
@@ -192,7 +196,7 @@ def _braked_place_m(c: Context) -> tuple[float, float]:
 
 
 def clear_contact_below(state: PlannerState, below_m: float) -> PlannerState:
-    """The state; without its contact if the vehicle is more than `below_m` below the contact."""
+    """Return the state, without its contact if the vehicle is more than `below_m` below it."""
     b = state.belief
     if b.contact_z_m is None or b.telemetry.position_m[2] >= b.contact_z_m - below_m:
         return state

@@ -1,6 +1,5 @@
-"""How a flight ended: where it met the target, how hard it met the floor, and what it showed of the
-camera's latency and mounting. None of it needs a simulator.
-"""
+"""Summarize how a flight ended: its contact offset, its touchdown speed, and the errors of latency
+and mounting that it has shown. No simulator is required."""
 
 from __future__ import annotations
 
@@ -22,49 +21,52 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraErrors
 
 HARD_MPS = 0.6
-"""No descent that goes as it should meets the floor faster."""
+"""Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
 TOUCHDOWN_WITHIN_S = 5.0
-"""Time from a touchdown to the motors' stop: an earlier blow was no floor."""
+"""Longest time from a touchdown to the stop of the motors, s; an earlier blow was not the floor."""
 SAME_HEIGHT_M = 0.3
-"""A blow higher above the present place was none by the floor."""
+"""Largest height of a blow above the final position for it to be a touchdown, m."""
 SURE = 1.96
-"""Standard deviations on both sides of a 95 % interval."""
+"""Half width of a 95 % interval, in standard deviations."""
 LATENCY_GATE_S = 0.02
-"""Error of the latency that advice is given on: 30 ms make an alignment swing by centimetres."""
+"""Latency error above which the report gives advice, s: an error of 30 ms makes the alignment
+oscillate by centimetres."""
 TURN_GATE_DEG = 2.0
-"""The same of a turn: 35 mm at 1 m, more than the cone of an ascent forgives."""
+"""Rotation error above which the report gives advice, deg: 35 mm at 1 m, more than the cone of an
+ascent allows."""
 
 
 def claims_of(row_name: str) -> Claim:
-    """The claims of the built-in row with this name, as a log holds it; none for any other name, as
-    of your own rows."""
+    """Return the claims of the built-in row with this name, as a log stores it; none for any other
+    name, for example that of your own row."""
     return next((row.claims for row in TABLE if row.name == row_name), Claim.NONE)
 
 
 @dataclass(frozen=True)
 class Touchdown:
-    """The downward speed on meeting the floor, and the largest acceleration of 10 ms samples."""
+    """The downward speed at the touchdown, and the largest specific force of samples every 10
+    ms."""
 
     speed_mps: float
     peak_g: float
 
     @property
     def is_hard(self) -> bool:
-        """True if the vehicle met the floor faster than `HARD_MPS`."""
+        """True if the vehicle touched down faster than `HARD_MPS`."""
         return self.speed_mps > HARD_MPS
 
     @property
     def text(self) -> str:
-        """The touchdown in words, as in ``touched down hard: 1.4 m/s, 3.2 g``."""
+        """The touchdown in words, for example ``touched down hard: 1.4 m/s, 3.2 g``."""
         how = "touched down hard" if self.is_hard else "touched down"
         return f"{how}: {self.speed_mps:.1f} m/s, {self.peak_g:.1f} g"
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Latency, and the camera's turn from what the profile says about body x, y and z, each with
-    one standard deviation; `advice` in sentences, empty if the profile fits, and for a simulated
-    vehicle: its camera is the scenario's, and tells nothing of a real one."""
+    """Latency, and rotation of the camera relative to the profile about body x, y and z, each with
+    one standard deviation. `advice` is a tuple of sentences; it is empty if the profile fits, and
+    for a simulated vehicle because its camera is not a real one."""
 
     latency_s: float
     latency_sigma_s: float
@@ -74,15 +76,15 @@ class Findings:
 
     @classmethod
     def of(cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False) -> Findings:
-        """The findings by a flight's estimates, with advice on each error whose 95 % interval lies
-        beyond its limit; none if the flight was `simulated`."""
+        """Return the findings from a flight's estimates, with advice on each error that is beyond
+        its limit and significant at 95 %; no advice if the flight was `simulated`."""
         latency_s = camera.start_latency_s + seen.delay_s
         x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
         found, advice = cls(latency_s, seen.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
         if simulated:
             return found
-        set_here = not isinstance(camera.latency_s, str)  # else the measured one is used
+        set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
         if set_here and _is_off(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
             advice.append(
                 f"latency {found.latency_text}, profile says {camera.start_latency_s * 1e3:.0f}: "
@@ -98,25 +100,25 @@ class Findings:
 
     @property
     def latency_text(self) -> str:
-        """The latency with its 95 % interval, as in ``92 +- 6 ms``."""
+        """The latency with its 95 % interval, for example ``92 +- 6 ms``."""
         return f"{self.latency_s * 1e3:.0f} +- {SURE * self.latency_sigma_s * 1e3:.0f} ms"
 
     @property
     def turn_text(self) -> str:
-        """The turn about x, y and z with 95 % intervals, as in
-        ``0.2 +- 0.6, -0.1 +- 0.6, 0.4 +- 1.8 deg``."""
+        """The rotation about x, y and z with 95 % intervals, for example ``0.2 +- 0.6, -0.1 +- 0.6,
+        0.4 +- 1.8 deg``."""
         each = zip(self.turn_deg, self.turn_sigma_deg, strict=True)
         return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"
 
 
 def _is_off(off: float, gate: float, sigma: float) -> bool:
-    """True if it is beyond the gate, and its 95 % interval is narrower than it is itself."""
+    """True if the error exceeds the gate and the width of its 95 % interval."""
     return abs(off) > max(gate, 2.0 * SURE * sigma)
 
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How a flight ended, and what it showed."""
+    """How a flight ended, and its findings."""
 
     phase: Phase
     outcome: Outcome
@@ -124,15 +126,15 @@ class FlightReport:
     attempts: int
     duration_s: float
     locked: bool
-    history: tuple[Event, ...] = ()  # its phases' events, the first at the start
-    findings: Findings | None = None  # of latency and mounting, where it was long enough
-    contact: ContactOffset | None = None  # of what hangs
-    touchdown: Touchdown | None = None  # of what met the floor
-    detached: tuple[str, ...] = ()  # a sentence for each watcher that raised, and was left out
+    history: tuple[Event, ...] = ()  # events of the phases, from the start of the flight
+    findings: Findings | None = None  # latency and mounting, if the flight was long enough
+    contact: ContactOffset | None = None  # offset of a vehicle that hangs
+    touchdown: Touchdown | None = None  # touchdown of a vehicle that reached the floor
+    detached: tuple[str, ...] = ()  # one sentence for each watcher detached after an exception
 
     @property
     def blames_profile(self) -> bool:
-        """True if a row decided in the flight that claims the profile may be wrong."""
+        """True if a row that claims a wrong profile fired during the flight."""
         return any(Claim.PROFILE_SUSPECT in event.claims for event in self.history)
 
     @classmethod
@@ -146,20 +148,22 @@ class FlightReport:
         *,
         simulated: bool = False,
     ) -> FlightReport:
-        """The report of a mission that is over, by its last tick; `simulated`: the vehicle was."""
+        """Return the report of a completed mission from its last tick."""
         b = state.belief.seen(obs, profile)
         hangs, contact = state.phase is Phase.PERCHED, b.contact
-        if hangs and contact is None:  # it was caught on its way down
+        if hangs and contact is None:  # the magnet caught the vehicle during the descent
             contact = contact_offset(b)
         placed = hangs and contact is not None and math.isfinite(contact.sigma_m)
         return cls(
             phase=state.phase,
             outcome=state.outcome or Outcome.SAFETY,
             reason=_reason(state, history),
-            # A hold that is noticed once the attempts are used up has been counted as failed.
+            # If a hanging vehicle is noticed after the last attempt, that attempt was counted as
+            # failed.
             attempts=state.attempts + int(hangs and state.outcome is not Outcome.ATTEMPTS_USED_UP),
             duration_s=obs.t_s - state.started_s,
-            # The telemetry at hand is older than an emergency stop, which always locks.
+            # The available telemetry is older than an emergency stop, which always locks the
+            # vehicle.
             locked=obs.telemetry.has_bit(LOCKED) or state.outcome is Outcome.EMERGENCY,
             history=history,
             findings=None
@@ -172,21 +176,21 @@ class FlightReport:
 
 @dataclass(frozen=True)
 class Rest:
-    """Where a vehicle came to rest, and how hard it met the floor if it did."""
+    """The rest state of a vehicle, and its touchdown if there was one."""
 
     state: RestState
     touchdown: Touchdown | None = None
 
     @property
     def text(self) -> str:
-        """The rest in words without a full stop, with its touchdown if that was hard."""
+        """The rest state in words without a full stop, with the touchdown if it was hard."""
         if self.touchdown is None or not self.touchdown.is_hard:
             return self.state.value
         return f"{self.state.value}; it {self.touchdown.text}"
 
 
 def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
-    """Return where the vehicle is; None until its motors have been seen off for `off_s`."""
+    """Return the rest state; None until telemetry has shown the motors off for `off_s`."""
     c = Context(replace(state, belief=state.belief.seen(obs, profile)))
     if c.held_s(DOWN) < off_s:
         return None
@@ -196,9 +200,10 @@ def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: fl
 
 
 def find_touchdown(c: Context) -> Touchdown | None:
-    """The newest blow from below, if it may be a touchdown; None if there is no such blow.
+    """Return the newest blow from below if it may be a touchdown, else None.
 
-    The speed is the state estimate's where that is believed, else the dead reckoning's."""
+    The speed is from the state estimate if it is believed, otherwise from dead reckoning.
+    """
     b = c.belief
     tel, imu, reckoning = c.telemetry, b.imu, b.reckoning
     blow = imu.blow

@@ -1,4 +1,5 @@
-"""Where a vehicle with its motors off is: on the magnet, on the floor, or nobody knows."""
+"""Determine the rest state of a vehicle with its motors off: on the magnet, on the floor, or
+unknown."""
 
 from __future__ import annotations
 
@@ -11,18 +12,20 @@ from perchctl.mission.context import Context
 from perchctl.mission.phase import Claim, Phase
 
 HUNG_WITHIN_M = 0.3
-"""A vehicle this little below its contact still hangs there, by an estimate that has drifted."""
+"""Distance below its contact at which a vehicle still hangs, m; allows for drift of the
+estimate."""
 HIGH_M = 0.45
-"""A descent that began higher than this can tell hanging from standing by the height."""
+"""Height at the start of a descent above which the height distinguishes hanging from standing,
+m."""
 STANDS_BELOW_M = 0.3
-"""Height below which the vehicle stands."""
+"""Height below which the vehicle stands, m."""
 STAYED_M = 0.15
-"""A vehicle that has not come down this far hangs where the descent began. Larger: one on a table
-hangs. Smaller: a drifting estimate has let one go that hangs."""
+"""Descent below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
+table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 
 
 class RestState(Enum):
-    """Where a vehicle with its motors off is, in words without a full stop."""
+    """The rest state of a vehicle with its motors off, in words without a full stop."""
 
     HANGS = "the vehicle hangs on the magnet, its motors are off"
     HELD = "something holds the vehicle away from the target; the motors are off"
@@ -32,8 +35,8 @@ class RestState(Enum):
 
 
 def find_rest_state(c: Context) -> RestState:
-    """Where the vehicle is, once its motors are off: by a position, by the picture of a target far
-    above, or by the falls measured since the vehicle came into the magnet's reach."""
+    """Return the rest state once the motors are off: from a position, from a picture of a target
+    far above, or from the falls measured since the vehicle came within the magnet's reach."""
     b, state = c.belief, c.state
     if _is_held_elsewhere(c):
         return RestState.HELD
@@ -66,12 +69,12 @@ def _is_held_elsewhere(c: Context) -> bool:
 
 
 def _by_falls(c: Context) -> RestState:
-    """By the falls since the vehicle came within the magnet's reach, if ever, and by the silences
-    that could hide one."""
+    """Return the rest state from the falls since the vehicle came within the magnet's reach, if
+    ever, and from silences that could hide a fall."""
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.reach_s
     felt_s = c.state.descent.floor_felt_s
     down_s = max(b.imu.fell_s, -math.inf if felt_s is None else felt_s)
-    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sighting ends the doubt
+    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sighting resolves the doubt
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
     came_unheard = unsure and reckoning.unsure_s <= since_s

@@ -1,8 +1,8 @@
-"""The rows of the table that hold in many phases, gravest first.
+"""The rows of the table that apply in many phases, most severe first.
 
-They stand before each phase's own exits: an operator's word, a locked or tumbled vehicle, a lost
-link, old telemetry, positions and pictures that cannot be relied on, limits, the battery; then a
-magnet that catches early, and something in the way.
+They come before the exits of each phase: operator commands, a locked or tumbled vehicle, a lost
+link, old telemetry, unreliable positions and pictures, limits and the battery; then a magnet that
+catches early, and obstacles.
 """
 
 from __future__ import annotations
@@ -59,51 +59,53 @@ from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
 TAKEOFF_LIFTED_M = 0.05
-"""Height below which a take-off may run aside by `SIDEWAYS_M` only."""
+"""Height below which the lateral limit of a take-off is `SIDEWAYS_M`, m."""
 SIDEWAYS_M = 0.12
-"""The most that a vehicle runs aside before it has lifted. Larger: a wrong mounting tips it
+"""Largest lateral motion before the vehicle has lifted off, m. Larger: a wrong mounting tips it
 over."""
 DIVERGED_BELOW_M = 0.3
-"""Height below which positions in other axes lead into the floor."""
+"""Height below which positions in wrong axes may lead the vehicle into the floor, m."""
 DIVERGED_LOW_M = 0.22
-"""Distance aside there, and in a climb that should be straight, at which positions have
-diverged."""
+"""Lateral distance from the setpoint at which positions have diverged, m, below `DIVERGED_BELOW_M`
+and in a vertical climb."""
 DIVERGED_LANDING_M = 0.4
-"""The same in a landing."""
+"""The same distance during a landing, m."""
 DIVERGED_M = 0.8
-"""The same in the open: farther than any draught carries the vehicle. Larger: it meets the
-walls."""
+"""The same distance elsewhere, m: further than any draught moves the vehicle. Larger: the vehicle
+reaches the walls."""
 ASIDE_BY_LATENCY_MPS = 4.0
-"""How far aside a take-off by the target may run for each second of the latency's sigma: by 0.1 s
-that pictures are later than assumed, up to 0.2 m. Larger: a turned camera leads farther away."""
+"""Increase of the lateral limit with the target as the position source, in m per second of the
+latency's standard deviation: pictures that are 0.1 s later than assumed cause up to 0.2 m. Larger:
+a rotated camera leads the vehicle further away."""
 ABOVE_START_M = 0.1
-"""A setpoint this near above the start only climbs."""
+"""Largest lateral distance between setpoint and start in a vertical climb, m."""
 MOVES_OTHERWISE_S = 0.1
-"""Time for which the estimate has to move against the accelerometer."""
+"""Time for which the estimate must contradict the accelerometer, s."""
 SWINGS_MPS = 0.5
-"""Sink that only swings of position control reach."""
+"""Sink rate that only an oscillation of position control reaches, m/s."""
 BELOW_S = 0.3
-"""Time for which a target has to seem below the vehicle."""
+"""Time for which the target must appear below the vehicle, s."""
 WEAK_S = 2.0
-"""Time at full thrust after which no thrust is left to press with."""
+"""Time at full thrust after which no thrust remains for a press, s."""
 HELD_S = 2.0
-"""Time after which the magnet has been told from other things."""
+"""Time after which the magnet has been distinguished from other supports, s."""
 BLIND_VARIANCE_M2PS2 = 0.02
-"""Variance of the velocity about 3 s after the last sighting."""
+"""Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
 CONTRADICTED_M = 0.3
-"""Distance of the newest sight from the estimate at which the estimate is wrong. Larger: position
-control leads farther aside. Smaller: a swing ends the flight."""
+"""Distance of the newest sighting from the estimate at which the estimate is wrong, m. Larger:
+position control moves the vehicle further off. Smaller: an oscillation ends the flight."""
 CONTRADICTED_S = 0.35
-"""Age of the newest position, latency included, from which on such sights are no single mistake.
-Larger: position control leads astray for longer. Smaller: one wrong detection ends the flight."""
+"""Age of the newest position, including the latency, at which contradicting sightings are not a
+single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection ends
+the flight."""
 
 
-# --- Whether the position, the pictures and their mounting can be relied on ---
+# --- Reliability of position, pictures and mounting ---
 
 
 def has_diverged(c: Context) -> bool:
-    """True if external positions in other axes than the vehicle's lead position control away from
-    its setpoint (fault 11): farther than any draught carries it, or in swings."""
+    """True if external positions in wrong axes lead position control away from its setpoint (fault
+    11): further than any draught does, or in oscillations."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.position_valid:
         return False
@@ -139,7 +141,7 @@ def _away_m(c: Context) -> float:
 
 
 def divergence_reason(c: Context) -> str:
-    """Text: how far positions have led the vehicle away, and what may be the cause."""
+    """Return how far positions have led the vehicle away, and the possible causes."""
     b = c.belief
     if _swings(c):
         return (
@@ -159,9 +161,9 @@ def divergence_reason(c: Context) -> str:
 
 
 def is_position_lost(c: Context) -> bool:
-    """True if no position came for `positioning.land_s`, or the estimate is useless earlier: after
-    a blow or gust that no sighting has corrected, by its variance, or because sightings contradict
-    it."""
+    """True if no position has arrived for `positioning.land_s`, or if the estimate is useless
+    earlier: after a blow or gust that no sighting has corrected, because of its variance, or
+    because sightings contradict it."""
     b = c.belief
     if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
         return True
@@ -172,7 +174,7 @@ def is_position_lost(c: Context) -> bool:
 
 
 def is_outside_fence(c: Context) -> bool:
-    """True if the vehicle is farther from its start than the fence allows."""
+    """True if the vehicle is further from its start than the fence allows."""
     ground_m = c.belief.ground_m
     if ground_m is None:
         return False
@@ -182,11 +184,11 @@ def is_outside_fence(c: Context) -> bool:
 
 
 def latency_reason(c: Context) -> str:
-    """Text: how old the pictures are, and how old they should be."""
+    """Return how old the pictures are, and how old they should be."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.delay_s
     found = f"the pictures are {1e3 * (assumed_s + b.mismatch.later_s):.0f} ms old"
-    if not b.proves:  # by late telemetry, pictures that are in time seem late
+    if not b.proves:  # with late telemetry, pictures in time seem late
         return (
             f"pictures and telemetry do not fit each other, by {1e3 * b.mismatch.later_s:.0f} ms; "
             f"the telemetry is {b.telemetry_age_s:.1f} s old"
@@ -201,14 +203,14 @@ def latency_reason(c: Context) -> str:
 
 
 def is_mounting_wrong(c: Context) -> bool:
-    """True if the target moves along with the vehicle, or seems to lie below the vehicle."""
+    """True if the target moves along with the vehicle, or appears below it."""
     b = c.belief
     below = c.held_s(TARGET_BELOW) >= BELOW_S
     return b.mounting.is_wrong or b.mismatch.turn_rad != 0.0 or below
 
 
 def mounting_reason(c: Context) -> str:
-    """Text: how the camera seems to be mounted, and what to do."""
+    """Return how the camera seems to be mounted, and what to do."""
     b = c.belief
     turn_rad = b.mismatch.turn_rad
     if turn_rad or b.mounting.is_wrong:
@@ -227,11 +229,11 @@ def mounting_reason(c: Context) -> str:
     )
 
 
-# --- Whether something holds or blocks the vehicle, or its thrust is too weak ---
+# --- Supports, obstacles and insufficient thrust ---
 
 
 def is_held(c: Context) -> bool:
-    """True if the target's magnet holds the vehicle already."""
+    """True if the target's magnet already holds the vehicle."""
     if c.held_s(HANGING) < HANGING_S:
         return False
     touched, radius_m = last_touch_offset(c.belief), c.planner.perch.contact_xy_m
@@ -240,7 +242,7 @@ def is_held(c: Context) -> bool:
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """True if something holds the vehicle off the target's height, or beside the target."""
+    """True if something holds the vehicle away from the target's height or from its axis."""
     touched = last_touch_offset(c.belief)
     offset = touched or contact_offset(c.belief)
     at_its_height = touched is not None or is_at_contact_height(c.belief)
@@ -249,12 +251,12 @@ def is_held_elsewhere(c: Context) -> bool:
 
 
 def is_blocked(c: Context) -> bool:
-    """True if the vehicle has pressed against something for `safety.blocked_s`."""
+    """True if the vehicle has pressed against an obstacle for `safety.blocked_s`."""
     return c.held_s(BLOCKED) >= c.safety.blocked_s
 
 
 def is_blocked_off_target(c: Context) -> bool:
-    """True if the vehicle is blocked, and not where a press would prove the contact."""
+    """True if the vehicle is blocked at a position where a press would not prove the contact."""
     pressing = c.state.phase is Phase.PERCH
     return is_blocked(c) and not (
         pressing and abs(c.belief.target.error_z_m) <= possible_contact_tolerance_m(c.belief)
@@ -262,7 +264,8 @@ def is_blocked_off_target(c: Context) -> bool:
 
 
 def lacks_press_thrust(c: Context) -> bool:
-    """True if no thrust is left to press with: seen at full thrust, or known before the press."""
+    """True if no thrust remains for a press: measured at full thrust, or predicted before the
+    press."""
     if c.state.pressed:
         return False
     if c.held_s(SATURATED_THRUST) >= WEAK_S:
@@ -284,7 +287,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.telemetry.has_bit(LOCKED) and hangs_with_motors_off(c),
         Phase.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
-        outcome=lambda before: before or Outcome.PERCHED,  # a landing keeps its own
+        outcome=lambda before: before or Outcome.PERCHED,  # a landing keeps its own outcome
     ),
     supervisor_row(
         "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"
@@ -434,7 +437,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         ),
         claims=Claim.HANGS,
     ),
-    # --- something is in the way ---
+    # --- obstacles ---
     land_row(
         "cannot-rise",
         {Phase.APPROACH},
@@ -461,4 +464,4 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "something is above",
     ),
 )
-"""In this order; your own rows come behind them, and before the phases' exits."""
+"""The safety rows in their order. Your own rows follow them and precede the exits of the phases."""

@@ -1,10 +1,11 @@
-"""Position setpoints: towards a goal, corrected by what was learned, and inside all limits.
+"""Compute position setpoints: step towards a goal, apply learned corrections, and enforce all
+limits.
 
-The firmware flies to a setpoint p by a cascade of PID controllers. On top of it, from the reference
-r, with the vehicle at x and its velocity v:
+The firmware flies to a setpoint p with a cascade of PID controllers. On top of it, for the
+reference r, the vehicle's position x (height z) and its velocity v:
 
-    p = r + integral + near * limit(POSITION_GAIN (r - x) - VELOCITY_GAIN_S v)     sideways
-    p = r + limit(HEIGHT_GAIN (r - z) - HEIGHT_RATE_S v_z)                          in height
+    p = r + integral + near * limit(POSITION_GAIN (r - x) - VELOCITY_GAIN_S v)     lateral
+    p = r + limit(HEIGHT_GAIN (r - z) - HEIGHT_RATE_S v_z)                         vertical
 
 The integral removes the offset that a steady wind leaves; `near` grows from 0 to 1 as the target
 comes closer.
@@ -24,49 +25,49 @@ from perchctl.vehicle import Command, PositionSetpoint
 Action = tuple[PlannerState, Command]
 
 HEIGHT_GAIN = 1.5
-"""Multiple of the error in height, against the onboard integrator's overshoot. Larger: it
-swings."""
+"""Gain on the height error, against the overshoot of the onboard integrator. Larger: the vehicle
+oscillates."""
 HEIGHT_RATE_S = 0.25
-"""Part of the vertical speed that is taken off that, s. Smaller: it overshoots."""
+"""Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
 HEIGHT_LIMIT_M = 0.15
-"""The most that the height of a setpoint is corrected by."""
+"""Largest correction of a setpoint's height, m."""
 POSITION_GAIN = 1.0
-"""Feedback on the error sideways near the target. Larger: late pictures make it swing."""
+"""Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate."""
 VELOCITY_GAIN_S = 0.3
-"""Part of the sideways velocity that is taken off that, s."""
+"""Damping of the lateral correction by the lateral velocity, s."""
 STIFF_BELOW_M = 0.8
-"""Gear's distance below the target at which this feedback begins."""
+"""Distance of the gear below the target at which the lateral feedback starts, m."""
 STIFF_RANGE_M = 0.4
-"""Way over which it grows to its whole."""
+"""Distance over which the lateral feedback grows to its full gain, m."""
 STIFF_LIMIT_M = 0.1
-"""The most that it moves a setpoint."""
+"""Largest correction of a setpoint by the lateral feedback, m."""
 GROUND_CLEARANCE_M = 0.05
-"""No setpoint is lower above the ground, but in a take-off."""
+"""Lowest height of a setpoint above the ground, m, except in a take-off."""
 SMALL_ERROR_M = 0.06
-"""An error of the position that the integral counts in motion, too."""
+"""Position error below which the integral also accumulates in motion, m."""
 MOST_TRIM_M = 0.4
-"""Against a wind of 5 m/s. Larger: a vehicle that something holds winds its setpoint up further.
-Smaller: a wind holds it aside of its target for good."""
+"""Largest integral, m: a wind of 5 m/s. Larger: the setpoint of a vehicle that is held winds up
+further. Smaller: a wind keeps the vehicle off its target permanently."""
 STANDS_MPS = 0.1
-"""Slower, a vehicle stands still in the air. Larger: an integral winds up on the way to its goal.
-Smaller: a wind that shakes the vehicle is never balanced."""
+"""Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
+the goal. Smaller: a gusty wind is never balanced."""
 WARY_MPS = 0.25
-"""Speed sideways while nothing confirms the camera's mounting. Larger: a turned camera leads it
-farther astray."""
+"""Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
+vehicle further off."""
 OUT_OF_VIEW_SINK_MPS = 0.2
-"""Speed at which a held vehicle sinks whose target is out of view."""
+"""Sink rate during a hold while the target is out of view, m/s."""
 LOWEST_M = 0.3
-"""Height above the ground to which it sinks."""
+"""Height above the ground at which that sink ends, m."""
 
 
 def hold_here(c: Context) -> PositionSetpoint:
-    """The setpoint at the vehicle's estimated position and heading."""
+    """Return the setpoint at the vehicle's estimated position and heading."""
     x, y, z = c.telemetry.position_m
     return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
 
 
 def body_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
-    """The body's world x and y (m) at which the gear is under the target at heading `yaw_rad`."""
+    """Return the body's world x and y (m) with the gear below the target at heading `yaw_rad`."""
     target = c.belief.target.world_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
@@ -74,7 +75,8 @@ def body_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
 
 
 def setpoint_under_target(c: Context, z_m: float) -> PositionSetpoint:
-    """The setpoint with the gear under the target and turned like it, the body at height `z_m`."""
+    """Return the setpoint with the gear below the target, the target's heading and the body at
+    `z_m`."""
     yaw = c.belief.target.world_yaw_rad
     assert yaw is not None
     x, y = body_xy_under_target(c, yaw)
@@ -91,9 +93,9 @@ def step_towards(
     wary: bool = False,
     turns: bool = True,
 ) -> PositionSetpoint:
-    """The setpoint one tick after `old`: towards `goal`, climbing at most at `up_mps`, sinking at
-    most at `down_mps`. `wary`: slower sideways while nothing confirms the camera's mounting;
-    without `turns` the heading stays."""
+    """Return the setpoint one tick after `old`: towards `goal`, with at most `up_mps` upwards and
+    `down_mps` downwards. `wary` limits the lateral speed while the camera's mounting is
+    unconfirmed; without `turns`, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not turns:
@@ -112,7 +114,7 @@ def step_towards(
 
 
 def fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Action:
-    """Remember the reference, and send it corrected; without `lift` at its own height."""
+    """Store the reference and send it corrected; without `lift`, its height is not corrected."""
     return replace(c.state, setpoint=reference), limit_setpoint(
         c, correct_setpoint(c, reference, lift=lift)
     )
@@ -128,11 +130,12 @@ def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
 
 
 def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
-    """The integral (x, y) of the position's error to `goal_xy`, m, world axes, which removes the
-    offset that a steady wind leaves.
+    """Return the integral (x, y) of the position error to `goal_xy`, m, world axes, which removes
+    the offset that a steady wind leaves.
 
-    It is limited, and frozen while the vehicle is still on its way: a large error counts, and a
-    large integral is learned, only once the vehicle stands still in the air."""
+    The integral is limited, and frozen while the vehicle is still on its way: a large error
+    accumulates, and the integral may become large, only while the vehicle hovers in place.
+    """
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
@@ -146,9 +149,10 @@ def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tu
 
 
 def anchor_in_wind(c: Context) -> PlannerState:
-    """The state with a setpoint where the vehicle is, and with the integral that holds it there, if
-    it stands still in the air: the same command as before. A vehicle on its way keeps its setpoint
-    and integral. One without a setpoint, or whose positions have diverged, has no integral."""
+    """Return the state with a setpoint at the vehicle's position and the integral that holds it
+    there, if it hovers in place; the command does not change. A vehicle on its way keeps its
+    setpoint and integral. Without a setpoint, or with diverged positions, the integral becomes
+    zero."""
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.diverged:
         return replace(c.state, integral_m=(0.0, 0.0))
@@ -163,7 +167,7 @@ def anchor_in_wind(c: Context) -> PlannerState:
 
 
 def limited(x: float, y: float, most: float) -> tuple[float, float]:
-    """The vector (x, y), shortened to a length of `most`."""
+    """Return the vector (x, y), shortened to at most the length `most`."""
     size = math.hypot(x, y)
     return (x, y) if size <= most else (x * most / size, y * most / size)
 
@@ -171,8 +175,8 @@ def limited(x: float, y: float, most: float) -> tuple[float, float]:
 def correct_setpoint(
     c: Context, reference: PositionSetpoint, *, lift: bool = True
 ) -> PositionSetpoint:
-    """The setpoint that brings the vehicle to `reference`, by the equations above; without `lift`
-    at the reference's own height."""
+    """Return the setpoint that brings the vehicle to `reference`, by the equations in the module
+    docstring; without `lift`, at the reference's own height."""
     tel = c.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
@@ -186,7 +190,7 @@ def correct_setpoint(
 
 
 def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
-    """Feedback on top of the onboard loop, near the target only."""
+    """Return the lateral feedback on top of the onboard controllers, near the target only."""
     near = (STIFF_BELOW_M - c.belief.target.error_z_m) / STIFF_RANGE_M
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
@@ -200,7 +204,8 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The held `setpoint` a tick later; lower if the position source is a target out of view."""
+    """Return the held setpoint one tick later; lower if the target is the position source and out
+    of view."""
     b = c.belief
     if not (b.by_target and b.position_is_stale) or b.ground_m is None:
         return setpoint
@@ -210,8 +215,8 @@ def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 
 
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The setpoint moved inside the fence, under the height limit and (fault 36)
-    `GROUND_CLEARANCE_M` above the ground; in a take-off, down to the ground."""
+    """Return the setpoint moved inside the fence, below the height limit and (fault 36) at least
+    `GROUND_CLEARANCE_M` above the ground; in a take-off, at least at the ground."""
     ground, safety = c.belief.ground_m, c.safety
     if ground is None:
         return setpoint

@@ -1,4 +1,4 @@
-"""What the planner remembers from tick to tick: its belief, and what it has decided."""
+"""The planner's memory between ticks: its belief, and its decisions so far."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """How long, and for how many attempts, the battery lasts by the energy model; None: unknown."""
+    """Prediction of the energy model: remaining time and attempts; None means unknown."""
 
-    left_s: float | None = None  # of hovering, until `battery-low` would land it
-    attempts: int | None = None  # with the landing after the last; None before a target
-    used_mah: float = 0.0  # by the count of the thrust
-    rest_v: float | None = None  # what it would have at rest
+    left_s: float | None = None  # hover time until `battery-low` would land the vehicle
+    # including the landing after the last one; None before the first sighting
+    attempts: int | None = None
+    used_mah: float = 0.0  # charge consumed by the assumed current
+    rest_v: float | None = None  # estimated resting voltage
 
 
 @dataclass(frozen=True)
 class LevelDescent:
-    """What a descent by raw thrust remembers; thrusts are 0..65535, and 0 before it has begun."""
+    """Memory of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
-    thrust: float = 0.0  # ordered last
-    sample_s: float = -math.inf  # of the newest sample at its last tick
-    under_way_mps: float = 0.0  # climb that its last orders give, and no sample shows yet
-    floor_felt_s: float | None = None  # it felt the floor
+    thrust: float = 0.0  # last ordered thrust
+    sample_s: float = -math.inf  # time of the newest sample at the last tick
+    under_way_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
+    floor_felt_s: float | None = None  # time at which the floor was detected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +41,12 @@ class PhaseEntry:
     """How the present phase was entered."""
 
     t_s: float = 0.0
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the vehicle, as estimated
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
     yaw_rad: float = 0.0
     row: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
-    claims: Claim = Claim.NONE  # what the transition claims
-    stop: EmergencyStop | StopMotors | None = None  # what it sends at once
+    claims: Claim = Claim.NONE  # claims of the transition
+    stop: EmergencyStop | StopMotors | None = None  # command that the transition sends at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,32 +55,32 @@ class PlannerState:
 
     belief: Belief
     phase: Phase = Phase.APPROACH
-    entry: PhaseEntry = PhaseEntry()  #: when, where and why the phase began
-    started_s: float = 0.0  #: begin of the flight
-    t_s: float = 0.0  #: of the last decision
+    entry: PhaseEntry = PhaseEntry()  #: time, position and reason of the start of the phase
+    started_s: float = 0.0  #: start of the flight
+    t_s: float = 0.0  #: time of the last decision
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
     since: dict[Condition[Any], float] = field(default_factory=dict)
-    """The phases' own conditions that hold, and from when."""
-    attempts: int = 0  #: that have failed
-    confirmed: int = 0  #: frames in a row that measured the target, in this phase
+    """Start time of each true condition of the phases."""
+    attempts: int = 0  #: number of failed attempts
+    confirmed: int = 0  #: number of successive frames in this phase that measured the target
     searched_places: int = 0
     search_step_s: float = 0.0
     setpoint: PositionSetpoint | None = None
     integral_m: tuple[float, float] = (0.0, 0.0)
-    pressed: bool = False  #: the way down begins with full thrust against something
+    pressed: bool = False  #: the phase began with the vehicle pressed at high thrust
     catch_above_m: float | None = None
-    """After a slip, until the fall is stopped: how far above the vehicle the setpoint is."""
-    blocked_z_m: float | None = None  #: something solid is above
-    released_s: float | None = None  #: begin of the release by raw thrust
+    """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
+    blocked_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
+    released_s: float | None = None  #: start of the release by raw thrust
     stopped_s: float | None = None  #: first order to stop the motors
-    ordered_s: float | None = None  #: last order of a landing or motor stop
+    ordered_s: float | None = None  #: last order to land or to stop the motors
     orders: int = 0
-    raw_order: int | None = None  #: raw thrust that was ordered last; None in position mode
+    raw_order: int | None = None  #: last ordered raw thrust; None in position mode
     descent: LevelDescent = LevelDescent()
-    hold: str = ""  #: why the vehicle is held in place, empty when it is not
-    waits: str = ""  #: why your own row keeps it in its phase, empty when none does
-    waited_s: float = 0.0  #: in this phase
+    hold: str = ""  #: why the vehicle holds its position; empty without a hold
+    waits: str = ""  #: why your own row keeps the mission in its phase; empty if none does
+    waited_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
 
     @property
@@ -94,7 +95,7 @@ class PlannerState:
 
     @property
     def pause(self) -> str:
-        """Why the mission does not go on, by a hold or by your own row; else empty."""
+        """Why the mission pauses, by a hold or by your own row; empty if it does not."""
         return self.hold or self.waits
 
     @property
@@ -103,7 +104,7 @@ class PlannerState:
         return self.released_s is None and self.stopped_s is None
 
     def sent(self, maneuver: Maneuver) -> Sent:
-        """What the belief has to know of the orders until now."""
+        """Return the orders so far, in the form that the belief uses."""
         return Sent(
             maneuver=maneuver,
             began_m=self.entry.position_m,
@@ -116,7 +117,7 @@ class PlannerState:
 
     @classmethod
     def on_ground(cls, obs: Observation, profile: Profile) -> PlannerState:
-        """The memory before the first decision, of a vehicle that stands where it will take off."""
+        """Return the memory before the first decision, for a vehicle at its take-off position."""
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
             belief=Belief.on_ground(obs, profile),

@@ -1,6 +1,6 @@
-"""The mission as one ordered table: the first row that matches wins, safety on top.
+"""The mission as one ordered table: the first matching row wins, and safety rows come first.
 
-The diagram and the table of docs/mission.md are drawn from `TABLE`.
+The diagram and the table in docs/mission.md are generated from `TABLE`.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ PHASES: dict[Phase, PhaseDefinition] = {
 EXITS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for row in phase.exits)
 TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXITS)
 CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.conditions)
-"""The phases' own conditions; those of the belief are counted by `update_belief`."""
+"""The phases' own conditions; `update_belief` updates those of the belief."""
 
 
 def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
-    """The first transition that applies, or None to stay. Whatever the table says, a transition
-    from a landing to a flying phase is skipped. Your own waiting row blocks the later `CONTINUE`
-    rows; it is returned if no other row applies."""
+    """Return the first transition that applies, or None to stay. A transition from a landing to a
+    flying phase is skipped, whatever the table contains. Your own waiting row blocks the later
+    `CONTINUE` rows and is returned if no other row applies."""
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None
     for row in table:
@@ -79,19 +79,20 @@ ALLOWED = frozenset(
     for phase in row.phases & BEFORE_CONTACT - {row.to}
     if row.severity >= Severity.HOLD and not row.to.is_over
 ) | {(Phase.ALIGN, Phase.ALIGN, Severity.HOLD)}
-"""What your own row may do, by phase, next phase and severity: wait in ALIGN, or what the table
-itself does to interrupt a mission. None climbs, stops a motor, or proves a contact."""
+"""Combinations of phase, next phase and severity allowed for your own rows: wait in ALIGN, or
+interrupt the mission as the built-in table does. None of them climbs, stops a motor, or proves a
+contact."""
 
 
 def add_rows(
     rows: Iterable[Transition], table: tuple[Transition, ...] = TABLE
 ) -> tuple[Transition, ...]:
-    """The table with your own rows, in their order, behind all safety rows and before the phases'
-    exits. Each waits in ALIGN, or leads back, to RECOVER or down, by `ALLOWED`; in COMPLETE and
-    LANDING none applies.
+    """Return the table with your own rows, in their order, after all safety rows and before the
+    exits of the phases. By `ALLOWED`, each row waits in ALIGN, or returns to an earlier phase, to
+    RECOVER or to LANDING; in COMPLETE and LANDING, none applies.
 
-    Raises InvalidValue for a row that may do more, is no valid `Transition`, or whose name is
-    taken; in flight, for a row whose functions raise, whereupon the vehicle lands.
+    Raises InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name
+    that is taken; in flight, for a row whose functions raise, and then the vehicle lands.
     """
     names, own = {row.name for row in table}, list[Transition]()
     for row in rows if isinstance(rows, Iterable) else (rows,):
@@ -110,14 +111,14 @@ def add_rows(
             raise InvalidValue(f"row {row.name!r} may have no stop, no outcome and no claims")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
         when, reason = _named(row.name, row.when), _named(row.name, row.reason_text)
-        phases = frozenset(row.phases)  # which cannot change in flight
+        phases = frozenset(row.phases)  # an immutable copy, so that it cannot change in flight
         own.append(replace(row, phases=phases, when=when, reason=reason, outcome=outcome))
     at = next(i for i, row in enumerate(table) if row in EXITS)
     return (*table[:at], *own, *table[at:])
 
 
 def _check_types(row: object) -> None:
-    """Raise InvalidValue for what is no valid `Transition`."""
+    """Raise InvalidValue for an object that is not a valid `Transition`."""
     if not (
         isinstance(row, Transition)
         and isinstance(row.phases, Set)
@@ -134,7 +135,8 @@ def _check_types(row: object) -> None:
 
 
 def _named(name: str, function: Callable[[Context], T]) -> Callable[[Context], T]:
-    """The function of your own row; its errors name the row. Raises InvalidValue."""
+    """Wrap a function of your own row so that its exceptions become InvalidValue with the row's
+    name."""
 
     def call(c: Context) -> T:
         try:
@@ -146,13 +148,13 @@ def _named(name: str, function: Callable[[Context], T]) -> Callable[[Context], T
 
 
 def table_of(name: str | None) -> tuple[Transition, ...]:
-    """The table of one flight, with the rows that a profile's `planner.rows` names: some, or a
-    function that returns some. Errors: as `add_rows`, NotFound."""
+    """Return the table of one flight, with the rows that a profile's `planner.rows` names: rows, or
+    a function that returns rows. Raises InvalidValue as `add_rows` does, and NotFound."""
     if name is None:
         return TABLE
     own = load_extension(name, "planner.rows")
     try:
-        # A log's profile may name anything.
+        # The profile in a log may name any object.
         own = own() if isfunction(own) else own
     except Exception as error:
         raise InvalidValue(f"planner.rows: {name} raised {error_at(error)}") from error

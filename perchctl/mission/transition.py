@@ -1,4 +1,4 @@
-"""A row of the mission's table, and builders for the kinds of rows."""
+"""A row of the mission's table, and constructors for the kinds of rows."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ NewOutcome = Outcome | Callable[[Outcome | None], Outcome | None]
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """A row of the table: from any of `phases`, if `when` returns True, to the phase `to`.
+    """A row of the table: from any of `phases` to the phase `to` if `when` returns True.
 
-    `when` gets a `Context`. `reason`, a text or a function of it, is shown to the user; `outcome`,
-    a value or a function of the outcome before, is why the flight ends; `stop` is what a transition
-    into ABORTED sends at once; `claims` is what the row claims of the vehicle.
+    `when` is called with a `Context`. `reason`, a text or a function of the context, is shown to
+    the user. `outcome`, a value or a function of the previous outcome, is the reason why the flight
+    ends. `stop` is the command that a transition into ABORTED sends at once. `claims` are the row's
+    claims about the vehicle.
     """
 
     name: str
@@ -38,11 +39,11 @@ class Transition:
         return self.to is phase and self.severity is Severity.HOLD
 
     def reason_text(self, c: Context) -> str:
-        """The reason in words."""
+        """Return the reason in words."""
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
     def new_outcome(self, before: Outcome | None) -> Outcome | None:
-        """The flight's outcome after this transition."""
+        """Return the flight's outcome after this transition."""
         if self.outcome is None or isinstance(self.outcome, Outcome):
             return self.outcome or before
         return self.outcome(before)
@@ -51,14 +52,14 @@ class Transition:
 def motor_cut_row(
     name: str, when: Predicate, reason: str, outcome: Outcome = Outcome.SAFETY
 ) -> Transition:
-    """A row that cuts and locks the motors at once, in any airborne phase."""
+    """Return a row that cuts and locks the motors at once, in any airborne phase."""
     return Transition(
         name, AIRBORNE, when, Phase.ABORTED, reason, Severity.STOP, outcome, stop=EmergencyStop()
     )
 
 
 def supervisor_row(name: str, bit: int, reason: str) -> Transition:
-    """A row that stops the motors and aborts, since the supervisor has set `bit`."""
+    """Return a row that stops the motors and aborts once the supervisor has set `bit`."""
 
     def when(c: Context) -> bool:
         return c.telemetry.has_bit(bit)
@@ -83,7 +84,7 @@ def land_row(
     outcome: Outcome = Outcome.SAFETY,
     claims: Claim = Claim.NONE,
 ) -> Transition:
-    """A row that ends the mission and begins the way down."""
+    """Return a row that ends the mission and starts the landing."""
     return Transition(
         name, phases, when, Phase.LANDING, reason, Severity.LAND, outcome, claims=claims
     )
@@ -96,14 +97,14 @@ def back_off_row(
     reason: Reason,
     claims: Claim = Claim.NONE,
 ) -> Transition:
-    """A row that ends the attempt: descend a little and try again."""
+    """Return a row that ends the attempt: descend a little and try again."""
     return Transition(name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, claims=claims)
 
 
 def give_up_row(
     name: str, when: Predicate, reason: Reason, claims: Claim = Claim.NONE
 ) -> Transition:
-    """A row that ends a landing which could not be completed normally."""
+    """Return a row that ends a landing which could not be completed normally."""
     return Transition(
         name,
         {Phase.LANDING},
