@@ -1,15 +1,15 @@
-"""From a frame to the target's estimate by pure functions: detection, pose, merge and filter.
+"""Estimate the target from a frame with pure functions: detection, pose, merge and filter.
 
-pipeline: the one way from a picture to the target; its memory is a value.
+pipeline: the only path from a picture to the target; its memory is a value.
 fields: the two pictures of an interlaced frame.
-markers: both markers' corners.
-lens: corners without the lens's distortion.
-pose: the target's pose and covariance by its corners.
-merge: the two ways from two markers to one target.
-target_selection: which of several equal targets is the own one.
-tracks: the gate, and the poses that a filter takes.
+markers: detection of the corners of both markers.
+lens: removal of the lens distortion from corners.
+pose: pose and covariance of the target from its corners.
+merge: the two methods that combine two markers into one target.
+target_selection: choice of the own target among several identical ones.
+tracks: the gate, and the poses that update a filter.
 filter: the paper's Kalman filter.
-types: the values between these.
+types: the values that these modules exchange.
 """
 
 import lazy_loader

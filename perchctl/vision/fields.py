@@ -1,9 +1,10 @@
-"""Pictures of interlaced cameras: found out, taken apart, and put in their order of time; pure.
+"""Deinterlace the frames of analogue cameras: detect, separate and order their fields. Pure.
 
-An interlaced frame is two pictures, half a frame's period apart, each in every second row.
-What moved between them stands in it like a comb: rows are unlike their neighbours.
-Only strong differences count, so that a small target in a noisy picture is enough.
-The later field of a frame is more like the earlier field of the next.
+An interlaced frame consists of two fields, half a frame period apart, each in every second row.
+Motion between the fields shows as combing: a row differs from its neighbours. Only strong
+differences count, so that a small target in a noisy picture is enough. The order of the fields
+follows from successive frames: the later field of a frame is more similar to the earlier field of
+the next one.
 """
 
 from __future__ import annotations
@@ -20,25 +21,25 @@ from perchctl.vision.types import FieldState, Frame
 
 Grey = NDArray[np.uint8]
 
-_COMBED = 1.4  # fields a pixel apart
-# Of so many rows in a group all but the outer four are compared with their neighbours.
+_COMBED = 1.4  # threshold of the ratio of differences; exceeded by fields one pixel apart
+# Rows per group; all but the outer four rows of a group are compared with their neighbours.
 _GROUP = 8
-_STRONG = 5.0  # of the mean difference within a field, for one to count
+_STRONG = 5.0  # multiple of the mean difference within a field above which a difference counts
 _LEAST_GREY = 8.0
-_FLOOR = 0.25  # grey^2 a pixel that noise may leave of strong differences
+_FLOOR = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _EVERY = 3
 _ALIAS_PX, _ALIAS_BLURS = 0.8, 2.45
-_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # a cubic's, half way
+_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # cubic interpolation at the midpoint
 
-_PERIODS_S = (1 / 30, 1 / 25)  # of NTSC and PAL frames
-_VIDEO_PERIODS_S = (0.029, 0.045)  # taken for one of them
+_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
+_VIDEO_PERIODS_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
 _ANY_PERIOD_S = (0.004, 0.1)
 _KEPT_PERIODS = 25
 _LOST_PERIODS = 1.8
-_MAX_GAP_S = 0.25  # older pictures say nothing of the order
-_EVIDENCE = 1.0  # a sum of votes, of at most 1 each, that decides: two frames at least
-_MOST_EVIDENCE = 3.0  # so that a changed order is found in time
-_TURNED_EVIDENCE = 1.0  # against an order that was taken for known
+_MAX_GAP_S = 0.25  # s; older pictures carry no information about the order
+_EVIDENCE = 1.0  # sum of votes, each at most 1, that decides the order: two frames at least
+_MOST_EVIDENCE = 3.0  # limit of the sum, so that a changed order is noticed in time
+_TURNED_EVIDENCE = 1.0  # sum of votes that reverses an order decided before
 
 
 def is_combed(image: Grey) -> bool:
@@ -47,12 +48,12 @@ def is_combed(image: Grey) -> bool:
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return False
-    # Groups of rows side by side: the next row is `width` further along; every third is enough.
+    # Groups of rows in one row: the next row is `width` further on. Every third group is enough.
     flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
     above2, above, row, below, below2 = (
         flat[:, k * width : (k + _GROUP - 4) * width] for k in range(5)
     )
-    # In place: what a frame leaves in the processor's cache is what the next steps need.
+    # In place, to keep the frame in the processor's cache for the next steps.
     other = cv2.addWeighted(above, 0.5, below, 0.5, 0.0)
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
@@ -66,16 +67,17 @@ def is_combed(image: Grey) -> bool:
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
-    """The top and bottom field, each (h, w), of a combed picture; of others the picture alone."""
+    """Return the top and bottom field, each (h, w), of a combed picture; otherwise the picture
+    alone."""
     if not is_combed(image):
         return (image,)
     return interpolate_field(image, 0), interpolate_field(image, 1)
 
 
 def interpolate_field(image: Grey, first_row: int) -> Grey:
-    """The field whose first row is `first_row` (0 or 1), at full height by interpolation."""
+    """Return the field whose first row is `first_row` (0 or 1), interpolated to full height."""
     own = image[first_row::2]
-    # Row k of the result lies between rows k and k + 1 of the field.
+    # Row k of the result is between rows k and k + 1 of the field.
     between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
     picture = image.copy()
     if first_row == 0:
@@ -87,19 +89,20 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
 
 
 def interpolated_sigma_px(blur_px: float) -> float:
-    """Standard deviation, px, of an edge along interpolated rows, given the edge's blur."""
+    """Return the standard deviation, px, of an edge along interpolated rows with a blur of
+    `blur_px`."""
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
 def classify_fields(frame: Frame) -> Frame:
-    """The frame with `fields` set to ``woven`` or ``whole``, if it was None."""
+    """Return the frame with `fields` set to ``woven`` or ``whole`` if it was None."""
     if frame.fields is not None:
         return frame
     return replace(frame, fields="woven" if is_combed(frame.image) else "whole")
 
 
 def field_frames(frame: Frame) -> tuple[Frame, Frame]:
-    """The top and the bottom field of a woven frame, both with the frame's time."""
+    """Return the top and the bottom field of a woven frame, both with the frame's time."""
     return (
         replace(frame, image=interpolate_field(frame.image, 0), fields="top", encoded=None),
         replace(frame, image=interpolate_field(frame.image, 1), fields="bottom", encoded=None),
@@ -107,15 +110,15 @@ def field_frames(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """The new state, and the pictures of a stream's frame in time order: the frame, or its two
-    fields half a period apart around the frame's time.
+    """Return the new state, and the pictures of a stream's frame in time order: the frame itself,
+    or its two fields, a quarter of a period before and after the frame's time.
 
     In a stream without fields so far, only every third frame is examined.
     """
     skip = frame.fields is None and state.kind == "whole" and state.skipped + 1 < _EVERY
     frame = replace(frame, fields="whole") if skip else classify_fields(frame)
     skipped = state.skipped + 1 if skip else 0
-    # A stream of fields stays one.
+    # Once interlaced, a stream counts as interlaced.
     kind = state.kind if state.kind == "woven" else frame.fields
     periods_s = _periods_s(state, frame)
     if frame.fields == "whole":
@@ -137,7 +140,8 @@ def _period_s(periods_s: tuple[float, ...]) -> float:
     if not periods_s:
         return _PERIODS_S[1]
     middle_s = median(periods_s)
-    # A receiver's own rate moves them to and fro: 25 a second in 60 come 33 and 50 ms apart.
+    # The receiver's own rate makes the periods vary: 25 frames a second at 60 Hz arrive 33 and 50
+    # ms apart.
     period_s = mean(p for p in periods_s if p < _LOST_PERIODS * middle_s)
     if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
         return min(_PERIODS_S, key=lambda p: abs(p - period_s))

@@ -1,11 +1,10 @@
 """The paper's Kalman filter (section II-A.1): constant velocity, eight states.
 
-State order as in the paper: yaw, yaw rate, then position and velocity of x, y, z.
-The time step is the real one: with 15 % late frames a fixed step gave 0.63 cm RMS,
-the real one 0.19 cm.
+The state order is the paper's: yaw, yaw rate, then position and velocity of x, y, z. The time step
+is the actual one: with 15 % late frames, a fixed step gave 0.63 cm RMS, the actual step 0.19 cm.
 
-Constant errors (the vehicle's roll and pitch, the print's size and curl) are consider terms: they
-change no gain, only what is claimed.
+Constant errors (the vehicle's roll and pitch, the print's size and curl) are consider states: they
+do not change the gain, only the claimed covariance.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from perchctl.vision.types import MarkerTrack
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
 MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
-TILTS, PRINT = slice(0, 2), slice(2, 4)  # of the constant errors
+TILTS, PRINT = slice(0, 2), slice(2, 4)  # columns of the constant errors
 
 MAX_TRACK_GAP_S = 1.0
 MAX_PREDICTION_S = 1.0
-"""Beyond it the target is taken to stay where it was predicted."""
+"""Longest prediction, s; after it, the target is assumed to stay at the predicted position."""
 
 _AXES: Array = np.eye(3)
 _STILL: Array = np.eye(8)
@@ -38,22 +37,26 @@ _MOVES[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, per state
+_UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # units of the paper, per state
 
 _PUSH_S = 0.1
-"""How long an acceleration lasts: white noise of its square times this, (m/s^2)^2 s."""
+"""Duration of an acceleration, s: the density of the white noise is its square times this,
+(m/s^2)^2 s."""
 _WANDER = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
-"""Of yaw, x, y and z of the state estimate: in a second's random walk."""
-_HEADING_RADPS2 = 0.1  # of the state estimate's heading
+"""Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
+m^2)."""
+_HEADING_RADPS2 = 0.1  # acceleration of the state estimate's heading
 _RESTART_NIS = 25.0
-"""Normalized innovation squared, four degrees of freedom: by chance in 5 of 100 000. Larger: a lost
-frame teaches a camera's track a speed that nothing had. Smaller: noise restarts the track."""
+"""Limit of the normalized innovation squared (NIS), four degrees of freedom: exceeded by chance in
+5 of 100 000 updates. Larger: after a lost frame, the track of a camera alone learns a wrong
+velocity. Smaller: noise restarts the track."""
 
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Standard deviations of accelerations: of a tracked target along each axis, of its heading,
-    of the level frame's rotation (`turn_radps2`). `is_drifting`: the tracks' frame is the world."""
+    """Standard deviations of accelerations: of the target along each axis, of its heading, and of
+    the rotation of the level frame (`turn_radps2`). `is_drifting` is True if the tracks are in the
+    world frame."""
 
     acceleration_mps2: float
     heading_radps2: float
@@ -69,14 +72,16 @@ class ProcessNoise:
 
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
-    """R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2) in SI;
-    P0 (8, 8) is the covariance after the first measurement; `alpha`, `n_max`: as in the profile.
-    If `process` is not None, it replaces Q, and each pose's own covariance replaces R.
+    """The constants of a filter: R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper
+    (cm^2, deg^2), converted to SI. P0 (8, 8) is the covariance after the first measurement. `alpha`
+    and `n_max` are those of the profile. If `process` is not None, it replaces Q, and the
+    covariance of each pose replaces R.
 
     A measurement z with the innovation v = z - H x and its covariance S = H P H^T + R restarts the
-    track if v^T S^-1 v (NIS) exceeds `restart_nis`. The model does not explain it, for example
-    after lost frames, and an update would turn the jump into a speed that S does not cover. The
-    track restarts at z with R + v v^T: until the next measurement, z may be the wrong one.
+    track if v^T S^-1 v (NIS) exceeds `restart_nis`. The model does not explain such a measurement,
+    for example after lost frames, and an update would turn the jump into a velocity that S does not
+    cover. The track restarts at z with R + v v^T, since z may be the wrong one until the next
+    measurement.
     """
 
     R: Array
@@ -86,14 +91,15 @@ class FilterSetup:
     n_max: int
     process: ProcessNoise | None = None
     tilt_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
-    drift_mps: float = math.inf  # most that the target moves while nothing is measured
+    drift_mps: float = math.inf  # largest speed of the target in its frame without measurements
     restart_nis: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """z = (yaw, x, y, z) of a target, (4,); R (4, 4), its covariance, None: the setup's R; and
-    `bias` (4, 4), the shift of z by one standard deviation of each constant error, or None."""
+    """A measurement of a target: `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4); None
+    means the setup's R. `bias` (4, 4) is the shift of z by one standard deviation of each constant
+    error, or None."""
 
     z: Array
     R: Array | None = None
@@ -101,8 +107,8 @@ class Measurement:
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
-    """The filter's constants. The velocity's initial sigma is 5 cm/s in the world, and in the
-    level frame 30 cm/s, or 1 m/s with measured noise."""
+    """Return the filter's constants. The initial standard deviation of the velocity is 5 cm/s in
+    the world frame, and 30 cm/s in the level frame, or 1 m/s with measured noise."""
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
@@ -124,29 +130,30 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
         process=process,
         tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         drift_mps=config.drift_mps if in_world else math.inf,
-        # In flight the gate recognises steps of the state estimate (`perchctl.vision.tracks`).
+        # In flight, the gate detects jumps of the state estimate (`perchctl.vision.tracks`).
         restart_nis=_RESTART_NIS if measured and not in_world else math.inf,
     )
 
 
 def tilt_jacobian(vector_m: Array) -> Array:
-    """Derivative (3, 2), m/rad, of `vector_m` (3,) by rotations about level x and y."""
+    """Return the derivative (3, 2), m/rad, of `vector_m` (3,) by rotations about level x and y."""
     x, y, z = vector_m
     return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
 def transition_matrix(dt_s: float) -> Array:
-    """The state transition matrix F (8, 8) of the paper's equation 1, over `dt_s`."""
+    """Return the state transition matrix F (8, 8) of the paper's equation 1 over `dt_s`."""
     return _STILL + dt_s * _MOVES
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
-    """The process noise Q (8, 8) over `dt_s` for a target at `position_m` (3,) in its frame."""
+    """Return the process noise Q (8, 8) over `dt_s` for a target at `position_m` (3,) in its
+    frame."""
     noise = setup.process
     if noise is None:
         return setup.Q
     pushed = _pushed(noise, position_m) * dt_s
-    # Of a value and its rate, which follow each other in the state.
+    # A value and its rate are adjacent in the state.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.is_drifting:
@@ -155,7 +162,7 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
 
 
 def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
-    """Return what a second adds to the rates of yaw, x, y and z, (4, 4)."""
+    """Return the covariance (4, 4) that one second adds to the rates of yaw, x, y and z."""
     if noise.turn_radps2 == 0.0:
         return noise.rate_variance
     turned2 = noise.turn_radps2**2 * _PUSH_S
@@ -168,7 +175,7 @@ def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
 
 
 def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """A track that begins with the measurement, at `t_s`."""
+    """Return a track that starts with the measurement at `t_s`."""
     x = np.zeros(8)
     x[MEASURED] = measured.z
     x[YAW] = wrap_rad(float(measured.z[0]))
@@ -187,17 +194,17 @@ def step_track(
     t_s: float,
     setup: FilterSetup,
 ) -> MarkerTrack | None:
-    """The track predicted to a frame's time and, if the marker was measured, updated.
+    """Predict the track to a frame's time and, if the marker was measured, update it.
 
     Args:
         track: the track so far, None before the first measurement.
-        measured: None, or not finite, if the marker was not measured.
+        measured: the measurement; None or not finite if the marker was not measured.
         t_s: the frame's time.
 
     Returns None without a track: never measured, or unseen for more than `n_max` frames (equation
-    3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap beyond
-    `MAX_TRACK_GAP_S` in either direction starts afresh, and so does a measurement that the motion
-    model does not explain (`FilterSetup.restart_nis`).
+    3's k_n <= n_max). A frame that is not newer than the track changes nothing. A gap of more than
+    `MAX_TRACK_GAP_S` in either direction restarts the track, and so does a measurement that the
+    motion model does not explain (`FilterSetup.restart_nis`).
     """
     if measured is not None and not is_finite(measured.z):
         measured = None
@@ -234,17 +241,17 @@ def step_track(
 
 
 def _innovation(x: Array, z: Array) -> Array:
-    """A measurement less the predicted one, (4,); the yaw is the nearest to the prediction."""
+    """Return the innovation (4,): measurement minus prediction, with the yaw difference wrapped."""
     off = z - x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
     return off
 
 
 def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Return state and covariance after a measurement, in Joseph's form, and the gain (8, 4)."""
+    """Return state and covariance after a measurement, in Joseph form, and the gain (8, 4)."""
     off = _innovation(x, z)
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
-    if not regular:  # no covariance: it tells nothing
+    if not regular:  # S is not a covariance, so the measurement has no weight
         return x, P, np.zeros((8, 4))
     gain = np.asarray(solved.T, dtype=np.float64)
     x = x + gain.dot(off)
@@ -257,7 +264,7 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
 def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, with_cov: bool = True
 ) -> MarkerTrack:
-    """The track predicted to `t_s`; without `with_cov` the covariance stays as it is."""
+    """Return the track predicted to `t_s`; without `with_cov`, the covariance does not change."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
@@ -269,7 +276,7 @@ def predict_track(
 
 
 def _drifting(x: Array, setup: FilterSetup) -> Array:
-    """The state with its speed limited to the frame's drift."""
+    """Return the state with its speed limited to the drift of its frame."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.drift_mps:
         return x
@@ -281,7 +288,7 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
 def _moved(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
-    """The track at `t_s`, its state being x, without a measurement."""
+    """Return the track predicted from the state `x` to `t_s`, without a measurement."""
     x = _drifting(x, setup)
     F = transition_matrix(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))

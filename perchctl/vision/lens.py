@@ -1,7 +1,7 @@
-"""From pixels to rays and back: the only place with a model of the lens.
+"""Convert pixels to rays and back: the only module with a lens model.
 
-Corners are undistorted, never pictures: undistorting the frame first loses
-markers at its rim and blurs the rest.
+Corners are undistorted, never pictures: undistorting the frame first loses markers at its edge and
+blurs the others.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.vision.types import CameraModel
 
-# OpenCV's default stops five iterations in, up to 0.12 px off at the corners of the picture.
+# OpenCV's default stops after five iterations, with errors of up to 0.12 px in the picture's
+# corners.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)  # px
 _ZERO = np.zeros(3)
 
@@ -20,8 +21,8 @@ _ZERO = np.zeros(3)
 def undistort(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
 
-    A point that the lens model cannot have imaged becomes NaN or lies far outside; no exception
-    is raised.
+    A point that the lens model cannot image becomes NaN or lies far outside; no exception is
+    raised.
     """
     points = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1, 1, 2)
     if len(points) == 0:
@@ -33,12 +34,13 @@ def undistort(points_px: Array, camera: CameraModel) -> Array:
 
 
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
-    """Convert pixels (n, 2) of the real lens to pixels (n, 2) of a pinhole with the same `K`."""
+    """Convert pixels (n, 2) of the lens to pixels (n, 2) of a pinhole camera with the same `K`."""
     return pinhole_px(undistort(points_px, camera), camera)
 
 
 def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole with the camera's `K`."""
+    """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole camera with the same
+    `K`."""
     K = camera.K
     result = np.empty_like(normalised)
     result[:, 0] = K[0, 0] * normalised[:, 0] + K[0, 1] * normalised[:, 1] + K[0, 2]
@@ -54,7 +56,8 @@ def distort(normalised: Array, camera: CameraModel) -> Array:
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """The pixels (n, 2) of points (n, 3) in a frame whose pose in the camera is (rvec, tvec)."""
+    """Project points (n, 3), whose frame has the pose (rvec, tvec) in the camera, to pixels (n,
+    2)."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _projected(points, rvec, tvec, camera)

@@ -1,8 +1,8 @@
-"""The two ways from one frame's markers to the target.
+"""Combine the markers of one frame into the target, by one of two methods.
 
-`weights` is the paper's (section II-A): a pose and a Kalman filter for each marker, then W.
-`joint` solves both markers' corners at once and filters that one pose, which a marker alone feeds
-too.
+`weights` is the paper's method (section II-A): a pose and a Kalman filter per marker, merged by W.
+`joint` solves the corners of both markers at once and filters that single pose; a marker alone
+updates the same filter.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from perchctl.vision.types import (
 )
 
 CONSISTENT_CHI2 = 4.0
-"""Per degree of freedom: below it, both markers cannot contradict."""
+"""Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
 _PLACE_YAW = [X, Y, Z, YAW]
 _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
@@ -35,9 +35,10 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
     """The target in the tracks' frame: `vector` (x, y, z, yaw), velocity (3,), covariance (3, 3) of
-    the position, variance of the yaw, frames `unseen` and the newest frame's stage.
+    the position, variance of the yaw, number of frames `unseen`, and the stage of the newest frame.
 
-    `bias_m` (3, 4): shift of the position by one standard deviation of each constant error."""
+    `bias_m` (3, 4) is the shift of the position by one standard deviation of each constant error.
+    """
 
     vector: Array
     velocity_mps: Array
@@ -58,7 +59,7 @@ def measure_markers(
 ) -> MeasuredMarkers:
     """Solve the poses of a frame's markers, and choose the tracks that these poses update.
 
-    `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,) is
+    `near` is the last pose of the target, moved by the vehicle's motion since. `normal_cam` (3,) is
     the target's normal in the last pose, in the camera's axes at that time.
     """
     seen, t_s = undo_rolling_shutter(detections, setup), detections.t_s
@@ -102,8 +103,8 @@ def measure_markers(
 def merge_tracks(
     tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
 ) -> MergedTarget | None:
-    """The target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
-    `fed` update, or else from the tracks measured last; None without tracks."""
+    """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
+    `fed` update, or otherwise from the tracks measured last; None without tracks."""
     if not tracks:
         return None
     least = min(track.unseen for track in tracks.values())
@@ -122,7 +123,7 @@ def merge_tracks(
         )
     large, small = used["large"], used["small"]
     order = _PLACE_YAW
-    W2 = weight_matrix(weights) ** 2  # of independent errors
+    W2 = weight_matrix(weights) ** 2  # squared: the errors are independent
     pairs = np.stack([np.diag(large.P)[order], np.diag(small.P)[order]], axis=1)
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
@@ -138,8 +139,8 @@ def merge_tracks(
 
 
 def widen(merged: MergedTarget, rival: Array) -> MergedTarget:
-    """The target with a spread that covers another place where it may be as well: the state (8,) of
-    a `rival` that contradicts. Value and rival differ by d, and the covariance grows by d d^T."""
+    """Return the target with a covariance that covers a second possible position: the state (8,) of
+    a contradicting `rival`. With the difference d between both, the covariance grows by d d^T."""
     off = rival[_PLACE_YAW] - merged.vector
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -149,22 +150,24 @@ def widen(merged: MergedTarget, rival: Array) -> MergedTarget:
     )
 
 
-# --- Corners of a rolling shutter at one moment ---
-# Rows are exposed one by one within the read-out time: each corner is moved along its own motion
-# to the middle row's moment, the frame's time.
+# --- Undo the rolling shutter ---
+# Rows are exposed one after the other within the readout time. Each corner is moved along its own
+# motion to the time of the middle row, which is the frame's time.
 
 
 UNKNOWN_READOUT_S = 0.012
-"""One standard deviation of a camera's read-out time where nobody has said it."""
+"""Standard deviation of a camera's readout time if the profile does not specify it, s."""
 FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
-"""Of a motion, along and across, as shares of it: it was measured a frame before."""
+"""Errors along and across a corner's motion, as shares of it, since the motion was measured one
+frame earlier."""
 
 
 def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """The markers with their corners moved to the frame's time.
+    """Return the markers with their corners moved to the frame's time.
 
-    If `setup.readout_s` is None, the corners stay, and `common_px` is their shift by a likely
-    read-out time; otherwise `common_px`, `sigma_px` and `cov_px2` hold the shift's error."""
+    If `setup.readout_s` is None, the corners stay, and `common_px` is their shift for a typical
+    readout time. Otherwise `common_px`, `sigma_px` and `cov_px2` contain the error of the shift.
+    """
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
@@ -175,9 +178,9 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
         if flow is None:
             out.append(d)
             continue
-        # From frame to frame a corner that moves down is also seen later.
+        # A corner that moves down from frame to frame is also exposed later.
         flow = flow / (1.0 + flow[..., 1:] * late / (height_px - 1.0))
-        # How much later than the middle row each corner's row is exposed.
+        # Time from the middle row's exposure to each corner's.
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
@@ -197,18 +200,19 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
     return out
 
 
-# --- Merging the two markers into the one pose of the target (paper, section II-A.2) ---
+# --- Merge the two markers into one target pose (paper, section II-A.2) ---
 
 
 def detected_stage(large: bool, small: bool) -> Stage:
-    """The stage of a frame, by whether its large and its small marker were detected."""
+    """Return the stage of a frame from whether its large and its small marker were detected."""
     if large:
         return Stage.BOTH if small else Stage.LARGE
     return Stage.SMALL if small else Stage.NONE
 
 
 def weight_matrix(weights: WeightsConfig) -> Array:
-    """Return the weights W (4, 8) of equation 9; columns: x, y, z, yaw, each of large, small."""
+    """Return the weights W (4, 8) of equation 9; columns: x, y, z, yaw, each for large and
+    small."""
     W = np.zeros((4, 8))
     for row, w in enumerate((weights.x, weights.y, weights.z, weights.yaw)):
         W[row, 2 * row : 2 * row + 2] = w, 1.0 - w
@@ -216,7 +220,7 @@ def weight_matrix(weights: WeightsConfig) -> Array:
 
 
 def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8, the yaws as angles."""
+    """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8, with the yaws as angles."""
     W = weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
@@ -224,8 +228,8 @@ def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 
 def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
-    """True if the markers are farther apart than `limit_m` and than four standard
-    deviations, in any axis. The print's errors move both alike, so they add no tolerance."""
+    """True if the markers differ by more than `limit_m` and four standard deviations on any axis.
+    Errors of the print shift both markers alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])
@@ -233,6 +237,6 @@ def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bo
 
 
 def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """The pose whose position has the smaller standard deviation."""
+    """Return the pose whose position has the smaller standard deviation."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

@@ -1,8 +1,8 @@
-"""THE pipeline: one frame through detection, pose, filter and merge.
+"""The vision pipeline: one frame through detection, pose, filter and merge.
 
-`step` is the only way from a picture to a pose, and `estimate` carries its result to any later
-moment. All memory is in `PipelineState`, which goes in and comes out.
-Matrices of a few numbers are multiplied by `dot`: `@` takes twice as long.
+`step` is the only path from a picture to a pose, and `estimate` predicts its result to any later
+time. All memory is in `PipelineState`, which the functions take and return. Small matrices are
+multiplied by `dot` because `@` takes twice as long.
 """
 
 from __future__ import annotations
@@ -64,10 +64,11 @@ SEVERAL = "more than one target in view: the one that was tracked is followed"
 
 
 class Detector(Protocol):
-    """A function that ``detector.own`` of a profile names. It gets a grey picture (height, width),
-    and returns a dict with ``large`` and ``small``, if seen: the marker's corners (4, 2) px, top
-    left, top right, bottom right, bottom left on the paper; or a tuple of these and their standard
-    deviation, px (by default 0.5). (0, 0) is the centre of the top-left pixel."""
+    """A detection function that ``detector.own`` in a profile names. It takes a grey picture
+    (height, width) and returns a dict with the detected markers, ``large`` and ``small``. Each
+    value is an array of corners (4, 2) px in the order top left, top right, bottom right, bottom
+    left on the paper, or a tuple of corners and their standard deviation, px (0.5 by default). (0,
+    0) is the centre of the top-left pixel."""
 
     def __call__(self, image: NDArray[np.uint8], /) -> Mapping[str, Any]: ...
 
@@ -80,7 +81,7 @@ Step = Callable[
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """The pipeline's constants, made by `make_pipeline`. `own_step` is called instead of `step`."""
+    """The pipeline's constants, made by `make_pipeline`. If set, `own_step` replaces `step`."""
 
     detector: DetectorSetup
     pose: PoseSetup
@@ -95,10 +96,11 @@ class Pipeline:
 def make_pipeline(
     profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
 ) -> Pipeline:
-    """The profile's pipeline for a calibrated camera; several streams may share it.
+    """Return the profile's pipeline for a calibrated camera; several streams may share it.
 
-    `covered`: pixels (h, w) that the vehicle covers in the camera's pictures; None: read
-    `camera.mask`. Errors: NotFound, InvalidValue (`camera.mask`)."""
+    `covered` marks the pixels (h, w) that the vehicle covers in the camera's pictures; None reads
+    `camera.mask`. Raises NotFound, and InvalidValue for an invalid `camera.mask`.
+    """
     pose = PoseSetup(
         config=profile.pose,
         target=profile.target,
@@ -115,7 +117,8 @@ def make_pipeline(
     if detector.fits_lines:
         prepare_cut_markers(detector.patterns, camera)
     target = profile.target
-    own = OwnTargetPlace(profile.planner.approach_xy_m)  # where the vehicle is sent to look for it
+    # the position where the vehicle searches for it
+    own = OwnTargetPlace(profile.planner.approach_xy_m)
     if target.expected_xy_m is not None:
         own = OwnTargetPlace(target.expected_xy_m, target.expected_within_m)
     return Pipeline(
@@ -138,7 +141,7 @@ def make_pipeline(
 
 
 def camera_profile(profile: Profile) -> Profile:
-    """The profile for tracking by a camera alone: without mounting and gear, so that poses
+    """Return the profile for tracking with a camera alone: without mounting and gear, so that poses
     are in the camera frame, and with a pose of each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
     return profile.model_copy(
@@ -153,8 +156,8 @@ def camera_profile(profile: Profile) -> Profile:
 def pictures(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
-    """The new state, and the frames to give to `step` one by one: the frame itself, or its two
-    fields in time order if the camera is interlaced. Errors: as `step`."""
+    """Return the new state, and the frames to pass to `step` one by one: the frame itself, or its
+    two fields in time order if the camera is interlaced. Raises InvalidValue as `step` does."""
     with one_thread():
         frame = _grey_frame(frame, pipeline.camera)
         fields, found = separate_fields(state.fields, frame)
@@ -165,9 +168,9 @@ def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
     """Process a frame, in grey or colour; return the new state and the frame's output. Raises
-    InvalidValue for an image that is none, or not of the calibration's size.
+    InvalidValue for an invalid image, or one that does not have the size of the calibration.
 
-    If `attitude`, the vehicle's at the frame's time, is None, the vehicle counts as level and at
+    `attitude` is the vehicle's at the frame's time. Without it, the vehicle is assumed level and at
     rest, and the filter works in the level frame, whatever `kalman.frame` says.
     """
     frame = classify_fields(_grey_frame(frame, pipeline.camera))
@@ -175,7 +178,7 @@ def step(
     if pipeline.own_detector is not None:
         detections = _own_detections(frame, pipeline.own_detector)
     else:
-        # A first picture is searched by all means.
+        # The first picture is searched by all methods.
         first = state.last is None and state.rival is None and state.empty_frames == 0
         empty = None if first else state.empty_frames
         place = pipeline.tracks.own_place
@@ -188,7 +191,7 @@ def step(
 
 
 def _grey_frame(frame: Frame, camera: CameraModel) -> Frame:
-    """The frame in grey. Raises InvalidValue."""
+    """Return the frame in grey. Raises InvalidValue."""
     grey, size_px = to_grey(frame.image), camera.size_px
     if grey is not frame.image:
         frame = replace(frame, image=grey, encoded=None)
@@ -202,7 +205,7 @@ def _grey_frame(frame: Frame, camera: CameraModel) -> Frame:
 
 
 def _own_detections(frame: Frame, detect: Detector) -> Detections:
-    """The detections of `detect`. Raises InvalidValue for values that cannot be corners."""
+    """Return the detections of `detect`. Raises InvalidValue for values that cannot be corners."""
     found: dict[MarkerName, Detection] = {}
     try:
         for name, value in dict(detect(frame.image) or {}).items():
@@ -228,8 +231,8 @@ def step_detections(
     near: PoseCandidate | None = None,
     fields: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` after detection; `near` is the target's expected pose, `fields`
-    the picture's kind."""
+    """Run the part of `step` after the detection. `near` is the expected pose of the target,
+    `fields` the kind of the picture."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
     measured = measure_markers(detections, attitude, near, normal, pipeline.merge, pipeline.pose)
@@ -286,11 +289,11 @@ def estimate(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> TargetEstimate | None:
-    """The target at `t_s`, after the newest frame, for the vehicle's attitude at `t_s`.
+    """Return the target at `t_s`, after the newest frame, for the vehicle's attitude at `t_s`.
 
-    A tracked target is predicted by its filter and carried on by the vehicle's motion. A target no
-    longer tracked stays at its last place in the world. None before the first measurement. Without
-    `spread` the standard deviations stay those of the newest frame.
+    A tracked target is predicted by its filter and by the vehicle's motion. A target that is no
+    longer tracked stays at its last position in the world. Returns None before the first
+    measurement. Without `spread`, the standard deviations stay those of the newest frame.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:
@@ -319,7 +322,7 @@ def estimate(
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
-# --- from the tracks to the target ---
+# --- From the tracks to the target ---
 
 
 def _at_frame(

@@ -1,9 +1,9 @@
-"""From corners to the target's pose relative to the gear.
+"""Compute the target's pose relative to the gear from its corners.
 
-A planar marker has two tilts with nearly the same picture; which one is true is decided by the
-vehicle's roll and pitch (the target lies level) or by the tilt of the frame before. The position is
-turned level by the vehicle's roll and pitch, too, never by the marker's own axes: at 1.15 m that is
-0.5 mm against 40 mm.
+A planar marker has two tilts with nearly identical pictures. The vehicle's roll and pitch decide
+between them (the target is horizontal), or otherwise the tilt in the previous frame. The position
+is also rotated to the level frame by the vehicle's roll and pitch, never by the marker's own axes:
+at 1.15 m, the error is 0.5 mm instead of 40 mm.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from perchctl.values import cached_property, replace
 from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 
-_ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
+_ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling combined
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
-_CURLED_CHI2 = 3.0  # of both markers' corners on a flat sheet, a degree of freedom
-_CURL_LEFT_SHARE = 0.5  # of that is left where the sheet's curl is what it comes from
+_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
+_CURL_LEFT_SHARE = 0.5  # share that may remain if the curl of the sheet is the cause
 _Source = Literal["large", "small", "joint"]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """The constants of pose estimation: `T_body_cam` (4, 4), the camera's mounting, `gear_body_m`
-    (3,), the gear's tip, and `readout_s`, the time from a picture's first row to its last (None:
-    unknown)."""
+    """The constants of pose estimation: `T_body_cam` (4, 4) is the camera's mounting, `gear_body_m`
+    (3,) the tip of the gear, and `readout_s` the time from a picture's first row to its last (None
+    if unknown)."""
 
     config: PoseConfig
     target: TargetConfig
@@ -44,26 +44,26 @@ class PoseSetup:
 
     @cached_property
     def corners_m(self) -> dict[_Source, Array]:
-        """Corners (4, 3) of each marker in its own axes; ``joint`` (8, 3): large, then small."""
+        """Corners (4, 3) of each marker in its own axes, m; ``joint`` (8, 3): large, then small."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
     @cached_property
     def curl_lift_m(self) -> dict[_Source, Array]:
-        """How far each corner lies off the sheet's plane, m, for one standard deviation of each of
-        the curl's two modes: (8, 2), ``joint`` (16, 2), each corner twice, for x and y."""
+        """Distance of each corner from the sheet's plane, m, for one standard deviation of each of
+        the two modes of curl: (8, 2), ``joint`` (16, 2), with each corner twice, for x and y."""
         curl = self.target.curl_per_m
         return {source: curl_lift(corners, curl) for source, corners in self.corners_m.items()}
 
 
 def square_corners(side_m: float) -> Array:
-    """The corners TL TR BR BL of a marker in its own axes, (4, 3) m; z is 0."""
+    """Return the corners TL TR BR BL of a marker in its own axes, (4, 3) m, with z = 0."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
 def level_rotation(attitude: Attitude | None) -> Array:
-    """Return ``R_level_body`` (3, 3); without an attitude the vehicle counts as level."""
+    """Return ``R_level_body`` (3, 3); without an attitude, the vehicle is assumed level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
 
@@ -75,17 +75,17 @@ def estimate_pose(
     previous_normal_cam: Array | None = None,
     start: PoseCandidate | None = None,
 ) -> MarkerPose | None:
-    """The pose from one marker's corners, or from both markers' corners at once.
+    """Return the pose from one marker's corners, or from both markers' corners at once.
 
-    `start`, the same frame's joint pose, is refined on these corners instead of solving anew, as
-    its tilt is already decided. Without an attitude `previous_normal_cam` (3,) decides the tilt.
-    None if the corners give no pose: no finite solution in front of the camera, or a reprojection
-    error (RMS over the corners) above `pose.max_reprojection_px`.
+    `start`, the joint pose of the same frame, is refined with these corners instead of solving from
+    scratch, since its tilt is already decided. Without an attitude, `previous_normal_cam` (3,)
+    decides the tilt. Returns None if the corners yield no pose: no finite solution in front of the
+    camera, or a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
     """
     source: _Source = "joint" if len(detections) > 1 else detections[0].marker
     image_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
     if not is_finite(image_px):
-        return None  # the lens cannot have imaged them
+        return None  # the lens model cannot image these corners
     K, lift = setup.camera.K, setup.curl_lift_m[source]
     points = weigh_corners(detections, setup.corners_m[source], image_px, K, lift)
     R_level_body = level_rotation(attitude)
@@ -103,7 +103,8 @@ def estimate_pose(
         return pose
     if any(d.lying_sigma_px > 0.0 for d in detections):
         return pose  # sides between interpolated rows look curled
-    # No flat sheet has both markers where they are. One that curls may, or the corners err.
+    # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
+    # wrong.
     points = replace(points, curled=True)
     settled = _continued(points, solution, prior, most_px)
     if settled is None:
@@ -115,7 +116,7 @@ def estimate_pose(
 def _continued(
     points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> ScoredPose | None:
-    """The solution next to a start, if it leaves `most_px` RMS or less."""
+    """Return the solution refined from `start` if its RMS error is at most `most_px`, else None."""
     solution = None if start is None else refine_pose(points, start)
     if solution is None or not solution.rms_px <= most_px or prior.contradicts(solution):
         return None
@@ -136,11 +137,11 @@ def _level_pose(
     cov, chi2, curl = pose_covariance(points, solution)
     e_m = R_level_body.dot(R_body_cam.dot(solution.tvec) + t_body_cam_m - setup.gear_body_m)
     heading = R_level_cam.dot(R).dot(R_MARKER_TARGET)
-    G = np.zeros((4, 6))  # change of (e, e_yaw) with (rvec, tvec)
+    G = np.zeros((4, 6))  # derivative of (e, e_yaw) by (rvec, tvec)
     G[:3, 3:] = R_level_cam
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
     cov_e = G.dot(cov).dot(G.T)
-    # A target that is larger by a share is farther away by that share of the way to it.
+    # A target that is larger by some share is further away by the same share of the distance.
     print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
     print_m = R_level_cam.dot(print_cam.T)
     cov_e[:3, :3] += print_m.dot(print_m.T)
@@ -163,49 +164,48 @@ def _level_pose(
 
 
 def camera_covariance(pose: MarkerPose) -> Array:
-    """Return a pose's covariance (6, 6) as small turns (rad) about and shifts (m) along the
-    camera's x, y, z, without the print's errors."""
+    """Return a pose's covariance (6, 6) as small rotations (rad) about and translations (m) along
+    the camera's x, y, z, without the errors of the print."""
     assert pose.camera_cov is not None
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(pose.rvec_rad))
-    turns = dR.reshape(3, 3, 3) @ R.T  # of each component of the rotation vector, skew-symmetric
+    turns = dR.reshape(3, 3, 3) @ R.T  # per component of the rotation vector, skew-symmetric
     J = np.eye(6)
     J[:3, :3] = turns[:, (2, 0, 1), (1, 2, 0)].T
     return np.asarray(J @ pose.camera_cov @ J.T)
 
 
 def rotation_matrix(rvec: Array) -> Array:
-    """The rotation matrix (3, 3) of a rotation vector (3,) rad."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), rad."""
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
 def rotation_vector(R: Array) -> Array:
-    """The rotation vector (3,) rad of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,), rad, of a rotation matrix (3, 3)."""
     return np.asarray(cv2.Rodrigues(R)[0], dtype=np.float64).ravel()
 
 
 def normal_cam(pose: MarkerPose) -> Array:
-    """The marker's z axis (out of the paper) in camera axes, (3,)."""
+    """Return the marker's z axis (out of the paper) in camera axes, (3,)."""
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
 def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
-    """The change (3,) of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9)."""
+    """Return the derivative (3,) of atan2(h[1, 0], h[0, 0]) by rvec through ``dR/drvec`` (3, 9)."""
     dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(heading[0, 0]), float(heading[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))
 
 
-# --- Rotation and translation from corners: a closed form, then least squares in which each ---
-# corner counts as it was measured.
+# --- Rotation and translation from corners: a closed form, then weighted least squares ---
 
 
-_MIN_FLIP_RAD = math.radians(2.0)  # closer solutions are one
-_MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can show
+_MIN_FLIP_RAD = math.radians(2.0)  # solutions closer than this are the same
+_MIN_SCORE_SIGMA_PX = 0.05  # lens and print limit the information in smaller residuals
 _MAX_STEPS = 8
-_TRUST = 8.0  # degrees of freedom that the claimed spread is worth beside the residuals
+_TRUST = 8.0  # weight of the claimed spread against the residuals, in degrees of freedom
 
 _SMALL_GAIN, _SMALL_STEP = 1.0, 0.005  # rad and m
-# Departs from linear by its square over the corners' distances, 20 px or more.
+# The nonlinearity is the square of the motion over the distance between corners, 20 px or more.
 _SMALL_MOVE_PX = 0.3
 
 
@@ -219,27 +219,29 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose(PoseCandidate):
-    """A candidate, its reprojection errors (n, 2) and their Jacobian (2n, 6) by rvec, tvec."""
+    """A candidate, its reprojection errors (n, 2) and their Jacobian (2n, 6) by rvec and tvec."""
 
     error_px: Array
     jacobian: Array
 
     @property
     def rms_px(self) -> float:
-        """The root mean square distance of projected from measured corners."""
+        """Root mean square distance of projected from measured corners, px."""
         flat = self.error_px.ravel()
         return math.sqrt(float(flat.dot(flat)) / len(self.error_px))
 
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """Expected normal (3,) of the marker, camera axes, None if unknown, and its angle's sigma."""
+    """Expected normal (3,) of the marker in camera axes, None if unknown, and its standard
+    deviation."""
 
     normal_cam: Array | None
     spread_rad: float
 
     def contradicts(self, candidate: PoseCandidate) -> bool:
-        """True if the candidate's normal and a known `normal_cam` differ by over `spread_rad`."""
+        """True if the candidate's normal differs from a known `normal_cam` by more than
+        `spread_rad`."""
         return (
             self.normal_cam is not None
             and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
@@ -247,7 +249,7 @@ class TiltPrior:
 
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
-    """The better of a planar marker's two possible poses; None if neither is valid."""
+    """Return the better of the two possible poses of a planar marker; None if neither is valid."""
     candidates = [_refined(points, c) for c in _closed_form(points)]
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
@@ -255,13 +257,13 @@ def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     best = _likeliest(scored, points, prior)
     if prior.normal_cam is None or prior.contradicts(best):
         best = _likeliest([best, *_other_tilt(best, points)], points, prior)
-    # The unweighted optimum is near enough for errors to be linear.
+    # The unweighted optimum is so close that the errors are linear.
     return refine_pose(points, best) or best
 
 
 def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine a nearby pose by Gauss-Newton, each corner weighted by its spread; None if the
-    steps do not converge."""
+    """Refine a nearby pose by Gauss-Newton steps, with each corner weighted by its standard
+    deviation; None if the steps do not converge."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
@@ -276,16 +278,17 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
             return None
         g = B.T.dot(error)
-        # OpenCV's is three times as fast on matrices of this size.
+        # OpenCV's solver is three times as fast on matrices of this size.
         regular, solved = cv2.solve(B.T.dot(A), g[:, None], flags=cv2.DECOMP_CHOLESKY)
         if not regular:
             return None
         step = solved[:, 0]
-        gain = float(step.dot(g))  # of the step, in squared standard deviations
+        # reduction of the cost by the step, in squared standard deviations
+        gain = float(step.dot(g))
         moved_px = scored.jacobian.dot(step).reshape(-1, 2)
         small = gain < _SMALL_GAIN or float(np.abs(moved_px).max()) < _SMALL_MOVE_PX
         if small and max(map(abs, step.tolist())) < _SMALL_STEP:
-            # Errors are linear in such a step.
+            # Errors are linear in a step of this size.
             error_px = scored.error_px - moved_px
             rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
             return ScoredPose(rvec, tvec, error_px, scored.jacobian)
@@ -301,11 +304,11 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
 
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array, float, Array]:
-    """The covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and
-    the pose's change (6,) by one standard deviation of the sheet's curl.
+    """Return the covariance (6, 6) of (rvec, tvec), chi2 (squared error per degree of freedom), and
+    the change of the pose (6,) by one standard deviation of the sheet's curl.
 
-    The covariance covers the corners' noise (at least as large as the residuals), shifts that all
-    corners share, and a twist of the sheet, but not its curl.
+    The covariance covers the noise of the corners (at least as large as the residuals), shifts
+    common to all corners, and a twist of the sheet, but not its curl.
     """
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
@@ -329,21 +332,22 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
 
 
 def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
-    """Return what each kind of curl does to the whitened errors."""
+    """Return the effect of each mode of curl on the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
-    # A corner out of the sheet's plane is where a target moved along its normal would have it.
+    # A corner out of the sheet's plane appears where a target moved along its normal would show it.
     moved = scored.jacobian[:, 3:].dot(normal_cam)[:, None] * points.curl_lift_m
     return np.asarray(points.whitening.dot(moved))
 
 
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
-    """The angle between a marker's normal, at rotation `rvec`, and the normal `expected_cam`."""
+    """Return the angle between a marker's normal at rotation `rvec` and the normal `expected_cam`,
+    rad."""
     normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
 def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
-    """The candidates of OpenCV's SQPNP; none of corners on one line."""
+    """Return the candidates of OpenCV's SQPNP; none for collinear corners."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             points.object_m, points.image_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
@@ -377,7 +381,8 @@ def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
 
 
 def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
-    """The best candidate near the normal mirrored at the line of sight, if it is another."""
+    """Return the best candidate near the normal mirrored at the line of sight, if it is a different
+    one."""
     R = rotation_matrix(scored.rvec)
     normal, sight = R[:, 2], scored.tvec / np.linalg.norm(scored.tvec)
     other = 2.0 * float(normal @ sight) * sight - normal
@@ -405,31 +410,32 @@ def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPri
     return min(scored, key=cost)
 
 
-# --- A sheet that is not flat: what its curl does to corners, and what they are worth then ---
+# --- A sheet that is not flat: effect of its curl on corners, and their weights ---
 
 
 def curl_lift(object_m: Array, curl_per_m: float) -> Array:
-    """The distances of corners (n, 3) from the sheet's plane, at one standard deviation of
-    each kind of curl: the whole rim to one side, or two corners to each
-    side: (2n, 2) m, a corner's row given twice, for its x and y."""
+    """Return the distances of corners (n, 3) from the sheet's plane at one standard deviation of
+    each mode of curl: the whole edge to one side, or two corners to each side. Shape (2n, 2), m,
+    with each corner's row twice, for its x and y."""
     x, y = object_m[:, 0], object_m[:, 1]
     lift: Array = curl_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
 
 
 def curl_weight(curl: Array) -> Array:
-    """Return ``(I + curl curl^T)^-1`` (2n, 2n), weights of errors; curl (2n, k): curls' errors."""
+    """Return the weights ``(I + curl curl^T)^-1`` (2n, 2n) of errors; curl is (2n, k), one column
+    per mode."""
     inner = np.linalg.inv(np.eye(curl.shape[1]) + curl.T @ curl)
     weight: Array = np.eye(len(curl)) - curl @ inner @ curl.T
     return weight
 
 
-# --- Corners as a pose is solved from them: where they are, and what each is worth ---
-# A fitted line is off by an offset and a tilt, and moves the corners at both of its ends. These
-# have errors across it of variance s^2 with a correlation of -1/2, so half the line's offset is
-# known to s/2 and its tilt to s sqrt(3)/2: `whitening` turns corner errors into these independent
-# ones. A shift of all edges (clipped white, ink) counts in the covariance only: in the fit small
-# markers' own faults would feed it.
+# --- Weights of the corners in the pose solution ---
+# A fitted line has errors of offset and tilt, and moves the corners at both of its ends. Their
+# errors across the line have the variance s^2 and a correlation of -1/2, so half the line's offset
+# is known to s/2 and its tilt to s sqrt(3)/2: `whitening` transforms the corner errors to these
+# independent ones. A shift of all edges (clipped white, ink) is part of the covariance only: in the
+# fit, faults of small markers would corrupt it.
 
 
 _EACH = np.eye(8)
@@ -439,16 +445,17 @@ _START = np.arange(4)  # side k runs from corner k ...
 _END = np.array([1, 2, 3, 0])  # ... to corner k + 1
 _ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
 _COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
-_SIDES = 8 * _ROWS + _COLUMNS  # in an (8, 8) matrix
+_SIDES = 8 * _ROWS + _COLUMNS  # indices into a flattened (8, 8) matrix
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedCorners:
-    """Corners object_m (n, 3) on the target and image_px (n, 2) of a pinhole K, with spreads
-    sigma_px (n,). whitening (2n, 2n) makes errors independent and of unit spread; shift (2n, k)
-    holds one whitened standard deviation of each common error: the shift of all edges, the
-    detections' `common_px`, and the shake of a detection's rows. `curl_lift_m` (2n, 2) is
-    `curl_lift`'s result, and `curled` is True if the curl changes the corners' weights."""
+    """Corners object_m (n, 3) on the target and image_px (n, 2) of a pinhole camera K, with
+    standard deviations sigma_px (n,). whitening (2n, 2n) makes the errors independent and of unit
+    variance. shift (2n, k) holds one whitened standard deviation of each common error: the shift of
+    all edges, the detections' `common_px`, and the jitter of a detection's rows. `curl_lift_m` (2n,
+    2) is the result of `curl_lift`, and `curled` is True if the curl changes the weights of the
+    corners."""
 
     object_m: Array
     image_px: Array
@@ -467,12 +474,12 @@ def weigh_corners(
     K: Array,
     lift: Array,
 ) -> WeightedCorners:
-    """Weigh the detections' corners: `image_px` as of a pinhole K, `lift` as of `curl_lift`."""
+    """Weigh the detections' corners: `image_px` in a pinhole camera K, `lift` from `curl_lift`."""
     n, m = len(image_px), len(detections)
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
     normals = _outward_normals(corners_px)
-    # A corner moves a pixel along the normals of both of its sides.
+    # A shift of all edges by one pixel moves a corner along the normals of both of its sides.
     moved = (normals + normals.take(_PREVIOUS_CORNER, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
         rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
@@ -480,7 +487,7 @@ def weigh_corners(
         if d.cov_px2 is not None:
             try:
                 W[rows, rows] = np.linalg.inv(np.linalg.cholesky(d.cov_px2))
-            except np.linalg.LinAlgError:  # of a cut target's corners far aside, by rounding
+            except np.linalg.LinAlgError:  # rounding, for far corners of a cut target
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
         elif d.refined:
             spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
@@ -492,7 +499,7 @@ def weigh_corners(
         if d.common_px is not None:
             shift[rows, 1] = d.common_px.ravel()
         if d.row_sigma_px > 0.0:
-            # As of a line: half to all of its rows alike, and a slant.
+            # As for a line: half to all of its rows shift alike, and they slant.
             down = corners[:, 1] - corners[:, 1].mean()
             down /= max(float(np.abs(down).max()), 1e-9)
             along_x = slice(8 * i, 8 * i + 8, 2)
@@ -503,7 +510,7 @@ def weigh_corners(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """The unit normals (m, 4, 2) of the sides of m squares."""
+    """Return the outward unit normals (m, 4, 2) of the sides of m squares."""
     side = corners.take(_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -515,7 +522,7 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _lying_px(d: Detection, corners: Array) -> Array:
-    """The spread of the sides, (4,): worse for one along the rows."""
+    """Return the standard deviation of each side, (4,): larger for a side along the rows."""
     way = corners.take(_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(way[:, 1])
@@ -523,8 +530,8 @@ def _lying_px(d: Detection, corners: Array) -> Array:
 
 
 def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
-    """The whitening of corners by the offset and tilt of four lines with normals (4, 2), at
-    `_SIDES`; `sigma_px` is of all or of each, (4,)."""
+    """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
+    `_SIDES`; `sigma_px` is a scalar for all lines, or (4,)."""
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT
     return np.concatenate([across, across, -tilt, tilt])

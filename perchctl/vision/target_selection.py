@@ -1,8 +1,8 @@
-"""Which of several targets is the vehicle's own, where their markers are the same.
+"""Select the vehicle's own target among several with identical markers.
 
-The one counts that is nearest to where the profile says that the own one is, in the world of the
-state estimate, or else to the upward axis through the gear. That decides once; from then on the
-lock (`perchctl.vision.tracks`) stays with the one that was chosen.
+The own target is the one closest to its position in the profile, in the world frame of the state
+estimate, or otherwise the one closest to the upward axis through the gear. This choice is made
+once; afterwards, the lock (`perchctl.vision.tracks`) follows the chosen target.
 """
 
 from __future__ import annotations
@@ -18,24 +18,26 @@ from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilt_
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
-_SIGMA_PX = 1.0  # of corners as a search finds them
+_SIGMA_PX = 1.0  # standard deviation of corners from a search
 
 
 @dataclass(frozen=True)
 class OwnTargetPlace:
-    """Place (x, y) of the vehicle's own target in the world of the state estimate, None if unknown.
-    A target farther than `within_m` from this place is another vehicle's."""
+    """Position (x, y) of the vehicle's own target in the world frame of the state estimate, None if
+    unknown. A target further than `within_m` from this position belongs to another vehicle."""
 
     xy_m: tuple[float, float] | None = None
     within_m: float = math.inf
 
 
 OwnOffset = Callable[[MarkerName, Array], float]
-"""How far a marker with corners (4, 2) px is from the own target's place, or inf."""
+"""Function that returns the distance of a marker with corners (4, 2) px from the own target's
+position, or inf."""
 
 
 _NO_POSE_M = 1e9
-"""Of corners that give no pose yet, as beside a highlight: looked at last, but not refused."""
+"""Distance for corners that yield no pose yet, for example next to a highlight, m: examined last,
+but not refused."""
 
 
 def marker_offset_m(
@@ -46,7 +48,8 @@ def marker_offset_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """`target_offset_m` of a marker by its corners (4, 2) px; infinite beyond `place.within_m`."""
+    """Return `target_offset_m` for a marker's corners (4, 2) px; infinite beyond
+    `place.within_m`."""
     seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
@@ -57,7 +60,8 @@ def marker_offset_m(
 def target_offset_m(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
-    """A target's horizontal distance from the own target's place, from the gear if unknown."""
+    """Return a target's horizontal distance from the own target's position; from the gear if
+    unknown."""
     if place.xy_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -67,7 +71,8 @@ def target_offset_m(
 def refusal_text(
     pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
-    """Message that a pose is another vehicle's target; None if it may be the own target."""
+    """Return the message that a pose is another vehicle's target; None if it may be the own
+    target."""
     if attitude is None or place.xy_m is None:
         return None
     away_m = target_offset_m(pose, attitude, place, setup)
@@ -79,11 +84,12 @@ def refusal_text(
     )
 
 
-# --- The target in the world, in the level frame, and as a measurement of a filter ---
+# --- The target in the world, in the level frame, and as a measurement for a filter ---
 
 
 _STILL = np.eye(4)
-_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
+# 0.006 deg, 0.03 mm: errors of lens and print
+_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
 _YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
@@ -91,7 +97,7 @@ def to_world(
     e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PoseSetup
 ) -> tuple[Array, float]:
     """Convert a target's position (3,) and heading, relative to the gear in the level frame, to the
-    world of the state estimate."""
+    world frame of the state estimate."""
     way_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(way_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -114,7 +120,7 @@ def track_measurement(
     constants: FilterSetup,
     setup: PoseSetup,
 ) -> Measurement:
-    """A pose as a measurement for the filter, in the world or the level frame."""
+    """Return a pose as a measurement for the filter, in the world or the level frame."""
     z, way_m = np.empty(4), pose.e_m
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
@@ -142,8 +148,8 @@ def track_measurement(
 def relative_bias_m(
     bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
 ) -> Array:
-    """The effect (3, 4) of constant errors on the vector from gear to target, level axes:
-    `bias_m` (3, 4) of the target less the effect of roll and pitch errors on the gear."""
+    """Return the effect (3, 4) of constant errors on the vector from gear to target in level axes:
+    `bias_m` (3, 4) of the target minus the effect of roll and pitch errors on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(bias_m)
     moved[:, TILTS] -= tilt_jacobian(gear_level) * constants.tilt_sigma_rad

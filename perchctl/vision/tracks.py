@@ -1,4 +1,4 @@
-"""One frame's poses into the filters, past the gate."""
+"""Pass one frame's poses through the gate and into the filters."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from perchctl.vision.types import (
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
     """The constants of the filters in the level and the world frame and of the pose estimation,
-    whether a gate judges poses, and the place of the vehicle's own target."""
+    whether the gate is enabled, and the position of the vehicle's own target."""
 
     level: FilterSetup
     world: FilterSetup
@@ -48,14 +48,14 @@ class TrackSetup:
     own_place: OwnTargetPlace
 
     def constants(self, in_world: bool) -> FilterSetup:
-        """The filters' constants in the world or the level frame."""
+        """Return the filters' constants in the world or the level frame."""
         return self.world if in_world else self.level
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks, lock and rival after a frame, and the gate's verdict; `measured.fed` is empty if
-    the verdict rejects the frame's pose."""
+    """The tracks, lock and rival after a frame, and the verdict of the gate; `measured.fed` is
+    empty if the gate rejects the frame's pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -72,7 +72,7 @@ def update_tracks(
     in_world: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """The tracks after a frame, updated with the poses that the gate accepts."""
+    """Return the tracks after a frame, updated with the poses that the gate accepts."""
     constants = setup.constants(in_world)
     fed = {
         name: track_measurement(pose, attitude, in_world, constants, setup.pose)
@@ -91,7 +91,8 @@ def update_tracks(
             sight = replace(sight, lock_in_view=looks)
         if setup.has_gate:
             verdict = judge_pose(state.lock, state.rival, sight, constants)
-        # What was locked on goes on, however far the estimate's world has drifted meanwhile.
+        # A locked target stays locked, however far the estimate's world frame has drifted
+        # meanwhile.
         goes_on = not verdict.restarts or verdict.same_target
         goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
         another = None if goes_on else refusal_text(pose, attitude, setup.own_place, setup.pose)
@@ -111,56 +112,60 @@ def update_tracks(
     return TrackedFrame(measured, tracks, verdict, lock, rival)
 
 
-# --- Whether a pose is the target's that was locked on ---
-# Another target, or a marker of another size, cannot be told from the target in a picture, but the
+# --- Gate: does a pose belong to the locked target? ---
+# A picture cannot distinguish another target, or a marker of another size, from the target, but the
 # target does not jump. A pose that contradicts the lock by more than noise, motion and drift
-# explain is a rival's and feeds no filter.
+# explain belongs to a rival and updates no filter.
 #
-# The lock goes over to a rival that rests on both markers: at once if the lock never did, or, if
-# it is as far away, after `REACQUIRE_S` in which the target was not seen though its place is in the
-# picture; and to any that was seen more often than a lock that is hardly begun.
+# The lock changes to a rival seen with both markers: at once if the lock never was; otherwise, if
+# both are equally far away, after `REACQUIRE_S` in which the target was not seen although its
+# position is in the picture. It changes to any rival that was seen more often than a lock of only a
+# few frames.
 #
 # A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
-# lacks, so a rival is most likely the target, seen from elsewhere. There the lock goes over after
-# `RELOCK_S` in which only the rival was seen, if the rival rests on both markers or the lock never
-# did. A rival that was seen before the target was lost is a second target, and waits `REACQUIRE_S`.
+# lacks, so a rival is most likely the target from a different viewpoint. The lock then changes
+# after `RELOCK_S` in which only the rival was seen, if the rival has both markers or the lock never
+# had. A rival that was seen before the target was lost is a second target and waits `REACQUIRE_S`.
 #
-# While a rival is seen and the target is not, the target's predicted place may be wrong, and its
-# spread covers the rival's place, too.
+# While a rival is seen and the target is not, the target's predicted position may be wrong, and its
+# covariance covers the rival's position, too.
 #
-# A pose that passes the gate may be wrong even so. If the next one fits the track as it was before,
-# and not as it is, the track restarts there.
+# A pose that passes the gate may still be wrong. If the next pose fits the previous track and not
+# the present one, the track restarts there.
 #
-# While something is seen where the lock is, the search hands on that and no whole target beside it.
-# Where the state estimate jumps, the target seems to jump in the world, but not in the picture.
+# While something is seen at the lock's position, the search continues there and ignores a complete
+# target elsewhere. If the state estimate jumps, the target seems to jump in the world, but not in
+# the picture.
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 RELOCK_S = 0.3
-"""How long a camera alone has to see only the rival. Longer: a recording has no target for longer
-after lost frames. Shorter: fewer wrong frames in a row capture the lock."""
+"""Time for which a camera alone must see only the rival, s. Larger: after lost frames, a recording
+has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
 FORGET_S = 10.0
 ESTABLISHED_FRAMES = 5
-"""A lock of fewer frames gives way to a rival that was seen more often."""
+"""Number of frames below which a lock yields to a rival that was seen more often."""
 
 _JUMPED = "the state estimate jumped, the target did not"
 _WENT_BACK = "the target is where it was expected before the last pose, which may have been wrong"
-_GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
+_GATE = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
 _SAME_RANGE = 4.0  # standard deviations
-# What no covariance knows of: calibration, print, latency; beside it a share of the range.
+# Errors outside any covariance: calibration, print, latency; plus shares of the range.
 _LEAST_M, _LEAST_YAW_RAD = 0.01, math.radians(4.0)
 _SIDEWAYS, _ALONG = 0.015, 0.02
 _PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
-_TURNED_RAD = math.radians(15.0)  # worth a word
-# How a hovering vehicle moves relative to the target while its estimate jumps.
+_TURNED_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
+# Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-_JUMP_LEFT_SHARE = 0.25  # most that the better of two explanations may leave, of squared misfits
+# largest share of the squared misfit that the better of two explanations may leave
+_JUMP_LEFT_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose as a measurement, whether it rests on both markers, whether the locked
-    target's place is in the picture, and whether no vehicle's attitude is known."""
+    """A frame's pose as a measurement, whether both markers contributed, whether the locked
+    target's position is in the picture, and whether the camera has no vehicle with a known
+    attitude."""
 
     t_s: float
     pose: MarkerPose
@@ -176,26 +181,27 @@ class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as the target's, whether the tracks
     restart at the pose, and whether they restart for the same target.
 
-    `rival` is the rival track after this frame; `text` explains a rejection or a restart."""
+    `rival` is the rival track after this frame; `text` explains a rejection or a restart.
+    """
 
     accepted: bool
     restarts: bool = False
     same_target: bool = False
     rival: RivalTrack | None = None
     text: str = ""
-    is_foreign_target: bool = False  # another vehicle's, by its place
+    is_foreign_target: bool = False  # another vehicle's target, by its position
 
 
 def judge_pose(
     lock: Lock | None, rival: RivalTrack | None, sight: FramePose, constants: FilterSetup
 ) -> GateVerdict:
-    """The gate's verdict on a frame's pose `sight`, given the lock and the rival, if any."""
+    """Return the gate's verdict on a frame's pose `sight`, given the lock and the rival, if any."""
     lock, rival = drop_expired(lock, rival, sight.t_s)
     if rival is not None and rival.in_world != sight.in_world:
         rival = None
     if lock is None or lock.in_world != sight.in_world:
         return GateVerdict(accepted=True)
-    if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
+    if sight.t_s <= lock.track.t_s:  # the tracks are newer
         return GateVerdict(accepted=False, rival=rival)
     if rival is None and _is_clear(lock.track, sight, constants):
         return GateVerdict(accepted=True)
@@ -218,15 +224,15 @@ def judge_pose(
 def drop_expired(
     lock: Lock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[Lock | None, RivalTrack | None]:
-    """The lock and the rival, None for each that has expired at `t_s`."""
+    """Return the lock and the rival, with None for each that has expired at `t_s`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
         return None, None
     age_s = t_s - lock.track.t_s
-    # A place in the level frame means nothing for long, but a rival stays a rival.
+    # A position in the level frame expires soon, but a rival stays a rival.
     lasting = lock.in_world or rival is not None
-    # A clock that was set back: nothing that is older than it will be confirmed.
+    # After the clock was set back, no older track can be confirmed.
     if age_s < -MAX_TRACK_GAP_S or age_s > (FORGET_S if lasting else MAX_TRACK_GAP_S):
         return None, None
     return lock, rival
@@ -235,9 +241,10 @@ def drop_expired(
 def contradiction(
     lock: Lock | None, rival: RivalTrack | None, in_world: bool, t_s: float, constants: FilterSetup
 ) -> Array | None:
-    """The rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
+    """Return the rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
 
-    Until either is confirmed, the target may be at one place as well as at the other."""
+    Until one of the two is confirmed, the target may be at either position.
+    """
     if lock is None or rival is None or not lock.in_world == rival.in_world == in_world:
         return None
     if rival.track.t_s <= lock.track.t_s:
@@ -248,7 +255,7 @@ def contradiction(
 def update_lock(
     lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
 ) -> Lock:
-    """The lock after the accepted pose `sight`, with the track that the pose updated."""
+    """Return the lock after the accepted pose `sight`, with the track that the pose updated."""
     anew = verdict.restarts and not verdict.same_target
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
@@ -261,12 +268,12 @@ def update_lock(
     )
 
 
-# --- how well a pose fits ---
+# --- How well a pose fits ---
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """By how much a pose is off in (yaw, x, y, z), (4,), and its spread (4, 4)."""
+    """The misfit of a pose in (yaw, x, y, z), (4,), and its covariance (4, 4)."""
 
     off: Array
     S: Array
@@ -277,7 +284,7 @@ class _Fit:
 
     @property
     def cost(self) -> float:
-        """The squared distance, with what a vaguer claim costs."""
+        """The squared distance plus a penalty for a larger covariance (negative log likelihood)."""
         return self.squared + float(np.linalg.slogdet(self.S)[1])
 
     @property
@@ -287,11 +294,11 @@ class _Fit:
 
 def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fit:
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
-    # The most that it drifts counts as three standard deviations.
+    # The largest drift counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
     off = measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
-    # A constant error moves both.
+    # A constant error shifts both.
     bias = wanted.bias[MEASURED] if measured.bias is None else measured.bias - wanted.bias[MEASURED]
     R = constants.R if measured.R is None else measured.R
     S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _PLACE + R + bias @ bias.T
@@ -299,7 +306,7 @@ def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fi
 
 
 def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
-    """True if what no pose claims explains all, as in most frames: a quick look."""
+    """True if errors outside any covariance explain the misfit, as in most frames: a fast check."""
     wanted = predict_track(track, sight.t_s, constants, with_cov=False)
     off = sight.measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
@@ -312,13 +319,14 @@ def _range_m(sight: FramePose) -> float:
 
 
 def _unclaimed(range_m: float) -> Array:
-    """The spread of (yaw, x, y, z) that no pose claims."""
+    """Return the standard deviations of (yaw, x, y, z) for errors outside any covariance."""
     sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
 def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
-    """True if the pose goes on as the vehicle saw it last, much better than in the world."""
+    """True if the pose fits the vehicle's last view of the target much better than its position in
+    the world."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
@@ -334,9 +342,9 @@ def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
 
 
 def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup) -> bool:
-    """True if the pose fits the track before the lock's last pose, much better than the track with
-    it, from which it is `off`: at few pictures a second, a single wrong pose is within the gate,
-    and teaches a camera's track a speed."""
+    """True if the pose fits the track before the lock's last pose much better than the present
+    track, from which it differs by `off`. At few pictures per second, a single wrong pose passes
+    the gate and gives the track of a camera alone a wrong velocity."""
     if lock.before is None or sight.in_world:
         return False
     fit, unclaimed = _misfit(lock.before, sight, constants), _unclaimed(_range_m(sight))
@@ -344,7 +352,7 @@ def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup)
     return fit.squared <= _GATE and before < _JUMP_LEFT_SHARE * now
 
 
-# --- rivals ---
+# --- Rivals ---
 
 
 def _watched(
@@ -384,7 +392,7 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     if not lock.has_both_markers:
         return True
     unseen_s = sight.t_s - max(rival.since_s, lock.track.t_s)
-    # What is not looked at is not empty.
+    # A position outside the picture is not known to be empty.
     return (
         (sight.lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.range_differs
@@ -394,7 +402,8 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
 
 
 def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
-    """True if the rival is most likely the target, seen by a camera that moved in lost frames."""
+    """True if the rival is most likely the target, after the camera has moved during lost
+    frames."""
     if rival.since_s < lock.track.t_s or sight.t_s - rival.since_s < RELOCK_S:
         return False
     if not lock.has_both_markers:
@@ -402,21 +411,22 @@ def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     return sight.has_both_markers and rival.whole_frames >= ESTABLISHED_FRAMES
 
 
-# --- Where the target should be in the next picture ---
-# The state estimate gives the vehicle's motion twice: by two positions and by speed times time.
-# Each is weighted by how little it was off of late in the target's own pictures.
+# --- Expected position of the target in the next picture ---
+# The state estimate provides the vehicle's motion in two ways: as the difference of two positions,
+# and as velocity times time. Each is weighted by its recent errors in the target's own pictures.
 
 
-_FORGOTTEN = 0.1  # of what was learned, with each picture
+_FORGOTTEN = 0.1  # share of the old errors that each picture replaces
 
 
 def expected_corners(
     sight: LastPose | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Both markers' expected corners, (4, 2) px, and the target's expected pose: the last pose,
-    moved by the vehicle's motion.
+    """Return the expected corners of both markers, (4, 2) px, and the expected pose of the target:
+    the last pose, moved by the vehicle's motion.
 
-    Without both attitudes: None and the unmoved pose; without a recent pose: both None."""
+    Without both attitudes: None and the unmoved pose. Without a recent pose: None and None.
+    """
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude
@@ -442,7 +452,7 @@ def expected_corners(
 def update_last_pose(
     before: LastPose | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> LastPose:
-    """The record of a new pose, with the errors of the estimated motion since `before`."""
+    """Return the record of a new pose, with the errors of the estimated motion since `before`."""
     if before is None:
         return LastPose(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
@@ -450,7 +460,7 @@ def update_last_pose(
         return LastPose(pose, attitude, before.error_rad2)
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
-    # Across the view: along it a far target's own distance is vague.
+    # Across the line of sight, because the distance of a far target is uncertain along it.
     off = [
         R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2]
         for way_m in _camera_motions_m(then, attitude, setup)
@@ -463,10 +473,10 @@ def update_last_pose(
 
 
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
-    """True if a place (3,) in the world lies in the picture at the vehicle's attitude."""
+    """True if a position (3,) in the world is in the picture at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
     way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
-    # Farther off the axis a lens model may fold back into the picture.
+    # Further off the axis, a lens model may fold back into the picture.
     if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > make_lattice(setup.camera).reach * way_m[2]:
         return False
     (at_px,) = project(np.zeros((1, 3)), np.zeros(3), way_m, setup.camera)
@@ -474,7 +484,8 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 
 def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
-    """The camera's way (3,) by the estimate's places, and by its speeds."""
+    """Return the camera's displacement (3,) from the estimated positions, and from the
+    velocities."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
@@ -489,6 +500,6 @@ def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
 
 
 def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
-    """The way from the vehicle to the camera, in the world (3,)."""
+    """Return the vector from the vehicle to the camera in the world, (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -1,4 +1,4 @@
-"""The values that vision's steps exchange, frozen dataclasses."""
+"""The values that the steps of the vision pipeline exchange, as frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
 
 
 class Stage(Enum):
-    """Which markers of the target are seen (paper, section II-A.2)."""
+    """The markers of the target in view (paper, section II-A.2)."""
 
     NONE = "none"
     LARGE = "large"  # stage 1, equation 5
@@ -38,8 +38,8 @@ class CameraModel:
         dist: distortion coefficients in OpenCV's order, shape (n,).
         model: ``plumb_bob`` (5), ``rational_polynomial`` (8) or ``fisheye`` (4).
 
-    Raises InvalidValue for another form of `K`: OpenCV's functions compute with fx, fy, cx and cy
-    only, and pass over the other entries in silence.
+    Raises InvalidValue for any other form of `K`: OpenCV's functions use only fx, fy, cx and cy,
+    and silently ignore the other entries.
     """
 
     size_px: tuple[int, int]
@@ -52,18 +52,19 @@ class CameraModel:
 
     @property
     def calibration_key(self) -> tuple[tuple[int, int], str, bytes, bytes]:
-        """A hashable value, equal for cameras with the same calibration."""
+        """A hashable value that is equal for cameras with the same calibration."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
 
 
 MAX_SKEW_PX = 0.3
-"""A skew of s px moves a pixel sideways by s y/z. With this much it is 0.2 px at the lower rim of
-the example camera, 0.5 mm at 1 m; more is an error that nothing else notices."""
+"""Largest skew, px. A skew of s px moves a pixel laterally by s y/z: with this value, 0.2 px at the
+lower edge of the example camera, or 0.5 mm at 1 m. Larger: an error that no other check detects is
+accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
-    """Raise InvalidValue if the camera matrix (3, 3) has entries that no computation here uses."""
+    """Raise InvalidValue if the camera matrix (3, 3) has entries that no computation uses."""
     if K.shape != (3, 3):
         raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
@@ -84,17 +85,19 @@ def check_camera_matrix(K: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture. `t_s` is its time of exposure on the loop's clock. A source knows it as the time
-    of arrival, `t_arrival_s`, less the profile's `camera.latency_s`; what a flight measures beyond
-    that, and half a field's time, are taken off by `perchctl.perception` alone.
+    """One picture. `t_s` is its time of exposure on the loop's clock. A source computes it as the
+    time of arrival, `t_arrival_s`, minus the profile's `camera.latency_s`. Only
+    `perchctl.perception` subtracts the additional latency measured in flight and half the time of a
+    field.
 
-    `image` is grey, uint8, shape (height, width); `step` also takes BGR, (height, width, 3).
+    `image` is grey, uint8, shape (height, width); `step` also accepts BGR, (height, width, 3).
 
-    `fields` is the picture's kind: ``whole``, of one moment; ``woven`` of two fields; a woven
-    picture's ``top`` or ``bottom`` field at full height; None: not classified yet
-    (`perchctl.vision.fields`). `repeated`: the source gave the previous picture again, which is no
-    measurement. `encoded`: the source's JPEG, from which `cv2.imdecode` with IMREAD_GRAYSCALE and
-    IMREAD_IGNORE_ORIENTATION gives exactly `image`; None without one, or for a changed image.
+    `fields` is the kind of the picture: ``whole`` for one exposure, ``woven`` for two fields,
+    ``top`` or ``bottom`` for one field of a woven picture at full height, None if not classified
+    yet (`perchctl.vision.fields`). `repeated`: the source returned the previous picture again,
+    which is not a measurement. `encoded` is the source's JPEG, from which `cv2.imdecode` with
+    IMREAD_GRAYSCALE and IMREAD_IGNORE_ORIENTATION yields exactly `image`; None if there is none, or
+    if the image was changed.
     """
 
     index: int
@@ -107,8 +110,8 @@ class Frame:
 
 
 def to_grey(image: Any) -> NDArray[np.uint8]:
-    """A contiguous 8-bit grey picture, (height, width), of an array in grey, BGR or BGRA, 8 or 16
-    bits. Raises InvalidValue for anything else."""
+    """Return a contiguous 8-bit grey picture, (height, width), from an array in grey, BGR or BGRA
+    with 8 or 16 bits. Raises InvalidValue for anything else."""
     if image is None:
         raise InvalidValue("the picture is None: cv2.imread returns it for what is no picture")
     shape: tuple[int, ...] = getattr(image, "shape", ())
@@ -131,30 +134,31 @@ def to_grey(image: Any) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """One marker's corners in the image: (4, 2) px, TL TR BR BL as cv2.aruco
-    orders them; pixel (0, 0) is the centre of the top-left pixel.
+    """One marker's corners in the image: (4, 2) px, TL TR BR BL in the order of cv2.aruco; pixel
+    (0, 0) is the centre of the top-left pixel.
 
-    `sigma_px` is the spread of the corners, from the line fit's residuals, or a
-    default where no line could be fitted. Corners that follow from a part of the drawing may
-    lie outside of the picture; they have a covariance `cov_px2` (8, 8), in pixels of a pinhole,
-    x and y of each corner by turns.
+    `sigma_px` is the standard deviation of the corners, from the residuals of the line fit, or a
+    default if no line could be fitted. Corners inferred from a part of the drawing may lie outside
+    the picture. They have a covariance `cov_px2` (8, 8) in pixels of a pinhole camera, with x and y
+    of each corner alternating.
     """
 
     marker: MarkerName
     corners_px: Array
     sigma_px: float
     refined: bool
-    shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
-    common_px: Array | None = None  # (4, 2): one sigma of what moved all corners together
+    shift_sigma_px: float = 0.0  # common shift of all edges in the picture, outwards
+    # (4, 2): one standard deviation of a shift common to all corners
+    common_px: Array | None = None
     cov_px2: Array | None = None
-    row_sigma_px: float = 0.0  # of corners in rows that shake along themselves, as analogue ones
-    lying_sigma_px: float = 0.0  # of a side along the rows, of which every second is interpolated
+    row_sigma_px: float = 0.0  # horizontal jitter of rows, as in analogue video
+    lying_sigma_px: float = 0.0  # for sides along the rows if every second row is interpolated
 
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """Growth of white over black at the edges of a picture, px, its standard deviation, and
-    how many pictures ago it was measured."""
+    """Growth of white over black at the edges of a picture, px, its standard deviation, px, and the
+    number of pictures since its measurement."""
 
     shift_px: float
     sigma_px: float
@@ -170,25 +174,25 @@ class Detections:
     large: Detection | None = None
     small: Detection | None = None
     mirrored: bool = False  # a marker decoded as its mirror image
-    targets: int = 0  # whole targets, both markers, that a search saw
+    targets: int = 0  # complete targets, with both markers, found by a search
     flow_px_s: dict[MarkerName, Array] = field(
         default_factory=dict
-    )  # (4, 2), or of all corners (2,)
+    )  # (4, 2), or (2,) for all corners
     edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
-        """Return the marker's detection, None if it was not detected."""
+        """Return the marker's detection; None if it was not detected."""
         return self.large if marker == "large" else self.small
 
     @property
     def markers(self) -> list[Detection]:
-        """The markers that were detected, the large one first."""
+        """The detected markers, the large one first."""
         return [each for each in (self.large, self.small) if each is not None]
 
 
 @dataclass(frozen=True, eq=False)
 class Attitude:
-    """The vehicle's attitude (and position) at a frame's time, world axes.
+    """The vehicle's attitude and position at a frame's time, world axes.
 
     Signs as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is None
     if unknown.
@@ -203,17 +207,17 @@ class Attitude:
 
     @cached_property
     def R_level_body(self) -> Array:
-        """The rotation (3, 3) from body to level axes, by roll and pitch."""
+        """Rotation (3, 3) from body to level axes, by roll and pitch."""
         return rotation_from_rpy(self.roll_rad, self.pitch_rad, 0.0)
 
     @cached_property
     def R_world_level(self) -> Array:
-        """The rotation (3, 3) from level to world axes, by the heading."""
+        """Rotation (3, 3) from level to world axes, by the heading."""
         return rot_z(self.yaw_rad)
 
     @cached_property
     def R_world_body(self) -> Array:
-        """The rotation (3, 3) from body to world axes."""
+        """Rotation (3, 3) from body to world axes."""
         return self.R_world_level @ self.R_level_body
 
 
@@ -222,16 +226,16 @@ class MarkerPose:
     """A pose from one frame. `source` is ``large``, ``small`` or ``joint``.
 
     Attributes:
-        rvec_rad, tvec_m: OpenCV camera frame, cv2.aruco's marker axes, (3,).
-        e_m: target relative to the gear in the level frame, (3,).
+        rvec_rad, tvec_m: pose in the OpenCV camera frame, with cv2.aruco's marker axes, (3,).
+        e_m: position of the target relative to the gear in the level frame, (3,).
         e_yaw_rad: heading of the target's x axis in the level frame.
-        sigma_m: standard deviation of `e_m`, (3,); sigma_yaw_rad likewise.
+        sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
         reprojection_px: RMS error of the corners.
-        chi2: the corners' squared errors over their variances, per degree of freedom.
+        chi2: squared errors of the corners over their variances, per degree of freedom.
         cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
         print_m: shift of `e_m` by one standard deviation of the print's size and of the sheet's
-            curl, (3, 2). Included in `sigma_m` and `cov`, but the same in every frame.
-        camera_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the print's.
+            curl, (3, 2). Included in `sigma_m` and `cov`, but identical in every frame.
+        camera_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the errors of the print.
     """
 
     source: Literal["large", "small", "joint"]
@@ -253,11 +257,11 @@ class MarkerPose:
 class MarkerTrack:
     """A marker's Kalman filter between two frames (paper, section II-A.1).
 
-    State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI,
-    indexed by the names in `perchctl.vision.filter`. P (8, 8) is its covariance by the noise of
-    measurements and motion; `bias` (8, 4) is the state's shift by one standard deviation of each
-    constant error: the vehicle's roll and pitch, the print's size and curl. `unseen` counts the
-    frames since the last measurement.
+    State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI, indexed by the names
+    in `perchctl.vision.filter`. P (8, 8) is its covariance due to the noise of measurements and
+    motion. `bias` (8, 4) is the shift of the state by one standard deviation of each constant
+    error: the vehicle's roll and pitch, the print's size and curl. `unseen` counts the frames since
+    the last measurement.
     """
 
     t_s: float
@@ -268,31 +272,31 @@ class MarkerTrack:
 
     @property
     def cov(self) -> Array:
-        """Covariance (8, 8) of the state, the constant errors included."""
+        """Covariance (8, 8) of the state, including the constant errors."""
         return self.P + self.bias @ self.bias.T
 
 
 @dataclass(frozen=True, eq=False)
 class TargetEstimate:
-    """The target's position and heading at `t_s`, the paper's (e_x, e_y, e_z, e_psi), and their
-    spread.
+    """The target's position and heading at `t_s`, the paper's (e_x, e_y, e_z, e_psi), with standard
+    deviations.
 
     Attributes:
-        t_s: the estimate's time: the frame's, or later by prediction.
-        measured_s, small_measured_s: exposure of the last frame in which the target, and
-            its small marker, were measured.
+        t_s: time of the estimate: the frame's, or later by prediction.
+        measured_s, small_measured_s: exposure of the last frame that measured the target, and its
+            small marker.
         stage: markers measured in the newest frame; ``NONE`` while the filter coasts.
-        measured: the newest frame held a detection of the target.
+        measured: the newest frame contains a detection of the target.
         tracked: the target was measured at most `kalman.n_max` frames ago. If False, the estimate
-            is the target's last place.
-        unseen: frames since the last detection.
-        e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,), which covers the
-            place of a contradicting pose, too, while only that is seen.
+            is the target's last position.
+        unseen: number of frames since the last detection.
+        e_m: target relative to the gear in the level frame, (3,) m. Its standard deviation sigma_m
+            (3,) also covers the position of a contradicting pose while only that is seen.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
-        velocity_mps: filter's velocity of `e_m` (`kalman.frame: level`) or of the
-            target in the world (`kalman.frame: world`), in level axes, (3,).
-        world_m, world_yaw_rad: the target in the world of the vehicle's state estimate;
-            None without an attitude. world_velocity_mps: drift of that world against the target,
+        velocity_mps: the filter's velocity of `e_m` (`kalman.frame: level`) or of the target in the
+            world (`kalman.frame: world`), in level axes, (3,).
+        world_m, world_yaw_rad: the target in the world frame of the vehicle's state estimate; None
+            without an attitude. world_velocity_mps: drift of that frame relative to the target,
             None if the filter works in the level frame.
     """
 
@@ -315,9 +319,9 @@ class TargetEstimate:
 
 @dataclass(frozen=True, eq=False)
 class LastPose:
-    """A pose of the target and the vehicle's attitude at that time, if it was known.
+    """A pose of the target and the vehicle's attitude at that time, if known.
 
-    `error_rad2` holds recent mean square errors of the vehicle's estimated motion, as angles seen
+    `error_rad2` holds the recent mean square errors of the vehicle's estimated motion as angles
     from the camera: of its position differences, and of its velocity times the time.
     """
 
@@ -329,8 +333,8 @@ class LastPose:
 @dataclass(frozen=True, eq=False)
 class Lock:
     """The target that the pipeline is locked on: its last track and pose, in the world or the level
-    frame, the number of `frames` with a pose, whether any pose rested on both markers, and the
-    track `before` the last pose, None for the first."""
+    frame, the number of `frames` with a pose, whether any pose used both markers, and the track
+    `before` the last pose, None for the first pose."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -342,9 +346,9 @@ class Lock:
 
 @dataclass(frozen=True, eq=False)
 class RivalTrack:
-    """A track of something that looks like the target, but at a place where the target cannot be
-    (`text`): its first time, numbers of its frames and of frames with both markers, and whether
-    its range differs from the target's."""
+    """A track of something that looks like the target at a position where the target cannot be
+    (`text`): its first time, the numbers of its frames and of its frames with both markers, and
+    whether its range differs from the target's."""
 
     track: MarkerTrack
     in_world: bool
@@ -357,8 +361,9 @@ class RivalTrack:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order; `fed`, by
-    the track's name, the poses that update a track; and whether the two markers contradict."""
+    """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order; `fed`, the
+    poses that update a track, by the track's name; and whether the two markers contradict each
+    other."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
     fed: dict[str, MarkerPose] = field(default_factory=dict)
@@ -366,16 +371,17 @@ class MeasuredMarkers:
 
     @property
     def surest(self) -> MarkerPose | None:
-        """The pose of least spread among those in `fed`, or else in `poses`; None without any."""
+        """The pose with the smallest standard deviation in `fed`, otherwise in `poses`; None
+        without poses."""
         poses = self.fed or self.poses
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """State of a stream's interlacing detection: `kind` of the last examined frame, `skipped`
-    frames ago; whether the top field is first, None until the `votes` decide; the frames' last
-    periods; the time `last_s` and picture of the `previous` woven frame."""
+    """State of the detection of interlacing in a stream: `kind` of the last examined frame,
+    `skipped` frames ago; whether the top field is first, None until the `votes` decide; the last
+    periods of the frames; the time `last_s` and the picture of the `previous` woven frame."""
 
     kind: PictureKind | None = None
     skipped: int = 0
@@ -388,16 +394,16 @@ class FieldState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
-    """All the memory of the pipeline; `PipelineState()` is a fresh start."""
+    """The pipeline's whole memory; `PipelineState()` is a fresh start."""
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
-    in_world: bool = False  # the tracks' frame: world of the state estimate, or level
-    measured: MeasuredMarkers = MeasuredMarkers()  # of the newest frame
+    in_world: bool = False  # frame of the tracks: world of the state estimate, or level
+    measured: MeasuredMarkers = MeasuredMarkers()  # poses of the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last: Detections | None = None
-    last_pose: LastPose | None = None  # the last
+    last_pose: LastPose | None = None  # the last pose
     disagreeing_frames: int = 0
-    empty_frames: int = 0  # in a row, without either marker
+    empty_frames: int = 0  # number of successive frames without a marker
     lock: Lock | None = None
     rival: RivalTrack | None = None
     fields: FieldState = FieldState()
@@ -410,21 +416,21 @@ class PipelineOutput:
     detections: Detections
     poses: dict[str, MarkerPose]
     target: TargetEstimate | None  # at the frame's time
-    stage: Stage  # by this frame's detections
-    disagreeing_frames: int = 0  # frames in a row in which the two markers contradict
-    fields: PictureKind = "whole"  # what the picture was
-    lock_note: str = ""  # why this frame's pose was not taken, or taken at another place
-    refused: bool = False  # this frame showed another vehicle's target, by its place
+    stage: Stage  # from this frame's detections
+    disagreeing_frames: int = 0  # number of successive frames with contradicting markers
+    fields: PictureKind = "whole"  # kind of the picture
+    lock_note: str = ""  # why this frame's pose was rejected, or accepted at another position
+    refused: bool = False  # this frame showed another vehicle's target, by its position
 
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the profile's camera latency and mounting as estimated in flight, each with one
+    """Errors of the profile's camera latency and mounting estimated in flight, each with one
     standard deviation.
 
-    `delay_s`: latency beyond the profile's. `turn_rad`: rotation of the mounting about body x, y
-    and z. `turn_sigma_rad` includes the constant error of the attitude, which moves the target
-    just as a mounting's roll and pitch do.
+    `delay_s` is the latency beyond the profile's. `turn_rad` is the rotation of the mounting about
+    body x, y and z. `turn_sigma_rad` includes the constant error of the attitude, which moves the
+    target just as an error in roll and pitch of the mounting does.
     """
 
     delay_s: float
