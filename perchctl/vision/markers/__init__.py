@@ -1,1 +1,1 @@
-"""Finding the target's two markers in a picture, and their corners to a hundredth of a pixel."""
+"""Detect the target's two markers in a picture, with corners accurate to 0.01 px."""

@@ -1,17 +1,17 @@
-"""Blurred search: markers in pictures so blurred that no search decodes them.
+"""Blurred search: find markers in pictures that are too blurred for any search to decode them.
 
-A start near an expected marker is where a blurred template T of its drawing correlates best with
-the picture I, by shifts s:
+Near an expected marker, the fit starts at the shift s at which a blurred template T of the marker's
+drawing correlates best with the picture I:
 
     max of  sum (I(x+s) - mean I) (T(x) - mean T) / (|I - mean I| |T - mean T|)
 
-Without an expectation, starts are the quadrilaterals whose cells correlate best with the drawing.
-They may come from anywhere, because none is taken that the photometric fit does not verify
-(`is_verified`, `is_distinctive`), and it measures the corners.
+Without an expectation, the fits start at the quadrilaterals whose cells correlate best with the
+drawing. Any start is safe because the photometric fit must verify it (`is_verified`,
+`is_distinctive`) and measures the corners.
 
-Wrong where that fit is (`perchctl.vision.markers.photometric_fit`). Empty where another codeword
-would look the same, or where the marker is farther from its expected place than 0.5 sides and
-10 px. Corners are (4, 2) px.
+The result is wrong where the photometric fit is (`perchctl.vision.markers.photometric_fit`). It is
+empty if another codeword would look the same, or if the marker is further from its expected
+position than 0.5 sides and 10 px. Corners are (4, 2) px.
 """
 
 from __future__ import annotations
@@ -39,23 +39,25 @@ from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, correlations
 from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
-_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # to start with
-_SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # how far a prediction may be off
+_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
+_SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # largest error of an expected position
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
 _MIN_START_RESEMBLANCE = 0.5
-_NEAR_RESEMBLANCE = 0.45  # where it is expected; textures seldom reach it, and cost a fit each
+# minimum at an expected position; textures seldom reach it, and each costs a fit
+_NEAR_RESEMBLANCE = 0.45
 _MAX_CANDIDATES = 3
-_CENTRE_GREY, _BEYOND_GREY = 0.3, 0.6  # where there may be anything
-_SAME = 0.15  # of a side
-_SHEET = 1.3  # half sides of a marker that are surely paper
+_CENTRE_GREY, _BEYOND_GREY = 0.3, 0.6  # grey of areas with unknown content
+_SAME = 0.15  # distance, as a share of a side, of candidates that count as one
+_SHEET = 1.3  # half sides of a marker that are certainly paper
 
 
 def find_expected_blurred(
     picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
-    """The first marker found near its `expected` corners (4, 2) px; empty if none is found.
+    """Return the first marker found near its `expected` corners (4, 2) px; empty if none is found.
 
-    An even or odd `turn` chooses fits that start with little or with much blur; None: both."""
+    An even or odd `turn` selects fits that start with little or with much blur; None tries both.
+    """
     image, patterns = picture.image, picture.setup.patterns
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
@@ -75,7 +77,8 @@ def find_expected_blurred(
 
 
 def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
-    """The marker that the best of the picture's quadrilaterals shows; empty if none does."""
+    """Return the marker in the best of the picture's quadrilaterals; empty if none contains a
+    marker."""
     image, setup = picture.image, picture.setup
     corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
@@ -89,7 +92,8 @@ def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
 def _best(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Quads (m, 4, 2) that resemble a marker, rolled to it, best first, each place once."""
+    """Return quads (m, 4, 2) similar to a marker, rolled to its orientation, best first, each
+    position once."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -111,7 +115,7 @@ def _best(
 
 
 def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """The corners moved to where the drawing is most like the picture."""
+    """Return the corners moved to the best correlation of the drawing with the picture."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_SEARCH_PX, _SEARCH_SIDES * side_px)
@@ -140,7 +144,7 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
 
 
 def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
-    """The drawing at own coordinates (n, n, 2), softened."""
+    """Return the blurred drawing at the marker's own coordinates (n, n, 2)."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -153,19 +157,19 @@ def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float3
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
 
-# --- A marker measured by its drawing, and taken only if the picture looks like it beyond doubt
+# --- Measure a marker by its drawing, and accept it only if the picture matches beyond doubt ---
 
 
 _MIN_SIGMA_PX = 0.015
-_BLUR_SIGMA = 0.012  # of the blur: no picture is its drawing with an even blur
+_BLUR_SIGMA = 0.012  # share of the blur: no picture equals its drawing with uniform blur
 _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
 _MAX_CELL_DEPARTURE = 0.3
 _MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
-_MOST_ALIGNED_SIGMA = 0.06  # of the side
+_MOST_ALIGNED_SIGMA = 0.06  # share of the side
 _MIN_REACH_PX = 3.0
-_MIN_GROWTH, _MAX_GROWTH = 0.6, 1.6  # of the mean side
-_MIN_EVENNESS = 0.6  # shortest side over the longest
+_MIN_GROWTH, _MAX_GROWTH = 0.6, 1.6  # ratio of the mean sides
+_MIN_EVENNESS = 0.6  # ratio of the shortest side to the longest
 
 
 def align_marker(
@@ -177,11 +181,11 @@ def align_marker(
     max_sigma: float = _MOST_ALIGNED_SIGMA,
     alone: bool = True,
 ) -> RefinedCorners | None:
-    """The marker fitted by its drawing; None unless the picture looks like the drawing.
+    """Return the marker fitted by its drawing; None unless the picture matches the drawing.
 
-    `reach` is the allowed distance of the corners from `start_px`, and `max_sigma` their
-    largest spread, both in side lengths; `blur_px` is a first guess. If `alone`, the codeword
-    must be distinctive; otherwise the other marker identifies it.
+    `reach` is the largest distance of the corners from `start_px`, and `max_sigma` their largest
+    standard deviation, both in side lengths; `blur_px` is a first guess. If `alone`, the codeword
+    must be distinctive; otherwise the other marker identifies this one.
     """
     side_px = mean_side_px(start_px)
     if not side_px >= LEAST_SIDE_PX:
@@ -195,7 +199,7 @@ def align_marker(
         or found.moved_px > max(reach * side_px, _MIN_REACH_PX)
     ):
         return None
-    # A square is still one, of about the same size, and the same way round.
+    # The square must remain a square of about the same size and orientation.
     sides_px, areas = side_lengths_px(found.corners_px), [found.corners_px, start_px]
     if (
         sides_px.min() < _MIN_EVENNESS * sides_px.max()
@@ -207,16 +211,16 @@ def align_marker(
     (left, top), (right, bottom) = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
     part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
     if int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size:
-        # No light makes a drawing whose white is clipped.
+        # The light model does not explain clipped white.
         sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
     return RefinedCorners(found.corners_px, sigma_px, True)
 
 
 def is_verified(found: Alignment, max_sigma: float = _MOST_ALIGNED_SIGMA) -> bool:
-    """True if the picture looks like the drawing.
+    """True if the picture matches the drawing.
 
-    Without the marker the pattern's correlation stays below 0.72 at the right strength; with the
-    marker it is above 0.95.
+    Without the marker, the correlation of the pattern stays below 0.72 at the right strength; with
+    the marker, it is above 0.95.
     """
     return (
         found.pattern > _MIN_PATTERN
@@ -228,6 +232,6 @@ def is_verified(found: Alignment, max_sigma: float = _MOST_ALIGNED_SIGMA) -> boo
 
 
 def is_distinctive(found: Alignment) -> bool:
-    """True if another codeword would look different. Of 36 other markers that `is_verified`
-    accepted, all had a flip above 0.5."""
+    """True if any other codeword would look different. All of 36 other markers that `is_verified`
+    accepted had a flip above 0.5."""
     return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA

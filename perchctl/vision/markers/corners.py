@@ -1,8 +1,8 @@
-"""A marker's square in the picture: its sides, its area, and the squares that share its centre;
-and its corners as they were refined.
+"""Geometry of a marker's square in the picture (sides, area, concentric squares), and its refined
+corners.
 
-The unit square is a marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1),
-(-1, 1) in the order of `Detection.corners_px`.
+The unit square is the marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1), (-1, 1)
+in the order of `Detection.corners_px`.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from perchctl.vision.lens import distort, undistort
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # corner i's neighbours
+NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # indices of corner i's neighbours
 OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-"""Of each side, in the marker's own coordinates."""
+"""Outward normal of each side in the marker's own coordinates."""
 _UNIT32 = UNIT.astype(np.float32)
 _UNIT1: Array = np.column_stack([UNIT, np.ones(4)])
 _INCREMENTS: Array = np.array(
     [[[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]] for u, v in UNIT]
 )
-"""Of each corner, how far an increment's terms move it in the marker's own coordinates."""
+"""Motion of each corner with the terms of an increment, in the marker's own coordinates."""
 
 
 def homography_from_unit(corners: Array) -> Array:
-    """The homography (3, 3) from the square of -1 to 1 to corners (4, 2)."""
+    """Return the homography (3, 3) from the square of -1 to 1 to corners (4, 2)."""
     H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def homography_to_unit(corners: Array) -> Array:
-    """The homography (3, 3) from corners (4, 2) to the square of -1 to 1."""
+    """Return the homography (3, 3) from corners (4, 2) to the square of -1 to 1."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
     return np.asarray(H, dtype=np.float64)
 
 
 def apply_homography(H: Array, points: Array) -> Array:
-    """The points (..., 2) mapped by the homography."""
+    """Return the points (..., 2) mapped by the homography."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
 def homography_jacobian(homography: Array) -> Array:
-    """The Jacobian (8, 8) of the projected corners of the unit square with respect to the
-    terms `p` of `increment_homography`, at a homography (3, 3)."""
+    """Return the Jacobian (8, 8) of the projected corners of the unit square by the terms `p` of
+    `increment_homography`, at a homography (3, 3)."""
     q = _UNIT1.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
@@ -59,20 +59,20 @@ def homography_jacobian(homography: Array) -> Array:
 
 
 def increment_homography(H: Array, p: Array) -> Array:
-    """Return H (I + P), scaled to 1 in its last term; p (8,) are the first terms of P
-    (3, 3), row by row; the last is 0."""
+    """Return H (I + P), scaled so that the last element is 1. p (8,) are the first elements of P
+    (3, 3), row by row; the last one is 0."""
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     return np.asarray(H / H[2, 2])
 
 
 def side_lengths_px(corners_px: Array) -> Array:
-    """The lengths (..., 4) of the sides of squares with corners (..., 4, 2)."""
+    """Return the side lengths (..., 4) of squares with corners (..., 4, 2)."""
     d = corners_px.take(NEXT, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
 
 def mean_side_px(corners_px: Array) -> float:
-    """The mean length of the sides of one square (4, 2)."""
+    """Return the mean side length of one square (4, 2)."""
     a, b, c, d = corners_px.tolist()
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
@@ -87,12 +87,12 @@ def within(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) ->
     """True if all corners (4, 2) are at least `margin_px` inside the edges of a picture (h, w)."""
     h, w = shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
-    # False for NaN.
+    # NaN yields False.
     return all(margin_px <= x <= right and margin_px <= y <= low for x, y in corners_px.tolist())
 
 
 def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
-    """The corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
+    """Return the corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
     without a camera, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
     found = apply_homography(homography_from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
@@ -102,7 +102,8 @@ def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = N
 def with_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
-    """Both markers' corners; a missing marker is derived from the other marker by their `ratio`."""
+    """Return both markers' corners; a missing marker follows from the other one and their
+    `ratio`."""
     both = dict(expected)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], ratio, camera)
@@ -111,19 +112,21 @@ def with_missing_marker(
     return both
 
 
-# --- A marker's corners as they were refined, and each by its own neighbourhood ---
-# Such a corner is pulled inwards (0.15 to 0.55 px), which makes the target look far.
+# --- Refined corners, and refinement of each corner by its own neighbourhood ---
+# Corners refined by their own neighbourhood are biased inwards (0.15 to 0.55 px), so that the
+# target looks too far away.
 
 
 RAW_SIGMA_PX = 0.6
 SUBPIX_SIGMA_PX = 0.25
-NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothing
+NESTED_SIGMA_PX = 0.6  # derived from the other marker, not measured
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """A marker's corners as they were refined; spreads and covariance as of a `Detection`; largest
-    and least blur of a side, px; `edge_shift` is the correction that was applied."""
+    """Refined corners of a marker: standard deviations and covariance as in `Detection`, the
+    largest and the smallest blur of a side, px, and the `edge_shift` correction that was
+    applied."""
 
     corners_px: Array
     sigma_px: float
@@ -137,11 +140,12 @@ class RefinedCorners:
 
 
 def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
-    """Corners (4, 2) px by `cv2.cornerSubPix`, or raw if that moves one out of its window.
+    """Refine corners (4, 2) px with `cv2.cornerSubPix`; keep them raw if one leaves its window.
 
-    Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over pixels q of a window of half a
-    cell to each side, 1 to 5 px; `cells` is the number of cells along a side. Blur pulls such a
-    corner inwards by 0.15 to 0.3 px, which makes the target look far: `refined` is False."""
+    Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window of half
+    a cell to each side, 1 to 5 px; `cells` is the number of cells along a side. Blur biases such a
+    corner inwards by 0.15 to 0.3 px, so that the target looks too far away: `refined` is False.
+    """
     side_px = float(side_lengths_px(raw_px).min())
     half = int(np.clip(round(0.5 * side_px / cells), 1, 5))
     points = np.ascontiguousarray(raw_px, dtype=np.float32).reshape(-1, 1, 2)

@@ -1,20 +1,23 @@
-"""Cut-view fit: the target so near, or so far aside, that no marker is wholly in the picture.
+"""Cut-view fit: a target so close, or so far off the axis, that no marker is completely in the
+picture.
 
-The edges of the whole drawing, of both markers, are sought across their predicted places. A part of
-a drawing does not determine the eight terms of a homography, so the unknowns are a rigid body's:
-Gauss-Newton finds the rotation w and translation t by the distances r_k, px, from the drawing's
-edges to the picture's, together with the shift d of all edges (white over black):
+The edges of the whole drawing, of both markers, are located across their predicted positions. A
+part of a drawing does not determine the eight terms of a homography, so the unknowns are those of a
+rigid body. Gauss-Newton finds the rotation w and the translation t, together with the shift d of
+all edges (white over black), from the distances r_k, px, between the drawing's edges and the
+picture's:
 
     min sum v_k (r_k - J_k (w, t, d))^2 / sigma^2 + sum ((w, t, d)_j / sigma_j)^2
 
-with Tukey's weights v. The second sum holds what is not seen at the prediction. One marker's
-corners follow by projection, with their covariance (8, 8) px^2.
+with Tukey's weights v. The second sum keeps unobserved terms at the prediction. The corners of one
+marker follow by projection, with their covariance (8, 8) px^2.
 
-Wrong where the predicted tilt is off by much more than its sigma, 2 deg, and no edge shows it. A
-part of a drawing looks like many things: it is no first sight of the target, and counts only if the
-picture is like it all over (correlation above 0.9), with three quarters of the edges in view.
+The result is wrong if the predicted tilt is wrong by much more than its standard deviation, 2 deg,
+and no edge shows it. A part of a drawing resembles many other objects: this fit never starts a
+track, and it counts only if the picture matches the drawing everywhere (correlation above 0.9) and
+three quarters of the edges in view are found.
 
-The unit of length is half the large marker's side.
+The unit of length is half the side of the large marker.
 """
 
 from __future__ import annotations
@@ -39,46 +42,48 @@ from perchctl.vision.markers.photometric_fit import likeness, make_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
 MOST_AGE_S = 0.5
-"""Since the target was last measured; after that what shows a part of it is no evidence."""
-_EDGE_PX = 40  # from the picture's edge, where a marker may just have been cut
-_LEAST_SMALL_CELL_PX = 8.0  # of the small marker; smaller, and the large one is in view
-_MIN_GLANCE = 0.6  # correlation where the prediction was moved to
-_GOOD_GLANCE = 0.95  # then no other size is tried
+"""Largest time since the target was last measured, s; after it, a visible part of the target is no
+evidence."""
+_EDGE_PX = 40  # from the edge of the picture, where a marker may just have been cut
+# cell of the small marker; if it is smaller, the large marker is in view
+_LEAST_SMALL_CELL_PX = 8.0
+_MIN_GLANCE = 0.6  # correlation required at the moved prediction
+_GOOD_GLANCE = 0.95  # correlation at which no other size is tried
 _GROWTHS = (1.0, 0.94, 1.06)
 _MIN_LIKENESS, _MIN_CUT_GAIN = 0.9, 20.0
-_MIN_SHOWN = 0.75  # of the places in view
+_MIN_SHOWN = 0.75  # share of the edge points in view
 _MOST_RESIDUAL_PX = 1.2
 _MOST_SPREAD = 0.04  # of the centre, in half sides
 _FLOOR_PX = 0.02
-_SMALL_PLACES = 12  # that make it the small marker that was seen
-_INVERTED = 1e-3  # normalised; the lens model holds where its inverse is one
-_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
+_SMALL_PLACES = 12  # edge points that make the small marker the measured one
+_INVERTED = 1e-3  # normalised; the lens model is valid where its inverse exists
+_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # rotation from a marker's own coordinates to its axes
 
 
 def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
-    """Fill the caches of `fit_cut_markers` before the flight, so that it is fast at once."""
+    """Fill the caches of `fit_cut_markers` before the flight, so that its first call is fast."""
     _outline(patterns), make_texture(patterns["large"].drawing), make_lattice(camera)
 
 
 def is_target_cut(
     expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
 ) -> bool:
-    """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden
-    by the vehicle's gear."""
+    """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden by the
+    vehicle's gear."""
     whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
     return bool(expected) and all(is_hidden(hidden, c) for c in whole)
 
 
 def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
-    """True if an expected marker (4, 2) px may be wholly in the picture."""
+    """True if an expected marker (4, 2) px may be completely in the picture."""
     return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
 
 
 def fit_cut_markers(
     picture: Picture, expected: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the target's visible part; return one marker's corners by that fit, empty if it fails.
-    `expected` are the predicted corners (4, 2) px."""
+    """Fit the target's visible part and return one marker's corners from the fit; empty if it
+    fails. `expected` are the predicted corners (4, 2) px."""
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
@@ -106,8 +111,8 @@ def fit_cut_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, position_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """True if the visible part of the target is enough to measure it, for a large marker
-    with the rotation (3, 3) and centre (3,) in the camera frame."""
+    """True if the visible part of the target suffices for a measurement, for a large marker with
+    the rotation (3, 3) and centre (3,) in the camera frame."""
     patterns = _patterns_of(target)
     pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
     found = predict_fit(pose, _outline(patterns), camera)
@@ -128,7 +133,7 @@ def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
 
 
 def _stands_for(found: PoseFit) -> MarkerName:
-    """The marker that was seen: the small one, if enough of it was."""
+    """Return the marker that was measured: the small one if enough of it was visible."""
     return "small" if found.small_points >= _SMALL_PLACES else "large"
 
 
@@ -151,7 +156,7 @@ def _start(
 
 
 def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
-    """The prediction moved to where the picture is like it, if it is."""
+    """Return the prediction moved to its best match in the picture; None without a match."""
     best, pose, lattice = _MIN_GLANCE, None, view.lattice
     for growth in _GROWTHS:
         t = start.t * (1.0, 1.0, 1.0 / growth)
@@ -170,7 +175,7 @@ def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose
 
 
 def _trusted(found: PoseFit) -> bool:
-    """True if nearly all edges are there and fix the place."""
+    """True if nearly all edges were found and determine the position."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
         found.points_shown >= _MIN_SHOWN * found.points_in_view
@@ -180,13 +185,13 @@ def _trusted(found: PoseFit) -> bool:
 
 
 def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners | None:
-    """The corners of the marker of that half side, if the lens reaches."""
+    """Return the corners of the marker with this half side; None outside the lens model."""
     r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
     X = r + found.pose.t
     if X[:, 2].min() <= 0.0:
-        return None  # one is beside or behind the camera
+        return None  # one corner is next to or behind the camera
     x = X[:, :2] / X[:, 2:]
-    J = np.zeros((8, 6))  # pixels of a pinhole, with turn and move
+    J = np.zeros((8, 6))  # pixels of a pinhole camera by rotation and translation
     for k in range(4):
         P = np.array([[1.0, 0.0, -x[k, 0]], [0.0, 1.0, -x[k, 1]]]) / X[k, 2]
         P = camera.K[:2, :2] @ P
@@ -200,26 +205,28 @@ def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
 
 
-# --- A picture at a glance: small, through a pinhole, beside what a drawing would look like there
+# --- A reduced picture through a pinhole camera, and the drawing rendered into it ---
 
 
 Grey = NDArray[np.float32]
 
-_NODES = 80  # across the picture, about
-_FINE = 2  # samples for a node, in both directions
+_NODES = 80  # across the picture, approximately
+_FINE = 2  # samples per node in both directions
 _WIDEST = 1.5  # normalised: 56 degrees off the axis
 _RIM_POINTS = 40
 _REACHED = 1.02
 _SEARCHED = 6  # nodes to each side
-_LEAST_NODES = 200  # that show paper
+_LEAST_NODES = 200  # least number of nodes on paper
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Nodes of a pinhole's picture, `step` apart in normalised coordinates from `first` on. (`x`,
-    `y`): places of their samples in the picture reduced to `size` (width, height).
+    """Nodes of a pinhole camera's picture, `step` apart in normalised coordinates, starting at
+    `first`. `x` and `y` are the positions of their samples in the picture reduced to `size` (width,
+    height).
 
-    `inside` marks nodes in the picture. Beyond `reach` a lens model may fold back."""
+    `inside` marks the nodes in the picture. Beyond `reach`, a lens model may fold back.
+    """
 
     first: Array
     step: float
@@ -232,8 +239,8 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A reduced picture: grey values (rows, columns) at a lattice's nodes; `seen` if the node is in
-    view and uncovered."""
+    """A reduced picture: grey values (rows, columns) at the nodes of a lattice; `seen` is True for
+    nodes in view and uncovered."""
 
     lattice: Lattice
     grey: Grey
@@ -242,7 +249,7 @@ class Overview:
 
 @lru_cache(maxsize=8)
 def make_lattice(camera: CameraModel) -> Lattice:
-    """The lattice over a camera's picture."""
+    """Return the lattice over a camera's picture."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _RIM_POINTS)
     low, high = np.zeros_like(s), np.ones_like(s)
@@ -279,7 +286,8 @@ def make_lattice(camera: CameraModel) -> Lattice:
 def make_overview(
     image: NDArray[np.uint8], camera: CameraModel, mask: NDArray[np.uint8] | None = None
 ) -> Overview:
-    """The reduced picture at the lattice's nodes; nodes where `mask` (h, w) is set are not seen."""
+    """Return the reduced picture at the lattice's nodes; nodes with `mask` (h, w) set are not
+    seen."""
     lattice = make_lattice(camera)
     seen = lattice.inside
     if mask is not None:
@@ -300,7 +308,8 @@ def _coarse(fine: Grey) -> Grey:
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
-    """Whiteness of the drawing projected by H (3, 3), at the nodes and `margin` nodes around."""
+    """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin` nodes
+    around."""
     step = lattice.step / _FINE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
@@ -322,7 +331,8 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
 
 
 def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
-    """The view's correlation with the drawing projected by H (3, 3), and contrast in greys."""
+    """Return the view's correlation with the drawing projected by H (3, 3), and the contrast in
+    grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
@@ -337,21 +347,22 @@ def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float,
     return likeness(grey, grey - A @ light), float(light[3])
 
 
-# --- The drawing of the whole target: its edges between black and white, and its picture ---
+# --- The drawing of the whole target: its edges between black and white, and its texture ---
 
 
-PAPER = 1.25  # half sides of the large marker that are surely paper
-_LARGE_PLACES, _SMALL_CELL_PLACES = 24, 6  # along a cell's side
-_FROM_END = 0.15  # of a cell's side, where the next cell's corner blurs the edge
-_HIDDEN = 1.2  # half sides of the marker in the centre, within which the large one is not seen
+PAPER = 1.25  # half sides of the large marker that are certainly paper
+_LARGE_PLACES, _SMALL_CELL_PLACES = 24, 6  # points along a cell's side
+# share of a cell's side near its ends, where the next cell's corner blurs the edge
+_FROM_END = 0.15
+_HIDDEN = 1.2  # half sides of the central marker, which hides the large one
 _TEXELS = 320
 
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Points along the drawing's edges: `at` (n, 2); `normal` (n, 2) from black to white; and per
-    point (n,) its `line`'s number, the sigma of that line's print error, the width of the adjacent
-    `cell`, and whether the edge is the `small` marker's."""
+    """Points along the drawing's edges: `at` (n, 2) and `normal` (n, 2) from black to white. Per
+    point (n,): number of its `line`, standard deviation of that line's print error, width of the
+    adjacent `cell`, and whether the edge belongs to the `small` marker."""
 
     at: Array
     normal: Array
@@ -362,12 +373,14 @@ class Outline:
 
 
 Texture = tuple[NDArray[np.float32], Array]
-"""How white the paper is, float32 (m, m), 0 to 1, and T (3, 3) from own coordinates to it."""
+"""Whiteness of the paper, float32 (m, m), 0 to 1, and T (3, 3) from own coordinates to its
+pixels."""
 
 
 @lru_cache(maxsize=8)
 def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
-    """The edges of both markers; tolerances are print errors of an edge's position, in cells."""
+    """Return the edges of both markers; tolerances are print errors of an edge's position, in
+    cells."""
     hidden = _HIDDEN * drawing.ratio
     edges = [
         edge
@@ -394,7 +407,7 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
 
 @lru_cache(maxsize=8)
 def make_texture(drawing: Drawing) -> Texture:
-    """A picture of the drawing up to `PAPER`, and the homography (3, 3) to its pixels."""
+    """Return a picture of the drawing up to `PAPER`, and the homography (3, 3) to its pixels."""
     axis = make_grid(_TEXELS, PAPER).axis
     wide = render_cells(drawing, axis, PAPER / _TEXELS)
     more = (len(wide) - _TEXELS) // 2
@@ -407,7 +420,7 @@ def make_texture(drawing: Drawing) -> Texture:
 def _edges(
     cells: Array, half: float, places: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
-    """The sides at which cells differ, as an `Outline` has them."""
+    """Yield the sides between cells of different colour, in the form of `Outline`."""
     width = 2.0 * half / len(cells)
     s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
     for across in (0, 1):
@@ -423,44 +436,49 @@ def _edges(
             yield at, normal, (half, across, j), width
 
 
-# --- The target's pose from the edges that are in view, where its markers are cut by the picture
-# Gauss-Newton turns and moves the drawing until its edges are the picture's, sought across them.
-# Its unknowns are a rigid body's: a part of a drawing does not show the eight of a homography, and
-# a tilt that it does not show is the prediction's. The unit is the large marker's half side.
+# --- Pose of the target from the edges in view ---
+# Gauss-Newton rotates and moves the drawing until its edges match those located across them in the
+# picture. The unknowns are those of a rigid body: a part of a drawing does not determine the eight
+# terms of a homography, and an unobserved tilt stays at the prediction. The unit is half the side
+# of the large marker.
 
 
-# Of the profiles, by rounds. An ascent blurs edges near the picture's rim by several pixels.
+# Half lengths of the profiles per round. An ascent blurs edges near the picture's border by several
+# pixels.
 _REACH_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _PROFILE_REACH_CELLS, _LEAST_REACH_PX = 0.4, 3.0
-_CUT_STILL_PX, _CUT_SETTLED_PX = 0.02, 0.5  # no other round follows; without this it is no fit
-_LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE = 8.0, 0.35  # grey levels; of the median
+# below the first, no further round; above the second, the fit has failed
+_CUT_STILL_PX, _CUT_SETTLED_PX = 0.02, 0.5
+_LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE = 8.0, 0.35  # grey levels; share of the median
 _LEAST_PLACES = 24
 _TUKEY, _LEAST_SCALE_PX = 3.5, 0.15
-_TAILS = 1.3  # what robust weights take away from a residual's square
-_LINE_OFF_PX = 0.02  # by which a whole line may be off, of lens and light
-_TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0  # of a prediction
-_SHIFT_PX = 0.15  # by which white may have grown over black
+_TAILS = 1.3  # share of a residual's square that robust weights remove
+_LINE_OFF_PX = 0.02  # error of a whole line, due to lens and light
+# standard deviations of a prediction
+_TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0
+_SHIFT_PX = 0.15  # growth of white over black
 _PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT_PX]) ** -2.0
 
 
 @dataclass(frozen=True, eq=False)
 class RigidPose:
-    """Rotation R (3, 3) and translation t (3,), large half sides, of the drawing in the camera."""
+    """Rotation R (3, 3) and translation t (3,), in half sides of the large marker, of the drawing
+    in the camera."""
 
     R: Array
     t: Array
 
     @property
     def H(self) -> Array:
-        """Homography (3, 3) of the drawing's coordinates to normalised image coordinates."""
+        """Homography (3, 3) from the drawing's coordinates to normalised image coordinates."""
         return np.column_stack([self.R[:, 0], self.R[:, 1], self.t])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
     """A pose with its covariance (6, 6) of rotation and translation; the numbers of edge points in
-    view, of points that showed an edge, and of the small marker's points among these; and the RMS
-    of the shown points' residuals."""
+    view, of points at which an edge was found, and of points on the small marker among these; and
+    the RMS residual of the found points."""
 
     pose: RigidPose
     cov: Array
@@ -472,9 +490,10 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Of an outline, in the picture: at (n, 2) px and unit normal (n, 2) from black to white,
-    changes J (n, 7) along it with turn, move and the shift of all edges (white over black), px for
-    a unit across (n,), and which of the outline's they are (n,)."""
+    """Edge points of an outline in the picture: `at` (n, 2) px and unit normal (n, 2) from black to
+    white. `J` (n, 7) is their motion along the normal with rotation, translation and the shift of
+    all edges (white over black), `px_per_unit` (n,) the scale across the edge, and `index` (n,)
+    their index in the outline."""
 
     at: Array
     normal: Array
@@ -484,8 +503,8 @@ class _Places:
 
 
 _Round = tuple[Array, Array, Array, float]
-"""The step of all unknowns (7,), the inverse of their normal matrix, the places' weights (n,), and
-the variance of one place, px^2."""
+"""Step of all unknowns (7,), inverse of their normal matrix, weights of the points (n,), and
+variance of one point, px^2."""
 
 
 def fit_pose(
@@ -516,13 +535,14 @@ def fit_pose(
         moved_px = float(np.abs(places.J[:, :6] @ step).max())
         if moved_px < _CUT_STILL_PX:
             break
-    if found is None or not (moved_px <= _CUT_SETTLED_PX and pose.t[2] > 0.0):  # or no number
+    if found is None or not (moved_px <= _CUT_SETTLED_PX and pose.t[2] > 0.0):  # also for NaN
         return None
     return _visible(pose, found, places, outline)
 
 
 def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
-    """The result of `fit_pose` for a perfect picture at that pose; None if too little is seen."""
+    """Return the result of `fit_pose` for a perfect picture at that pose; None if too little is
+    visible."""
     places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
     n = len(places.index)
     if n < _LEAST_PLACES:
@@ -549,7 +569,7 @@ def _in_view(
     inside = ((at >= room) & (at <= np.array([w - 1.0, h - 1.0]) - room)).all(axis=1)
     near, at = near[inside], at[inside]
     X, x = X[near], x[near]
-    # The lens's own change, (n, 2, 2), by small steps.
+    # Derivative of the lens model, (n, 2, 2), by finite differences.
     small = 1e-4
     D = np.stack(
         [
@@ -558,7 +578,8 @@ def _in_view(
         ],
         axis=2,
     )
-    # A point's change with turn (about the drawing's centre) and move: dx / d(X), (n, 2, 3).
+    # Motion of a point with rotation (about the drawing's centre) and translation: dx / d(X), (n,
+    # 2, 3).
     P = np.zeros((len(x), 2, 3))
     P[:, 0, 0] = P[:, 1, 1] = 1.0 / X[:, 2]
     P[:, :, 2] = -x / X[:, 2:]
@@ -585,7 +606,8 @@ def _in_view(
 def _offsets(
     image: NDArray[np.uint8], places: _Places, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return how far along its normal each place's edge is (n,) px, if it is."""
+    """Return the offset of each point's edge along its normal, (n,) px, and whether an edge was
+    found."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample_profiles(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -602,7 +624,7 @@ def _offsets(
 def _solved(
     places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
 ) -> _Round | None:
-    """A robust step, after those before, in `total` (7,)."""
+    """Return a robust step, given the sum `total` (7,) of the previous steps."""
     J, weight = places.J, shows.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):

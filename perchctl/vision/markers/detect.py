@@ -1,7 +1,7 @@
-"""The corners of the target's two markers in a picture.
+"""Detect the corners of the target's two markers in a picture.
 
-`METHODS` lists the methods that find corners in the order in which they are tried, with what each
-needs, what it costs and when it is used; ``docs/corners.md`` shows each of them at work.
+`METHODS` lists the methods that find corners in the order in which they are tried, with the
+requirements, cost and use of each; ``docs/corners.md`` shows examples of all.
 
     frame -> Prior -> METHODS, one by one -> Findings -> Detections
              (expected corners, kinds of search)
@@ -63,8 +63,9 @@ from perchctl.vision.types import (
     PictureKind,
 )
 
-_SEARCHED_SIDE_PX = 13.0  # smaller markers are not found by a search
-_SHIFT_PICTURES = 5  # for which a measured shift of all edges holds: light changes slowly
+_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
+# pictures for which a measured shift of all edges is valid, since light changes slowly
+_SHIFT_PICTURES = 5
 _Found = dict[MarkerName, RefinedCorners]
 
 
@@ -73,18 +74,18 @@ _Found = dict[MarkerName, RefinedCorners]
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known about the target before a frame is looked at.
+    """Knowledge about the target before a frame is examined.
 
     Attributes:
         expected: the markers' predicted corners, each (4, 2) px; empty if no target is expected.
         both: `expected`, with a missing marker derived from the other one.
-        look: the kinds of search whose turn it is.
-        turn: chooses the first guess of the blur by its parity; None: try all.
+        look: the kinds of search for this frame.
+        turn: its parity selects the first guess of the blur; None tries all.
         was_recent: a marker was found at most `MOST_AGE_S` before this frame; False without edge
             fits.
-        was_cut: so it was, and no marker may have been wholly in that picture.
-        edge_shift: the shift of all edges that the last frames measured; None: measure it.
-        own: chooses among several targets if none is expected; None: by the picture alone.
+        was_cut: `was_recent`, and no marker can have been completely in that picture.
+        edge_shift: the shift of all edges measured in the last frames; None measures it.
+        own: selects one of several targets if none is expected; None uses the picture alone.
     """
 
     expected: Mapping[MarkerName, Array]
@@ -99,8 +100,8 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the methods up to now have found in a picture: the markers' `corners`, and the result
-    of the last `search`."""
+    """Results of the methods tried so far: the markers' `corners`, and the result of the last
+    `search`."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
     search: FoundMarkers = field(default_factory=FoundMarkers)
@@ -108,15 +109,16 @@ class Findings:
 
 @dataclass(frozen=True, eq=False)
 class CornerMethod:
-    """One way to find corners: a row of `METHODS`.
+    """One method to find corners: a row of `METHODS`.
 
     Attributes:
         name: its heading in ``docs/corners.md``.
-        needs: what it cannot do without.
+        needs: its requirements.
         cost: typical time for a picture of 640x480 on one core.
         used_when: `is_used` in words.
-        is_used: whether it is tried, by the picture, the prior and what was found before.
-        find: the findings that replace those before it.
+        is_used: function that returns True if the method applies to the picture, the prior and the
+            findings so far.
+        find: function that returns the findings that replace the previous ones.
     """
 
     name: str
@@ -140,7 +142,7 @@ def _is_off_its_track(picture: Picture, prior: Prior, found: Findings) -> bool:
 
 
 def _search_halved(picture: Picture, prior: Prior, found: Findings) -> Findings:
-    # Where no side was met, a near target has most often moved farther than a profile reaches.
+    # If no side was found, a close target has usually moved further than a profile reaches.
     searched = search_halved(picture, prior.both)
     if searched is None:
         return found
@@ -268,12 +270,12 @@ METHODS: tuple[CornerMethod, ...] = (
         find=_search_blurred,
     ),
 )
-"""Tried in this order in each picture. With ``detector.refinement: subpix`` only the search is
-used."""
+"""The methods, tried in this order in each picture. With ``detector.refinement: subpix``, only the
+search is used."""
 
 
 def find_corners(picture: Picture, prior: Prior) -> Findings:
-    """What the methods find in a picture: each that is used starts from the findings before it."""
+    """Apply the methods to a picture; each one that is used starts from the previous findings."""
     found = Findings()
     for method in METHODS:
         if method.is_used(picture, prior, found):
@@ -292,10 +294,11 @@ def detect_markers(
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
-    The search begins at the corners (4, 2) px `expected` by the vehicle's motion, or else near the
-    `previous` detections. `empty_frames`, the number of frames in a row without markers, alternates
-    the kinds of search; None: all kinds. If no target is expected, `own` chooses among several. For
-    a frame of two fields the result is the fields' mean."""
+    The search starts at the corners (4, 2) px `expected` from the vehicle's motion, or otherwise
+    near the `previous` detections. `empty_frames`, the number of successive frames without markers,
+    alternates the kinds of search; None applies all kinds. If no target is expected, `own` selects
+    one of several. For a frame of two fields, the result is the mean of the fields.
+    """
     prior = make_prior(frame, previous, setup, camera, expected, empty_frames, own)
     if frame.fields == "woven":
         first, second = (_detect(each, setup, camera, prior) for each in field_frames(frame))
@@ -312,13 +315,13 @@ def make_prior(
     empty_frames: int | None = None,
     own: OwnOffset | None = None,
 ) -> Prior:
-    """What is known before the frame; arguments as of `detect_markers`."""
+    """Return the knowledge before the frame; arguments as in `detect_markers`."""
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     look = _look(empty_frames, bool(expected), setup.fits_lines)
     turn = None
     if empty_frames is not None and look in ("near", "fits"):
         turn = (empty_frames + 2) // 4
-    # A part of the target is known again where it was measured a short time ago.
+    # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
     was_recent = was_recent and setup.fits_lines and bool(last)
@@ -356,7 +359,7 @@ def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prio
 
 
 def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
-    """Return how to search this frame. After a loss the ways take turns."""
+    """Return the kind of search for this frame. After a loss, the kinds alternate."""
     if empty_frames is None:
         return "all"
     if not fits_lines or (expected and empty_frames % 2):
@@ -365,7 +368,7 @@ def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
         if empty_frames == 0:
             return "near"
         return "fits" if empty_frames % 4 else "window"
-    # At 0 something was seen, though not where the target should be.
+    # At 0, something was seen, but not at the expected position.
     every = DetectorConfig.blurred_every
     return "blurred" if empty_frames and empty_frames % every == 0 else "sharp"
 
@@ -381,9 +384,9 @@ def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array
 
 
 def _refine_found(picture: Picture, found: FoundMarkers) -> _Found:
-    """Measure the raw corners of a search: by edge fit, or else by subpixel refinement; markers
-    that are not wholly in view by the partial-view fit, because a search takes the picture's edge
-    for a side; and by the photometric fit where edges do not suffice."""
+    """Measure the raw corners of a search: by the edge fit, otherwise by subpixel refinement.
+    Markers that are not completely in view are measured by the partial-view fit because a search
+    takes the picture's edge for a side. The photometric fit follows where edges do not suffice."""
     image, setup = picture.image, picture.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_lines(picture, raw) if setup.fits_lines else {}
@@ -429,15 +432,16 @@ def _detection(name: MarkerName, seen: _Found, fields: PictureKind | None) -> De
     )
 
 
-# --- How the markers move from picture to picture, and where that leads them ---
+# --- Motion of the markers from picture to picture, and their predicted positions ---
 
 
 _QUARTERS: Array = np.full(4, 0.25)
-_MAX_GAP_S = 0.25  # older motion is no evidence of where to look
+_MAX_GAP_S = 0.25  # older motion does not predict positions
 
 
 def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
-    """The corners (4, 2) px in `previous`, extrapolated to `t_s` by their flow; may be empty."""
+    """Return the corners (4, 2) px in `previous`, extrapolated to `t_s` by their flow; may be
+    empty."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
@@ -464,17 +468,19 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
     return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
-# --- Photometric fits of what the edge fit left vague or unseen ---
+# --- Photometric fits for markers that the edge fit measured poorly or missed ---
 
 
-_GOOD_CELL_PX = 6.0  # from here on, lines are as exact as the drawing, and faster
-_GOOD_CELL_BLURS = 6.0  # a cell's width over the blur's sigma, likewise
-_ALIGN_REACH = 0.3  # of the side
-# Where the other marker shows that it must be there, it may be vague.
-_MOST_SIGMA_ALONE, _MOST_TRACKED_SIGMA = 0.06, 0.12  # of the side
-_UNKNOWN_BLUR_PX = 1.5  # to start with, where it is not known
+_GOOD_CELL_PX = 6.0  # from this size on, lines are as accurate as the drawing, and faster
+# the same limit as a ratio of a cell's width to the blur's standard deviation
+_GOOD_CELL_BLURS = 6.0
+_ALIGN_REACH = 0.3  # share of the side
+# A marker whose position follows from the other one may have a larger standard deviation.
+_MOST_SIGMA_ALONE, _MOST_TRACKED_SIGMA = 0.06, 0.12  # share of the side
+_UNKNOWN_BLUR_PX = 1.5  # initial guess if the blur is unknown
 _ACROSS_PX = 0.37
-"""Sigma: sides have the width of pixels and of reading them in their blur, a drawing has not."""
+"""Standard deviation that pixels and interpolation add to the blur of sides but not to that of a
+drawing, px."""
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
@@ -486,8 +492,8 @@ def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
 
 
 def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
-    """The `seen` markers, those whose edges do not suffice measured by a photometric fit, and any
-    other visible marker, which is derived from the first. If `searched`, a lone marker is dropped
+    """Return the `seen` markers, with a photometric fit of those whose edges do not suffice, and
+    any other visible marker derived from the first. If `searched`, a single marker is dropped
     unless its edges suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
@@ -512,7 +518,8 @@ def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _
 
 
 def _blur_px(seen: RefinedCorners | None) -> float:
-    """The first guess of the blur's sigma, px: that of the sides, where lines were fitted."""
+    """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
+    fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _UNKNOWN_BLUR_PX
     return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _UNKNOWN_BLUR_PX)
@@ -522,8 +529,8 @@ def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
         if this.cov_px2 is not None:
-            return None  # what hides a part of it would spoil the drawing, too
-        # Small cells matter only where no larger ones were measured.
+            return None  # an obstacle in front of the marker would spoil the drawing, too
+        # Small cells matter only if no larger ones were measured.
         enough = lines_suffice(this, picture.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
@@ -532,19 +539,19 @@ def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
     return None
 
 
-# --- Markers where they are expected: no search, only verification ---
+# --- Markers at their expected positions: no search, only verification ---
 
 
-_LEAST_LINE_CELL_PX = 2.5  # for lines
-_ANCHOR = 0.12  # of the small marker's side
+_LEAST_LINE_CELL_PX = 2.5  # least cell size for line fits
+_ANCHOR = 0.12  # share of the small marker's side
 
 
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """The markers near corners `places` (4, 2) px whose four sides are straight edges, by
-    `refine_lines`: all at once, because they share the shift of all edges. What the cells show is
-    not looked at. `shift`: None to measure it."""
+    """Return the markers near corners `places` (4, 2) px whose four sides are straight edges, by
+    `refine_lines`: all at once because they share the shift of all edges. The cells are not
+    examined. `shift` None measures the shift of all edges."""
     if not places:
         return {}
     rims = [picture.setup.patterns[name].rim for name in places]
@@ -556,9 +563,9 @@ def fit_lines(
 def follow_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
 ) -> _Found:
-    """The expected markers, corners (4, 2) px, whose sides and cells are all confirmed in the
-    picture, by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
-    off or hidden ones, and ones with cells below 2.5 px are left out."""
+    """Return the expected markers, corners (4, 2) px, whose sides and cells the picture confirms,
+    measured by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
+    or hidden markers, and markers with cells below 2.5 px are omitted."""
     image, patterns = picture.image, picture.setup.patterns
     places = {
         name: expected[name]
@@ -580,7 +587,7 @@ def add_partly_visible(
     seen: _Found,
     shift: EdgeShift | None = None,
 ) -> _Found:
-    """The `seen` markers of `follow_markers` plus those fitted to their visible part.
+    """Return the `seen` markers of `follow_markers` plus those fitted to their visible part.
 
     If the small marker was seen, the large one is expected around it.
     """
@@ -593,7 +600,8 @@ def add_partly_visible(
             if partly is not None:
                 seen[name] = partly
     if "large" in seen and "small" not in seen:
-        # Too small for lines, but where it must be: enough to know that it is there.
+        # Too small for lines, but its position follows from the large marker: a similar pattern is
+        # enough.
         small_px = picture.other_corners(seen["large"].corners_px, "small")
         if mean_side_px(small_px) > LEAST_SIDE_PX and fits_pattern(
             picture.image, small_px, picture.setup.patterns["small"]
@@ -603,8 +611,8 @@ def add_partly_visible(
 
 
 def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
-    """The large marker around a detected small one; the large one may be partly covered or
-    cut off. None if the picture does not confirm it."""
+    """Return the large marker around a detected small one; the large one may be partly covered or
+    cut. None if the picture does not confirm it."""
     image, pattern = picture.image, picture.setup.patterns["large"]
     start = picture.other_corners(small.corners_px, "large")
     if not np.isfinite(start).all():
@@ -616,7 +624,7 @@ def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | No
         return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
 
     if within(start, image.shape, ROOM_PX):
-        # A small marker gives a rough place; the first fit is where to look closely.
+        # A small marker yields a rough position only, so the fit is repeated from the first result.
         found = fit_lines(picture, {"large": start}).get("large")
         if found is not None:
             found = fit_lines(picture, {"large": found.corners_px}).get("large")
@@ -629,15 +637,15 @@ def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | No
     return partly if partly and is_centred(partly) else None
 
 
-# --- The markers of two fields, at the moment half way between them ---
+# --- Mean of the markers in two fields, at the time half way between them ---
 
 
 _MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
 def mean_of_fields(first: Detections, second: Detections) -> Detections:
-    """The mean of both fields' corners, valid for either order of the fields. If one marker
-    is in both fields, a marker in only one field is left out."""
+    """Return the mean of both fields' corners, valid for either order of the fields. If one marker
+    is in both fields, a marker in only one field is omitted."""
     both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)

@@ -1,8 +1,8 @@
-"""What finding the target's markers needs, made once: their dictionaries and patterns,
-and the mask of the vehicle's own gear.
+"""Constants for the detection of the target's markers, made once: dictionaries, patterns, and the
+mask of the vehicle's own gear.
 
-Each marker has a dictionary that holds its one id, so nothing else can be taken for it
-(0/1 correction bits: no false accept in 28 pictures without a target; 0/3: 7 of 28).
+Each marker has a dictionary with its single id, so that no other marker can be mistaken for it (0/1
+correction bits: no false accept in 28 pictures without a target; 0/3: 7 of 28).
 """
 
 from __future__ import annotations
@@ -21,16 +21,19 @@ from perchctl.vision.markers.pattern import Pattern, make_drawing, make_pattern,
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
-_PRINT_M = 1e-6  # of an edge: over its hundreds of dots what each errs by averages out
-_MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, of 640 px
+_PRINT_M = 1e-6  # error of an edge: the errors of its hundreds of printed dots average out
+_MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, at 640 px
 _LOOSE_PERIMETER_RATE = 0.05
 _LOOSE_ACCURACY_RATE = 0.1
 
 
 Thresholds = tuple[int, int]
-"""Least and greatest window of the adaptive threshold, px; OpenCV tries them in steps of 10."""
+"""Smallest and largest window of the adaptive threshold, px; OpenCV tries windows in steps of
+10."""
 OPENCV_THRESHOLDS: Thresholds = (3, 23)
-QUICK_THRESHOLDS: Thresholds = (13, 13)  # enough where both markers were seen a frame ago
+"""OpenCV's default windows."""
+# sufficient if both markers were seen in the previous frame
+QUICK_THRESHOLDS: Thresholds = (13, 13)
 _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 
 
@@ -38,9 +41,10 @@ _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 class DetectorSetup:
     """Constants of `detect_markers`, made by `make_aruco_detector`.
 
-    `dictionaries` are the large and the small marker's; `ratio` is the small side over the large
-    side, `mask` the pixels covered by the vehicle. Without `fits_lines` markers are neither fitted
-    nor tracked by fits."""
+    `dictionaries` are those of the large and the small marker; `ratio` is the small side over the
+    large side; `mask` marks the pixels covered by the vehicle. Without `fits_lines`, markers are
+    neither fitted nor tracked by fits.
+    """
 
     dictionaries: tuple[Any, Any]
     patterns: dict[MarkerName, Pattern]
@@ -52,7 +56,7 @@ class DetectorSetup:
 def make_aruco_detector(
     config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
 ) -> DetectorSetup:
-    """The setup for a target, with dictionaries of its markers' ids alone."""
+    """Return the setup for a target, with dictionaries that contain only its markers' ids."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -79,9 +83,9 @@ def make_aruco_detector(
 def make_marker_decoder(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
-    """Return OpenCV's marker detector for pictures of that size, (width, height)."""
+    """Return OpenCV's marker detector for pictures of the size (width, height)."""
     parameters = cv2.aruco.DetectorParameters()
-    parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
+    parameters.errorCorrectionRate = 1.0  # makes maxCorrectionBits the limit itself
     parameters.minDistanceToBorder = 0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = thresholds
@@ -90,7 +94,7 @@ def make_marker_decoder(
 
 
 def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
-    """Return OpenCV's marker detector, accepting nearly any quadrilateral."""
+    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -102,7 +106,7 @@ def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
 
 
 def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
-    """The inner bits (n, n) of the profile's marker, 1 = white."""
+    """Return the inner bits (n, n) of the profile's marker, 1 = white."""
     source = aruco_dictionary(marker.dictionary)
     rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
@@ -119,21 +123,23 @@ def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
     )
 
 
-# --- The vehicle's own gear in the picture: where it is, nothing is to be seen of a target ---
-# The picture is filled there with what is around it, so that no threshold joins the gear to a
-# marker's rim, and no side or cell is measured.
+# --- The vehicle's own gear in the picture ---
+# The gear hides the target. Its pixels are filled from their surroundings, so that no threshold
+# connects the gear to a marker's border; no side or cell is measured there.
 
 
 Covered = NDArray[np.bool_]
 WITH_WHITE = 1.25
-"""Half sides from a marker's centre within which anything spoils its sides' measurement."""
-_FIELD_ROWS = 7  # of a field's picture, that a covered row has a part in
-_REDUCED, _SPREAD = 8, 2.0  # times smaller, and there the spread of what fills
+"""Half sides from a marker's centre within which any object disturbs the measurement of its
+sides."""
+_FIELD_ROWS = 7  # rows of a field's picture to which a covered row contributes
+# reduction factor, and standard deviation of the fill in the reduced picture
+_REDUCED, _SPREAD = 8, 2.0
 _TINY = 1e-4
 
 
 def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
-    """The mask (h, w) of the vehicle in a frame; for a single field it is widened, as the
+    """Return the mask (h, w) of the vehicle in a frame; widened for a single field because the
     missing rows are interpolated."""
     if mask is None or frame.fields not in ("top", "bottom"):
         return mask
@@ -141,7 +147,7 @@ def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
 
 
 def fill_hidden(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
-    """The picture with its hidden pixels filled smoothly from their surroundings."""
+    """Return the picture with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
     size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
@@ -177,8 +183,8 @@ def is_hidden(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHI
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture with the setup and camera to measure markers in it. `hidden` (h, w): pixels where
-    the vehicle covers the view."""
+    """A picture with the setup and camera for measuring markers in it. `hidden` (h, w) marks the
+    pixels where the vehicle covers the view."""
 
     image: NDArray[np.uint8]
     hidden: Covered | None
@@ -186,6 +192,7 @@ class Picture:
     camera: CameraModel
 
     def other_corners(self, corners_px: Array, name: MarkerName) -> Array:
-        """Return marker `name`'s corners (4, 2) by `corners_px` (4, 2) of the other marker."""
+        """Return marker `name`'s corners (4, 2), derived from `corners_px` (4, 2) of the other
+        marker."""
         ratio = self.setup.ratio if name == "small" else 1.0 / self.setup.ratio
         return scale_square(corners_px, ratio, self.camera)

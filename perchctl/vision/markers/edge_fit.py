@@ -1,27 +1,28 @@
-"""Edge fit: lines fitted to a marker's four sides, intersected.
+"""Edge fit: fit lines to a marker's four sides and intersect them.
 
-On 24 profiles across each side the edge is the centroid of the grey gradient g under a Gaussian
-window w around the side's line; a blur that is equal on both flanks does not move it:
+On 24 profiles across each side, the edge is the centroid of the grey gradient g under a Gaussian
+window w around the side's line. A blur that is symmetric across the edge does not move it:
 
     e = sum(w g u) / sum(w g)
 
 The window pulls the centroid towards its own middle by a known factor, and a neighbouring edge one
 cell away adds a known share; both are corrected. The edge points x of a side are undistorted, a
-line n.x = c is fitted by total least squares with Tukey's weights, and neighbours are intersected:
+line n.x = c is fitted by total least squares with Tukey's weights, and neighbouring lines are
+intersected:
 
     min over |n| = 1 of sum w_k (n.x_k - c)^2,    n_a.p = c_a,  n_b.p = c_b
 
-White that is clipped, glares or went through a gamma curve moves all edges towards black by the
-same number of pixels, d. The inner edges of the border move the opposite way. At the part r of the
-outer square they appear d (1 + r) too far out, so the border's width, known to be one cell, gives
-d, and the lines are moved back.
+White that is clipped, glares or passed a gamma curve moves all edges towards black by the same
+number of pixels, d. The inner edges of the border move in the opposite direction. At the share r of
+the outer square, they appear d (1 + r) too far out. The border's width, known to be one cell,
+therefore determines d, and the lines are moved back.
 
     profiles -> edges -> lines -> shift of all edges -> corners -> gates
 
-Wrong where light clips the white of some sides only, where a cell is only two or three blurs wide
-and its neighbours bend the sides, and where the sheet curls; the standard deviation includes the
-first two. `refine_lines` gives None where a corner moved by more than 0.6 cells, points are 0.6 px
-off their line, less than half of the profiles count, or the blur fills the window.
+The result is wrong if light clips the white of some sides only, if a cell is only two or three
+blurs wide and its neighbours bend the sides, or if the sheet curls; the standard deviation includes
+the first two. `refine_lines` returns None if a corner moved by more than 0.6 cells, the points are
+0.6 px off their line, less than half of the profiles count, or the blur fills the window.
 
 Lengths are px in the picture; lines and points are in normalised image coordinates.
 """
@@ -56,14 +57,14 @@ from perchctl.vision.types import CameraModel, EdgeShift
 # --- Grey profiles across the sides of markers ---
 
 
-PROFILES = 24  # across each side
-STEPS = 16  # gradient samples in each profile
+PROFILES = 24  # number across each side
+STEPS = 16  # gradient samples per profile
 Floats = NDArray[np.float32]
 
-ALONG: Array = np.linspace(-1.0, 1.0, PROFILES)  # a side, between its margins
+ALONG: Array = np.linspace(-1.0, 1.0, PROFILES)  # positions along a side, between its margins
 _OFFSETS: Floats = np.linspace(-1.0, 1.0, STEPS + 1).astype(np.float32)
 _ALONG_PROFILE: Floats = np.stack([np.ones_like(_OFFSETS), _OFFSETS])
-MIDDLES: Floats = (_OFFSETS[1:] + _OFFSETS[:-1]) * np.float32(0.5)  # of the gradients
+MIDDLES: Floats = (_OFFSETS[1:] + _OFFSETS[:-1]) * np.float32(0.5)  # positions of the gradients
 # Values and slopes at the profiles from a polynomial through the nodes.
 _NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
 _INVERSE: Array = np.linalg.inv(_NODES[:, None] ** np.arange(5.0))
@@ -75,8 +76,8 @@ _TO_THE_LEFT = np.array(-1j)
 
 
 def profile_places(lengths_px: Array) -> Array:
-    """The profiles' places along sides of `lengths_px` (rows,), as shares (rows, n) of a
-    side, away from the corners, where the next side blurs."""
+    """Return the positions of the profiles along sides of `lengths_px` (rows,), as shares (rows, n)
+    of a side. They keep away from the corners, where the next side blurs the edge."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
     return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
 
@@ -84,19 +85,20 @@ def profile_places(lengths_px: Array) -> Array:
 def side_profiles(
     starts: Array, ends: Array, shares: Array, camera: CameraModel
 ) -> tuple[Array, Array]:
-    """The points where profiles cross the sides, px, and the unit normals there, to the
-    left of the way from start to end as the picture is seen (outwards for a marker whose corners
-    run clockwise): each (rows, n, 2).
+    """Return the points where profiles cross the sides, px, and the unit normals there, to the left
+    of the direction from start to end in the picture (outwards for a marker with clockwise
+    corners): each (rows, n, 2).
 
-    `starts`, `ends` (rows, 2): the sides' ends, normalised; `shares` (rows, n): `profile_places`.
-    A side's image through the lens is smooth: a few nodes define all of it.
+    `starts`, `ends` (rows, 2) are the normalised ends of the sides; `shares` (rows, n) come from
+    `profile_places`. The image of a side through the lens is smooth, so a few nodes define all of
+    it.
     """
     first, last = shares[:, :1], shares[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODES)[..., None]
     points = starts[:, None] + at * (ends - starts)[:, None]
     nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
     origin = np.matmul(_VALUES, nodes)
-    # As complex numbers x + iy a quarter turn is one product.
+    # As complex numbers x + iy, a quarter turn is a single product.
     tangent = np.matmul(_SLOPES, nodes).view(np.complex128)
     normal = tangent * (_TO_THE_LEFT / np.maximum(np.abs(tangent), 1e-12))
     return origin, normal.view(np.float64)
@@ -105,11 +107,11 @@ def side_profiles(
 def sample_profiles(
     image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array
 ) -> Floats:
-    """The grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
-    repeated outside.
+    """Return the grey values along the profiles, (rows, n, steps + 1): bilinear, with the picture's
+    border pixels repeated outside.
 
-    On float pictures OpenCV 5 interpolates at the exact position; on bytes, other
-    releases round it to 1/32 px, which is as large as the spread that is aimed at.
+    On float pictures, OpenCV 5 interpolates at the exact position. On 8-bit pictures, other
+    releases round it to 1/32 px, which is as large as the intended standard deviation.
     """
     h, w = image.shape
     reach = float(half_px.max()) + 2.0
@@ -120,7 +122,7 @@ def sample_profiles(
     right, bottom = max(right, left + 2), max(bottom, top + 2)
     patch = image[top:bottom, left:right].astype(np.float32)
     rows, n = origin.shape[:2]
-    lines = np.empty((2, rows, n, 2), dtype=np.float32)  # of x and y: where, and which way
+    lines = np.empty((2, rows, n, 2), dtype=np.float32)  # x and y: origin, and direction
     np.subtract(origin[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
     np.subtract(origin[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
     np.multiply(normal[..., 0], half_px[:, None], out=lines[0, ..., 1], casting="same_kind")
@@ -130,7 +132,7 @@ def sample_profiles(
     return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
 
 
-# --- Lines fitted to a marker's sides, intersected ---
+# --- Lines fitted to a marker's sides, and their intersections ---
 
 
 MIN_LINE_SIGMA_PX = 0.015
@@ -138,22 +140,22 @@ MIN_LINE_SIGMA_PX = 0.015
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIERS = 0.5
-_LINE_TAILS = 1.7  # what robust weights take away from a residual's square, and from the samples
-_BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
-_CURVED_REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
-CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
-CLIPPED_SHARE = 0.05  # of the profiles
-_WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off an edge that is wide and not central
-_NEAR_END_PX = 4.0  # of 7: an edge 6 px off, cut off there, was seen up to 0.3 px beside its place
-_LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
-_LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
+_LINE_TAILS = 1.7  # share of a residual's square, and of the samples, that robust weights remove
+_BEND, _BEND_BLURS = 0.6, 2.0  # bend of an edge by the next one, a cell away, in units of blur
+_CURVED_REACH = 0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
+CLIPPED_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
+CLIPPED_SHARE = 0.05  # share of the profiles
+_WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off a wide edge that is not central
+_NEAR_END_PX = 4.0  # of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
+_LEAST_ROWS = 2.0  # ratio of variances of the sides that shows jittering rows
+_LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1) required to distinguish them
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
 _SHIFT_FLOOR_PX = 0.01
 _MAX_SHIFT_PX = 1.0
-_MAX_EDGE_BLUR_CELLS = 0.45  # beyond it the two edges of a border are one
-_MIN_PROFILES = 3.0  # in total weight, of a side that counts
-_SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
-_CLIPPED_PRIOR_PX = 0.4  # what clipping does
+_MAX_EDGE_BLUR_CELLS = 0.45  # beyond it, the two edges of a border merge
+_MIN_PROFILES = 3.0  # total weight required of a side
+_SHIFT_PRIOR_PX = 0.15  # standard deviation due to glare and gamma
+_CLIPPED_PRIOR_PX = 0.4  # standard deviation due to clipping
 CLIPPED_GREY = 248.0
 _ONES: Array = np.ones(PROFILES)
 _ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
@@ -172,7 +174,8 @@ def refine_lines(
     """Fit lines to the sides of m markers (m, 4, 2); None for corners without a marker's sides.
 
     The shift of all edges is measured unless it is `known`. A marker with wide edges, or with edges
-    near the ends of the profiles, is fitted again with the profiles centred on its edges."""
+    near the ends of the profiles, is fitted again with the profiles centred on its edges.
+    """
     found = _refined_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
@@ -202,7 +205,7 @@ def _refined_once(
     glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
     clipped = glaring.reshape(-1, 4) @ _QUARTERS > CLIPPED_SHARE
     if known is not None and clipped.any():
-        # How far clipping moves edges changes with the light.
+        # The edge shift due to clipping changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
     lines, residual_px = _fit_lines(markers, sides)
     shift = known
@@ -220,7 +223,7 @@ def _refined_once(
         return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, residual_px, corners_px)
-    # A line fitted to n samples spreads twice as far at its ends as in its middle.
+    # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
     ends_px2 = (4.0 * _LINE_TAILS * residual_px * residual_px / independent).tolist()
     blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
@@ -244,8 +247,8 @@ def _refined_once(
 
 
 def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
-    """The lines (4m, 3), normalised: nx, ny, c with n.x = c and |n| = 1; and the weighted
-    RMS distance of the points from these, px (4m,)."""
+    """Return the normalised lines (4m, 3): nx, ny, c with n.x = c and |n| = 1; and the weighted RMS
+    distance of the points from them, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
     cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
@@ -261,7 +264,7 @@ def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
 
 
 def _intersect(lines: Array) -> Array:
-    """Return where side i - 1 of each marker meets side i: (m, 4, 2)."""
+    """Return the intersections of side i - 1 and side i of each marker: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
     before = sides.take(BEFORE, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -275,7 +278,7 @@ def _intersect(lines: Array) -> Array:
 
 
 def shift_prior_px(white_grey: float) -> float:
-    """The standard deviation of an unmeasured edge shift, given white paper's grey level."""
+    """Return the standard deviation of an unmeasured edge shift, given white paper's grey level."""
     return _CLIPPED_PRIOR_PX if white_grey > CLIPPED_GREY else _SHIFT_PRIOR_PX
 
 
@@ -287,11 +290,11 @@ def _measure_edge_shift(
     residual_px: Array,
     corners: Array,
 ) -> EdgeShift | None:
-    """Return how far white has grown over black, by the width of a border, of which `corners` (m,
-    4, 2) are the outer edge's; None where no inner edge was sampled.
+    """Return how far white has grown over black, from the width of a border whose outer edge has
+    the `corners` (m, 4, 2); None if no inner edge was sampled.
 
-    Outer edges that moved in by d shrink the marker's own scale; the inner edges, at
-    the part r of it, moved out by d: they appear d (1 + r) too far out.
+    Outer edges that moved in by d shrink the marker's own scale. The inner edges, at the share r of
+    it, moved out by d and appear d (1 + r) too far out.
     """
     if inner is None:
         return None
@@ -307,7 +310,7 @@ def _measure_edge_shift(
     some = mass > _MIN_PROFILES
     if not some.any():
         return EdgeShift(0.0, prior_px)
-    # A sheet that curls moves outer edges farther than inner ones, and ends farther than middles.
+    # A curled sheet moves outer edges further than inner ones, and ends further than middles.
     bent_px = 8.0 * r / (3.0 * rim.cells) * _bow_px(markers, sides, lines, residual_px)
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -317,10 +320,10 @@ def _measure_edge_shift(
     information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
-    # Sides that disagree are worth less.
+    # Sides that disagree reduce the weight.
     chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
     variance = max(chi2, 1.0) / total
-    # What no averaging takes away: the neighbours' blur and the print.
+    # Errors that averaging does not reduce: the neighbours' blur and the print.
     variance += (2.0 * math.exp(-cell_px / 2.2)) ** 2 + (rim.tolerance * cell_px) ** 2
     prior = prior_px**2
     return EdgeShift(
@@ -330,8 +333,8 @@ def _measure_edge_shift(
 
 
 def _bow_px(markers: Sides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
-    """Return how far the ends of the widest marker's sides lie further out than their middles, as
-    far as noise does not explain it."""
+    """Return how far the ends of the widest marker's sides are further out than their middles,
+    beyond the noise; 0 if noise explains it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
     scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
@@ -343,7 +346,7 @@ def _bow_px(markers: Sides, sides: EdgeData, lines: Array, residual_px: Array) -
 
 
 def _outwards(markers: Sides, lines: Array) -> Array:
-    """Return +1 where a line's normal points out of its marker, else -1, (4m,)."""
+    """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners
     out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
@@ -367,18 +370,19 @@ def _sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
     blur_px = max(blur_px, 1e-3)
-    # Cells of few pixels let the inner pattern's blur reach the border's edge.
+    # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
     bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
     reach_px = _CURVED_REACH * blur_px**3
     clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
-    # Edges are not where they were meant to be printed.
+    # Printed edges deviate from their nominal positions.
     print_px = tolerance * cell_px
     noise_px = max(math.sqrt(noise_px2), MIN_LINE_SIGMA_PX)
     return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
 def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
-    """The spread of corners by what shakes rows: it moves upright sides only."""
+    """Return the standard deviation of corners due to jittering rows, which affects upright sides
+    only."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -390,20 +394,21 @@ def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
     return math.sqrt(slope) if slope > (_LEAST_ROWS - 1.0) * max(still, 0.0) else 0.0
 
 
-# --- The sides of markers, measured: the edge's place on profiles across each of them ---
-# Rows 4 i to 4 i + 3 are of marker i; then the inner edges of one marker's border may follow.
+# --- Measurement of the markers' sides: position of the edge on profiles across each side ---
+# Rows 4 i to 4 i + 3 belong to marker i; then the inner edges of one marker's border may follow.
 
 
-_MIN_SHIFT_CELL_PX = 6.0  # of a border whose inner edge is measured too
+_MIN_SHIFT_CELL_PX = 6.0  # cell of a border whose inner edge is measured too
 _SIDES = np.arange(4)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """Sides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; the sides' lengths
-    `sides_px` and the cells' depths behind them `depth_px` (m, 4); mean cell width `cell_px` (m,);
-    index of the marker with the `widest` cells; `winding` of the corners, +1 or -1 (m,); and pixels
-    per normalised unit along each side `px_per_unit` (4m,)."""
+    """Sides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; `rims`, the cells
+    next to each marker's border; the side lengths `sides_px` and the depths of the cells behind
+    them `depth_px` (m, 4); mean cell width `cell_px` (m,); index of the marker with the `widest`
+    cells; `winding` of the corners, +1 or -1 (m,); and pixels per normalised unit along each side
+    `px_per_unit` (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
@@ -418,7 +423,7 @@ class Sides:
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """Edges on profiles: `grey` values (rows, n, steps + 1), half length `near_px` of the windows
+    """Edges on profiles: `grey` values (rows, n, steps + 1), half lengths `near_px` of the windows
     in them (rows,), edge `points` (rows, n, 2), normalised, `weight` (rows, n) and blur (rows,)."""
 
     grey: Floats
@@ -429,7 +434,8 @@ class EdgeData:
 
 
 def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Sides | None:
-    """The sides of markers with corners (m, 4, 2); None if any marker is not a quadrilateral."""
+    """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
+    quadrilateral."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
@@ -445,7 +451,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
         rims=rims,
         corners=corners,
         sides_px=sides_px,
-        # The inner row lies one cell further in, along the neighbouring sides.
+        # The inner row is one cell further in, along the neighbouring sides.
         depth_px=0.5 * across_px / cells[:, None],
         cell_px=cell_px,
         widest=int(cell_px.argmax()),
@@ -457,7 +463,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 def measure_edges(
     image: NDArray[np.uint8], markers: Sides, camera: CameraModel, with_inner: bool
 ) -> tuple[EdgeData, EdgeData | None]:
-    """The edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
+    """Return the edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
     marker `markers.widest`; None without `with_inner`, or if the marker's cells are too narrow."""
     starts, lengths_px, depth_px = markers.corners, markers.sides_px, markers.depth_px
     of = np.arange(len(starts)).repeat(4)
@@ -471,7 +477,7 @@ def measure_edges(
         lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
         depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
         of = np.append(of, (widest, widest, widest, widest))
-    # Normals point out of a marker whose corners run clockwise; dark must come first.
+    # Normals point out of a marker with clockwise corners; dark must come first.
     sign = markers.winding[of]
     if with_inner:
         sign[-4:] *= -1.0
@@ -495,7 +501,8 @@ def measure_edges(
 
 
 def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
-    """The half lengths, px, of the windows around edges and of the profiles, for a cell's size."""
+    """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
+    size."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
@@ -503,8 +510,9 @@ def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
 def neighbour_edges(
     shares: Array, rims: Sequence[Rim], inner_rim: Rim, cell_depth_px: Array
 ) -> NeighbourEdges:
-    """Neighbours of the edges at `shares` (rows, n) of sides: four rows a rim, then, if given, four
-    of the inner edges of `inner_rim`'s border. `cell_depth_px` (rows,): cells' sizes across."""
+    """Return the neighbours of the edges at `shares` (rows, n) of sides: four rows per rim, then,
+    if given, four rows for the inner edges of `inner_rim`'s border. `cell_depth_px` (rows,) is the
+    size of a cell across the edge."""
     inside, outside = np.zeros(shares.shape, np.float32), np.zeros(shares.shape, np.float32)
     possible = np.ones(shares.shape, np.bool_)
     for i, rim in enumerate(rims):
@@ -512,7 +520,7 @@ def neighbour_edges(
         inside[four] = rim.white[_SIDES, (shares[four] * rim.cells).astype(np.intp)]
     if len(shares) > 4 * len(rims):
         at = 1.0 + shares[-4:] * (inner_rim.cells - 2)  # in cells from the border's corner
-        # Near a black cell of the rim, or with one behind, blur bends the edge.
+        # Near a black cell of the rim, or with a black cell behind it, blur bends the edge.
         free = inner_rim.white_behind[_SIDES, (at - 0.3).astype(np.intp)]
         free = free * inner_rim.white_behind[_SIDES, (at + 0.3).astype(np.intp)]
         possible[-4:] = free > 0.0
@@ -520,27 +528,28 @@ def neighbour_edges(
     return NeighbourEdges(cell_depth_px, inside, outside, possible)
 
 
-# --- Edges between black and white to a hundredth of a pixel, on grey profiles across them ---
-# An edge is the gradient's windowed centroid, first by a wide window, then by one centred on the
-# side's own line. Of a side is (rows,), of a profile (rows, n).
+# --- Edges between black and white to 0.01 px, on grey profiles across them ---
+# An edge is the windowed centroid of the gradient, first with a wide window, then with one centred
+# on the side's own line. Values per side are (rows,), values per profile (rows, n).
 
 
 _ALONG32 = ALONG.astype(np.float32)
-_WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81  # squares of its sigma: of the blur's, and px^2
+# squares of the window's standard deviation: in units of the blur's, and px^2
+_WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81
 _MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
-_PER_NEAR = 1.0 / 0.6  # of the wide window's spread
+_PER_NEAR = 1.0 / 0.6  # standard deviation of the wide window
 _TUKEY = 3.5 * 1.4826
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
 _STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)
-_LEAST_SHARE = 0.3  # of the row's mean gradient, for a profile to count
-_TUKEY_FLOOR_PX = 3.5 * 0.05  # of the scatter that is taken for noise
+_LEAST_SHARE = 0.3  # share of the row's mean gradient that a profile requires to count
+_TUKEY_FLOOR_PX = 3.5 * 0.05  # scatter that counts as noise
 _ONE_ROUND_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _SETTLED_PX = 0.06
 _LINE_ROUNDS = 3
 _FAR = 1e6
 _QUARTER = PROFILES // 4
 _QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
-# The line through values in the middles of both halves of the profiles, (2, n).
+# The line through the values in the middles of both halves of the profiles, (2, n).
 _SLOPE: Floats = _ALONG32 * (0.5 / float(ALONG[PROFILES // 2 :].mean()))
 _THROUGH_HALVES: Floats = np.stack([0.5 - _SLOPE, 0.5 + _SLOPE])
 _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
@@ -550,9 +559,9 @@ _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.flo
 class NeighbourEdges:
     """The neighbouring edges that blur into a measured edge.
 
-    depth_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 where another
-    edge of the same contrast lies one cell further in or out, (rows, n). possible: False where no
-    edge can be found, (rows, n).
+    depth_px: size of a marker's cell across the edge, (rows,). inside, outside: 1 if another edge
+    with the same contrast is one cell further in or out, (rows, n). possible: False if no edge can
+    be found, (rows, n).
     """
 
     depth_px: Array
@@ -564,8 +573,9 @@ class NeighbourEdges:
 def locate_edges(
     grey: Floats, half_px: Array, near_px: Array, neighbours: NeighbourEdges
 ) -> tuple[Array, Array, Array]:
-    """Return, for the dark-to-bright edge on each profile, its offset from the profile's middle, px
-    (rows, n), its weight, 0 for outliers (rows, n), and each row's blur, sigma in px (rows,).
+    """Locate the dark-to-bright edge on each profile. Return its offset from the middle of the
+    profile, px (rows, n), its weight, 0 for outliers (rows, n), and the blur of each row, standard
+    deviation in px (rows,).
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
@@ -588,23 +598,23 @@ def locate_edges(
 
 
 class _Profiles:
-    """The gradients along all profiles, and what every window over them needs."""
+    """The gradients along all profiles, and the values that every window over them needs."""
 
     def __init__(
         self, grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
     ) -> None:
         self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
-        self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # where, (rows, steps)
+        self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # position, (rows, steps)
         self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
-        self.most2 = 0.25 * self.near * self.near  # square of a window's largest sigma
-        # The flanks with a neighbouring edge: both, and outside less inside.
+        self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
+        # Neighbouring edges on the flanks: number on both, and outside minus inside.
         self.both, self.side = around.inside + around.outside, around.outside - around.inside
         self.can = around.possible.astype(np.float32)
-        # Multiplies a sum over a row's profiles: a part of the mean over those possible.
+        # Factor for the sum over a row's profiles: a share of the mean over the possible ones.
         self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), 1.0)
 
     def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """The edges by one window around all middles, and which count."""
+        """Return the edges from one window around all middles, and which ones count."""
         spread = self.u * (_PER_NEAR / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -616,9 +626,9 @@ class _Profiles:
         return np.divide(moments[..., 1], np.where(usable, total, 1.0)), usable
 
     def narrow(self, line: Floats, blur2: Floats) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """The edges by a window around the row's line, which count, blur^2."""
+        """Return the edges from a window around the row's line, which ones count, and blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
-        # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
+        # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
         squared = relative * relative
         mass = squared * (-0.5 / w2)[:, None, None]
@@ -626,7 +636,7 @@ class _Profiles:
         mass *= self.gradient
         total = (mass @ _STEP_ONES) * self.can
         usable = total > np.maximum(total.dot(_ONES32) * self.part, 1e-9)[:, None]
-        # A neighbour seen through the window has this share, at this place, with this spread.
+        # Share, position and spread of a neighbour seen through the window.
         wide2 = w2 + blur2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
@@ -640,19 +650,20 @@ class _Profiles:
         moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
         moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
         found2 = moment * w2 / (w2 - moment)
-        # The window pulls the centroid towards its own middle: undo that.
+        # Undo the pull of the window on the centroid.
         centroid = first / total * (1.0 + found2 / w2)[:, None]
         limit = self.near[:, None]
         return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Lines (rows, n) through each row's half middles, robust to a bad quarter of either."""
+    """Return lines (rows, n) through the middle of each row's halves, robust to a bad quarter of
+    either."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2
     middle = halves[:, :, first : first + _QUARTER]
-    # Left out before the sum: beside the others' size an edge's place is rounded away.
+    # Excluded before the sum: next to huge values, an edge's position would be rounded away.
     shown = np.abs(middle) < _FAR
     count = shown @ _QUARTER_ONES
     mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, 1.0)
@@ -660,7 +671,7 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
-    """Return straight lines (rows, n) with Tukey's weights, and these."""
+    """Return straight lines (rows, n) fitted with Tukey's weights, and the weights."""
     line = row_medians(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
@@ -680,7 +691,7 @@ def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[
 
 
 def row_medians(values: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Each row's median over its usable values, (rows,); 0 without any."""
+    """Return each row's median over its usable values, (rows,); 0 if it has none."""
     values = np.where(usable, values, _HIGH_LOW)
     values.partition(PROFILES // 2, axis=1)
     found = values[:, PROFILES // 2]

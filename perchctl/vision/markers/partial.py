@@ -1,19 +1,20 @@
-"""Partial-view fit: a marker of which a part cannot be seen, because the picture ends in it, light
-glares on it, or the vehicle's own gear is before it.
+"""Partial-view fit: measure a marker that is partly invisible because the picture ends in it, light
+glares on it, or the vehicle's own gear covers it.
 
-Four lines need all four sides. Here the whole square is fitted at once to the edges where they
-are seen: its sides, and the inner edges of its border, which stand in for a side that is gone.
-Gauss-Newton finds the increment P of the homography H and the shift d of all edges (white over
-black) by the distances r_k, px, from the square's edges to the picture's:
+Four lines need all four sides. Here, the whole square is fitted at once to the visible edges: its
+sides, and the inner edges of its border, which replace a missing side. Gauss-Newton finds the
+increment P of the homography H and the shift d of all edges (white over black) from the distances
+r_k, px, between the square's edges and the picture's:
 
     min sum w_k (r_k - a_k.P - s_k d)^2 + (d - d_0)^2 / sigma_d^2,    H <- H (I + P)
 
-where a_k is an edge's change with P, s_k is -1 for sides and +1 for inner edges, and d_0 the shift
-measured before. What is not seen follows from what is, and the corners' covariance (8, 8) px^2,
-J N^-1 J' times the variance of an edge, says how well.
+where a_k is the derivative of an edge by P, s_k is -1 for sides and +1 for inner edges, and d_0 is
+the shift measured before. The invisible part follows from the visible one; the corners' covariance
+(8, 8) px^2, J N^-1 J' times the variance of an edge, says how accurately.
 
-Wrong where the rim of a glare or of a shadow runs along a side and passes for it. None where the
-edges leave a corner vaguer than 2 % of the side, or where the cells in view are not the marker's.
+The result is wrong if the boundary of a glare or a shadow runs along a side and is mistaken for it.
+It is None if the edges leave a corner with a standard deviation above 2 % of the side, or if the
+cells in view are not the marker's.
 """
 
 from __future__ import annotations
@@ -60,15 +61,15 @@ from perchctl.vision.markers.edge_fit import (
 from perchctl.vision.markers.pattern import CELL_MARGIN, MIN_CONTRAST, MOST_CELLS, Pattern
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
-LEAST_CELL_PX = 4.0  # smaller cells leave no part of a side that would show anything
+LEAST_CELL_PX = 4.0  # with smaller cells, a part of a side contains no information
 _PART_ROUNDS, _PART_STILL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
-_MAX_BLUR = 0.9  # of the window
-_MOST_PART_SIGMA = 0.02  # of the side: vaguer corners are no measurement
+_MAX_BLUR = 0.9  # share of the window
+_MOST_PART_SIGMA = 0.02  # share of the side: less certain corners are no measurement
 _LEAST_SHIFT_SIGMA_PX = 0.01
-_TAILS = 1.3  # what robust weights take away from a residual's square
+_TAILS = 1.3  # share of a residual's square that robust weights remove
 _MAX_STEP = 0.5
-_MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
+_MOST_OFF_PX = 20.0  # from the start, three windows away: edges cannot move a fit further
 
 
 def fit_partly_seen(
@@ -78,16 +79,16 @@ def fit_partly_seen(
     known_by: KnownBy,
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """Fit the whole marker near to corners `start_px` (4, 2), which may be outside of the picture.
+    """Fit the whole marker near corners `start_px` (4, 2), which may be outside the picture.
 
     `known_by` says what identifies the marker; `known` is the shift of all edges, if measured
-    before. None if the visible part does not determine the corners, or its cells are not the
+    before. None if the visible part does not determine the corners, or if its cells are not the
     marker's.
     """
     pattern, camera = picture.setup.patterns[name], picture.camera
     if not mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX:
         return None
-    # So many cells have to be in the picture, wherever the fit may lead.
+    # Enough cells must be in the picture, wherever the fit may end.
     spots = _within(_spots_px(start_px, pattern, camera), picture.image.shape, _MOST_OFF_PX)
     if not _enough(_known(spots, pattern), pattern, known_by):
         return None
@@ -116,7 +117,7 @@ def fit_partly_seen(
 
 
 def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
-    """True if no part of the marker is hidden or outside of the picture."""
+    """True if no part of the marker is hidden or outside the picture."""
     room_px = ROOM_PX + found.blur_px
     return within(found.corners_px, picture.image.shape, room_px) and not is_hidden(
         picture.hidden, found.corners_px
@@ -124,9 +125,9 @@ def is_wholly_seen(picture: Picture, found: RefinedCorners) -> bool:
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """The changes (9, rows * n) of the edges with the terms of `homography_jacobian` and the
-    shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
-    spread."""
+    """Return the derivatives (9, rows * n) of the edges by the terms of `homography_jacobian` and
+    by the shift of all edges, px; and their normal equations (9, 9), (9,), per px^2 of an edge's
+    variance."""
     u, v = seen.points[..., 0], seen.points[..., 1]
     nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
     A = np.empty((9, *u.shape))
@@ -134,14 +135,14 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
     A[3], A[4], A[5] = ny * u, ny * v, ny
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
-    # The model's edge moves with the square, the seen one by the shift.
+    # The model's edge moves with the square, the observed edge with the shift.
     A[8] = np.where(seen.side_distance < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
-    # Profiles nearer to each other than a pixel measure the same.
+    # Profiles closer to each other than a pixel measure the same edge.
     worth = np.minimum(1.0, 2.0 * seen.scale_px * seen.side_distance / PROFILES)
     weighted = A * (seen.weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(seen.offset_px.ravel())
-    # An edge's spread is about a tenth of a pixel while it is not known.
+    # Until it is known, an edge's standard deviation is assumed to be a tenth of a pixel.
     certain = (0.1 / prior.sigma_px) ** 2
     N[8, 8] += certain
     g[8] += certain * prior.shift_px
@@ -152,8 +153,8 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
 def _corners(
     H: Array, seen: SeenEdges, left: Array, N: Array, pattern: Pattern, camera: CameraModel
 ) -> RefinedCorners | None:
-    """The corners of the square H (3, 3) with their covariance by what is left over of the
-    edges, px (rows, n), and the normal matrix (9, 9); None where these are vague."""
+    """Return the corners of the square H (3, 3), with their covariance from the residuals of the
+    edges, px (rows, n), and the normal matrix (9, 9); None if the corners are too uncertain."""
     w = seen.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -170,7 +171,7 @@ def _corners(
     corners_px = distort(apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera)
     side_px = mean_side_px(pinhole)
     cell_px = side_px / pattern.rim.cells
-    # Of the square alone; what the shift of all edges leaves open is `shift_sigma_px`.
+    # The square alone; `shift_sigma_px` covers the uncertainty of the shift of all edges.
     J = homography_jacobian(H)
     cov_px2: Array = J @ np.linalg.inv(N[:8, :8]) @ J.T * noise2
     floor2 = MIN_LINE_SIGMA_PX**2 + (pattern.rim.tolerance * cell_px) ** 2
@@ -190,19 +191,21 @@ def _corners(
     )
 
 
-# --- Which marker it is, by the cells that are seen of it ---
+# --- Identify a marker from its visible cells ---
 
 
 KnownBy = Literal["bits", "track", "other"]
-"""By what a marker is known: its cells alone, its place before, or the other marker."""
-_LEAST_KNOWN = 0.6  # of all cells
-_GLARE, _BRIGHTEST_GREY = 0.25, 250.0  # over white, of the contrast; as bright as can be
-_UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords differ in two
-_INVERTED_PX = 0.5  # the lens model holds where its inverse is one
+"""What identifies a marker: its cells alone, its previous position, or the other marker."""
+_LEAST_KNOWN = 0.6  # share of all cells
+# above white, as a share of the contrast; as bright as possible
+_GLARE, _BRIGHTEST_GREY = 0.25, 250.0
+_UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords differ in two bits
+_INVERTED_PX = 0.5  # the lens model is valid where its inverse exists
 
 
 def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by: KnownBy) -> bool:
-    """True if visible, unglared cells have their colour; how many, `known_by` decides."""
+    """True if the visible cells without glare have their colours; `known_by` decides how many
+    must."""
     image, hidden = picture.image, picture.hidden
     h, w = image.shape
     at = _spots_px(corners_px, pattern, picture.camera)
@@ -234,8 +237,8 @@ def _cells_agree(picture: Picture, corners_px: Array, pattern: Pattern, known_by
 
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
-    """The spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it
-    does not reach. A marker that fills the picture is no square in it."""
+    """Return the spots of a marker with corners (4, 2) in the distorted picture, (n, 2); NaN
+    outside the lens model. A marker that fills the picture is not a quadrilateral in it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)
@@ -246,14 +249,14 @@ def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array
 
 
 def _within(at_px: Array, shape: tuple[int, ...], room_px: float) -> NDArray[np.bool_]:
-    """Return which points (n, 2) are in the picture, or no farther outside."""
+    """Return which points (n, 2) are in the picture, or at most `room_px` outside."""
     h, w = shape[:2]
     inside = (at_px >= -room_px) & (at_px <= (w - 1 + room_px, h - 1 + room_px))
     return np.asarray(inside.all(axis=1))
 
 
 def _known(seen: NDArray[np.bool_], pattern: Pattern) -> NDArray[np.bool_]:
-    """Return which cells (cells,) show half of their spots (n,) or more."""
+    """Return which cells (cells,) show at least half of their spots (n,)."""
     known: NDArray[np.bool_] = (
         np.bincount(pattern.spot_cells, weights=seen) >= 0.5 * pattern.spots_per_cell
     )
@@ -268,16 +271,16 @@ def _enough(known: NDArray[np.bool_], pattern: Pattern, known_by: KnownBy) -> bo
     )
 
 
-# --- The edges of a marker where they are seen: of its sides, and inside of its border ---
+# --- The visible edges of a marker: its sides, and the inner edges of its border ---
 
 
 ROOM_PX = 2.0
-"""To the picture's edge, where blur would need what is beyond it."""
-_INNER_CELL_PX = 6.0  # of a border whose inner edge is seen apart from the outer one
-_TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white outside
+"""Distance to the picture's edge, px, within which blur would need pixels outside the picture."""
+_INNER_CELL_PX = 6.0  # cell of a border whose inner and outer edges are separate
+_TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # shares of the contrast: black inside, white outside
 _LEAST_PART_CONTRAST = 10.0
 _MIN_WEIGHT = 3.0  # of a side's profiles
-_LEAST_EDGES = 4  # a square has eight unknowns, and an edge fixes two
+_LEAST_EDGES = 4  # a square has eight unknowns, and an edge determines two
 _FAR_PX = 1e6
 _SEARCH_STEPS: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
@@ -287,9 +290,10 @@ class SeenEdges:
     """Edges measured in one round of the fit.
 
     Per profile (rows, n): point in the marker's coordinates (rows, n, 2), outward offset from the
-    square's edge, weight. Per row (rows,): number of the side, the edge's distance from the centre
-    in half sides, pixels per half side across it, blur in units of the window. And white paper's
-    grey level."""
+    square's edge, weight. Per row (rows,): number of the side, distance of the edge from the centre
+    in half sides, pixels per half side across it, blur in units of the window. `white_grey` is the
+    grey level of white paper.
+    """
 
     points: Array
     offset_px: Array
@@ -302,7 +306,8 @@ class SeenEdges:
 
 
 def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None:
-    """The edges near the square projected by H (3, 3) to pixels; None if too few are visible."""
+    """Return the edges near the square projected by H (3, 3) to pixels; None if too few are
+    visible."""
     camera, cells, corners = picture.camera, pattern.rim.cells, apply_homography(H, UNIT)
     sides_px = side_lengths_px(corners)
     if not (np.isfinite(corners).all() and sides_px.min() > 1.0):
@@ -318,8 +323,8 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
     ends = starts[:, NEXT].reshape(-1, 2)
     origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
     if not (np.abs(origin) < _FAR_PX).all():
-        return None  # a lens model throws what is far outside anywhere, to no number too
-    # White is outside of the marker, and inside of its border.
+        return None  # far outside, a lens model may yield any position, even NaN
+    # White is outside the marker, and inside its border.
     turn = float(np.sign(doubled_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
     near_px, half_px = profile_reaches_px(np.full(len(at), cell_px))
@@ -362,7 +367,7 @@ def seen_edges(picture: Picture, H: Array, pattern: Pattern) -> SeenEdges | None
 
 def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> NDArray[np.bool_]:
     hidden, (h, w) = picture.hidden, picture.image.shape
-    # A profile is as far in the picture as both its ends are.
+    # A profile is in the picture if both of its ends are.
     reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
     x_and_y = (origin - reach >= ROOM_PX) & (origin + reach <= last)
     seen = x_and_y[..., 0] & x_and_y[..., 1]
@@ -376,7 +381,8 @@ def _in_view(picture: Picture, origin: Array, normal: Array, near_px: Array) -> 
 def _unspoilt(
     grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return which profiles (rows, n) go from black to white, and how white the paper is."""
+    """Return which profiles (rows, n) change from black to white, and the grey level of white
+    paper."""
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

@@ -1,6 +1,5 @@
-"""How a marker looks: the rim of its border, its cells, its drawing; and whether the picture
-shows these cells at given corners.
-"""
+"""Appearance of a marker (rim of its border, cells, drawing), and checks of a picture for these
+cells at given corners."""
 
 from __future__ import annotations
 
@@ -15,20 +14,22 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import apply_homography, homography_from_unit, within
 
-LEAST_SIDE_PX = 7.0  # below it a marker is a spot
+LEAST_SIDE_PX = 7.0  # a smaller marker is only a spot
 MIN_CONTRAST = 10.0  # grey levels
-CELL_MARGIN = 0.1  # of the contrast that a cell must keep from the threshold
+CELL_MARGIN = 0.1  # margin of a cell to the threshold, as a share of the contrast
 MOST_CELLS = 0.8
 _MIN_RESEMBLANCE = 0.6
-_COVERED = 1.25  # half sides of a marker in the centre that may hide cells
+_COVERED = 1.25  # half sides of a central marker that may hide cells
 _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
 
 
 @dataclass(frozen=True, eq=False)
 class Rim:
-    """The cells next to a marker's border, along its four sides in the order of the corners. white:
-    (4, n), 1 for a white cell; the first and last are the border's. white_behind: (4, n), 1 if the
-    cell behind it is white too. tolerance: print error of an edge's position, in cells.
+    """The cells next to a marker's border, along its four sides in the order of the corners.
+
+    white: (4, n), 1 for a white cell; the first and last ones belong to the border. white_behind:
+    (4, n), 1 if the cell behind it is white too. tolerance: print error of an edge's position, in
+    cells.
     """
 
     white: Array
@@ -42,12 +43,12 @@ class Rim:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """A marker's looks.
+    """The appearance of a marker.
 
     rim: cells inside the border. drawing: all cells. spots (n, 2): points in the marker's
     coordinates (see `perchctl.vision.markers.corners`) at which cells are read; spot_cells (n,):
-    each spot's cell; spots_per_cell (cells,); blurred_spots (4, n): expected grey at the spots with
-    a blur of half a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; is_white,
+    the cell of each spot; spots_per_cell (cells,); blurred_spots (4, n): expected grey at the spots
+    with a blur of half a cell, zero-mean and of unit norm, for corners rolled by 0 to 3; is_white,
     is_inner (cells,): True for a white cell, for a cell within the border.
     """
 
@@ -62,7 +63,7 @@ class Pattern:
 
 
 def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
-    """The rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
+    """Return the rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
     the border's edges."""
     n = len(bits)
 
@@ -80,7 +81,7 @@ def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
 
 def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
-    """The pattern of a marker, with spots in all cells not hidden by a marker inside."""
+    """Return the pattern of a marker, with spots in all cells that no central marker hides."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -114,7 +115,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     if means is None:
         return False
     white, black = means[pattern.is_white], means[~pattern.is_white]
-    # The light may differ across the marker: white and black are the medians.
+    # The light may vary across the marker, so white and black are medians.
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
@@ -125,7 +126,7 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if the picture has the pattern's colour in nearly all cells."""
+    """True if the picture has the pattern's colour in more than `MOST_CELLS` of the cells."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
@@ -140,14 +141,14 @@ def fits_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) 
 
 
 def correlations(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
-    """The correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
-    rolled on by 0 to 3; 0 without contrast."""
+    """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
+    rolled by 0 to 3; 0 without contrast."""
     grey = _read(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
     grey -= grey.mean()
     spread = float(np.linalg.norm(grey))
-    # Black and white each on about half of the spots are 2 spreads apart.
+    # With black and white on about half of the spots each, they differ by two standard deviations.
     if spread < 0.5 * MIN_CONTRAST * math.sqrt(len(grey)):
         return np.zeros(4)
     return np.asarray(pattern.blurred_spots @ grey / spread)
@@ -161,9 +162,9 @@ def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
 
 
 def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """The grey values (k,) at the spots; None outside of the picture."""
+    """Return the grey values (k,) at the spots; None outside the picture."""
     at = apply_homography(homography_from_unit(corners_px), pattern.spots)
-    # Spots are inside of the corners.
+    # Spots are inside the corners.
     if not (within(corners_px, image.shape) or within(at, image.shape)):
         return None
     nearest = (at + 0.5).astype(np.intp)
@@ -171,7 +172,7 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
-    """The whiteness at the spots with a blur of half a cell."""
+    """Return the whiteness at the spots with a blur of half a cell."""
     n, fine = len(drawing.cells), 8
     sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
     white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
@@ -179,20 +180,22 @@ def _softened(drawing: Drawing, spots: Array) -> Array:
     return np.asarray(white[at[:, 1], at[:, 0]])
 
 
-# --- A marker's drawing on a grid: how white each node is, sharp and blurred ---
+# --- A marker's drawing on a grid: whiteness of each node, sharp and blurred ---
 
 
-_REACH_CELLS = 0.6  # of white around the border
+_REACH_CELLS = 0.6  # white around the border
 EDGE = 12
-"""Nodes more all around, for the blur."""
+"""Number of additional nodes on all sides, for the blur."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
     """A marker's `cells` with its border, 1 = white, (n, n).
 
-    For the target's large marker also the small marker's cells, `centre`, the `ratio` of small to
-    large side, and `sheet`, half the paper's side in the marker's coordinates (None: endless)."""
+    For the target's large marker, also the small marker's cells, `centre`, the `ratio` of the small
+    to the large side, and `sheet`, half the side of the paper in the marker's coordinates (None:
+    infinite).
+    """
 
     cells: Array
     centre: Array | None = None
@@ -208,7 +211,8 @@ class Drawing:
 def make_drawing(
     bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None, ratio: float = 0.0
 ) -> Drawing:
-    """A marker's drawing by its inner bits, 1 = white; `centre`, `ratio`: of a marker inside."""
+    """Return a marker's drawing from its inner bits, 1 = white; `centre` and `ratio` describe a
+    marker inside."""
     cells = np.pad(bits.astype(np.float64), 1)
     if centre is None:
         return Drawing(cells)
@@ -216,7 +220,7 @@ def make_drawing(
 
 
 def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
-    """The share of each cell in each node, (nodes, cells)."""
+    """Return the share of each cell in each node, (nodes, cells)."""
     edges = size * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = axis[:, None] - half_node, axis[:, None] + half_node
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
@@ -224,14 +228,15 @@ def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array
 
 
 def _wide(axis: Array, half_node: float) -> Array:
-    """The axis with `EDGE` nodes more at either end."""
+    """Return the axis with `EDGE` additional nodes at both ends."""
     more = 2.0 * half_node * np.arange(1, EDGE + 1)
     return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
 
 
 @lru_cache(maxsize=64)
 def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
-    """The whiteness at n by n nodes, and if the sheet ends, each node's share beyond its end."""
+    """Return the whiteness at n by n nodes and, if the sheet ends, the share of each node beyond
+    its end."""
     half_node = drawing.reach / n
     axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = render_cells(drawing, axis, half_node)
@@ -243,12 +248,13 @@ def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
 
 @lru_cache(maxsize=64)
 def black_square(cells: int, n: int) -> NDArray[np.float32]:
-    """The whiteness of a black square of `cells` cells a side, n by n nodes."""
+    """Return the whiteness of a black square with `cells` cells per side, at n by n nodes."""
     return render_sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
 def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """The whiteness of the nodes at `axis` x `axis`, and of `EDGE` more nodes all around."""
+    """Return the whiteness of the nodes at `axis` x `axis`, and of `EDGE` additional nodes on all
+    sides."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
@@ -259,7 +265,7 @@ def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.
 
 
 def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
-    """The share (n, cells) of each row of cells in each node, blurred by `sigma` nodes."""
+    """Return the share (n, cells) of each row of cells in each node, blurred by `sigma` nodes."""
     wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
@@ -268,6 +274,6 @@ def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) ->
 
 
 def blur_nodes(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """The nodes, with the margin around them, after a Gaussian blur of `sigma` nodes."""
+    """Return the nodes, with the margin around them, after a Gaussian blur of `sigma` nodes."""
     soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

@@ -1,21 +1,21 @@
-"""Photometric fit: a marker's drawing laid over the picture, where edges and bits no longer show.
+"""Photometric fit: fit a marker's drawing to the picture if edges and bits are no longer visible.
 
-Where blur has run the cells together, or cells are a few pixels wide, the picture of the whole
-marker still is its drawing D, blurred and lit. Gauss-Newton finds the homography H together with
-the blur's sigma and the light, at the nodes u of a grid over the marker:
+If blur has merged the cells, or cells are only a few pixels wide, the picture of the whole marker
+is still its drawing D, blurred and lit. Gauss-Newton finds the homography H together with the
+standard deviation of the blur and the light, at the nodes u of a grid over the marker:
 
     min sum (I(lens(H u)) - [a + b.u + (c + e.u) D + f D (1 - D)])^2,    D blurred by sigma
 
-a, b: black level and its slope; c, e: gain and its slope; f: bend of the tone curve; where the
-sheet ends, the grey beyond it is one more unknown. What does not look like the drawing then, cell
-by cell, is not the marker.
+a, b: black level and its slope; c, e: gain and its slope; f: bend of the tone curve. If the sheet
+ends, the grey beyond it is one more unknown. A picture that still deviates from the drawing, cell
+by cell, does not show the marker.
 
-Wrong where the blur differs between directions (fast motion), where something covers a part but
-leaves the cells readable, and where white is clipped; the fit itself does not notice a codeword
-that looks the same under that blur: `Alignment.flip` tells how near one is.
+The result is wrong if the blur is anisotropic (fast motion), if something covers a part but leaves
+the cells readable, or if white is clipped. The fit itself does not notice a codeword that looks the
+same with that blur; `Alignment.flip` says how close one is.
 
-Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to
-255; grids are (n, n) nodes, stored as rows of n * n.
+Coordinates u are the marker's own, see `perchctl.vision.markers.corners`; grey values are 0 to 255;
+grids are (n, n) nodes, stored as rows of n * n.
 """
 
 from __future__ import annotations
@@ -50,45 +50,48 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
-_GRID_PX = 0.8  # picture pixels from node to node
+_GRID_PX = 0.8  # picture pixels between nodes
 _ROUNDS = 12
 _HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
-"""A marker's likeness is above 0.9 after two rounds; what is still far from it is none."""
-_STILL_PX = 0.05  # the round after such a step moves a tenth of that, mostly
-_LENS_PX = 0.3  # what the lens does is computed anew after this way
-_MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
-# How far shape may leave its start, a unit of half a side: turns and scales; the perspective.
+"""Number of rounds after which the fit fails unless its likeness reaches `_LEAST_HOPE`. The
+likeness of a marker is above 0.9 after two rounds."""
+_STILL_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
+_LENS_PX = 0.3  # motion after which the lens distortion is computed again
+_MAX_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
+# Standard deviations of the shape from its start, in half sides: rotations and scales; the
+# perspective.
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
 _BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
-_MOST_BLUR_STEP = 0.5  # of a round: of the blur's square; a node's square at least
+_MOST_BLUR_STEP = 0.5  # per round, as a share of the blur's square; a node's square at least
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
-"""A change of blur draws nothing anew that is smaller than both: as a share, and in cells."""
+"""Changes of the blur below both limits do not render the drawing again: as a share, and in
+cells."""
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
-_SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # unknowns: the increment, blur, those of light
+_SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # indices of the unknowns: increment, blur, light
 _PRIOR: Array = (
     np.array(
         [_SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _VIEW_SIGMA, _VIEW_SIGMA]
     )
     ** -2.0
-)  # of the increment's terms; the place is free
+)  # terms of the increment; the position is free
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Result of fitting a drawing to the picture, and how well it fits.
+    """Result of fitting a drawing to the picture, with measures of the fit's quality.
 
     Attributes:
-        corners_px, sigma_px: the marker's corners (4, 2) and their spread.
+        corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
         likeness: correlation of the picture with the drawing.
-        pattern, strength: correlation and contrast of the inner bits, beyond what a black square of
-            the same size explains; the contrast relative to the border's.
-        cell_departure: largest mean departure of a cell, in units of the gain.
-        flip, flip_sigma: how far the worst-fitting cell has the other colour, 0 (as drawn) to 1
-            (wrong bit), and the spread of the least certain cell.
-        blur_px: the blur's sigma.
-        moved_px: how far the corner that moved most is from its start.
+        pattern, strength: correlation and contrast of the inner bits, beyond a black square of the
+            same size; the contrast is relative to the border's.
+        cell_departure: largest mean deviation of a cell, in units of the gain.
+        flip, flip_sigma: how far the worst-fitting cell has the opposite colour, 0 (as drawn) to 1
+            (wrong bit), and the standard deviation of the least certain cell.
+        blur_px: standard deviation of the blur.
+        moved_px: largest distance of a corner from its start.
     """
 
     corners_px: Array
@@ -105,8 +108,8 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """What a picture's grey values leave over of a drawing in its best light, with a gain of grey
-    levels from black to white; the changes J with the unknowns; and the normal equations N x = g
+    """Residuals of a picture's grey values from a drawing in its best light, with a gain of grey
+    levels from black to white; the derivatives J by the unknowns; and the normal equations N x = g
     of the next increment, per unit of noise."""
 
     gain: float
@@ -126,7 +129,7 @@ def align_drawing(
 ) -> Alignment | None:
     """Fit the drawing to the picture, starting at `start_px` (4, 2) and `blur_px`.
 
-    None if the marker leaves the picture, looks different, or the fit diverges.
+    Returns None if the marker leaves the picture, looks different, or the fit diverges.
     """
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all():
@@ -178,7 +181,7 @@ def align_drawing(
         elif moved_px < _STILL_PX and since_lens_px <= _LENS_PX:
             break
     assert equations is not None
-    # What the last round left over, its step being next to nothing.
+    # Residuals of the last round, whose step was negligible.
     gain, error = equations.gain, equations.error
     corners_px = distort_px(apply_homography(H, UNIT).T, camera).T
     pattern, strength = _pattern_seen(seen, grey, gain)
@@ -202,11 +205,11 @@ def align_drawing(
 
 
 def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
-    """The equations of the next increment; None without contrast. `total` (8,) is the sum of
+    """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
     the increments so far."""
     rows, products = seen.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
-    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is seen
+    A[BEND, BEND] += 1e-3 * len(grey)  # no bend unless it is visible
     light = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
     gain = float(light[GAIN])
     if gain < _MIN_GAIN:
@@ -217,7 +220,7 @@ def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations |
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
-    N[_BLUR, _BLUR] += 1.0  # about a node's width a round
+    N[_BLUR, _BLUR] += 1.0  # about a node's width per round
     N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0
     g[bend] -= light[BEND] * (_BEND_SIGMA * gain) ** -2.0
     N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
@@ -226,11 +229,11 @@ def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations |
     return _Equations(gain, error, J, noise, N, g)
 
 
-# --- How much the picture looks like a drawing that was fitted to it ---
+# --- How well the picture matches a fitted drawing ---
 
 
 def likeness(grey: Array, error: Array) -> float:
-    """The correlation of grey values (k,) with their fit, whose residual is `error` (k,)."""
+    """Return the correlation of grey values (k,) with their fit, whose residual is `error` (k,)."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -239,8 +242,9 @@ def likeness(grey: Array, error: Array) -> float:
 def _cells_seen(
     seen: RenderedDrawing, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
-    """Return `flip` and `flip_sigma` of an `Alignment`, by the inverse of N. A wrong bit is looked
-    for as it would look: blurred, and without what the unknowns of the fit explain of it."""
+    """Return `flip` and `flip_sigma` of an `Alignment`, using the inverse of N. A wrong bit is
+    tested in the form in which it would appear: blurred, and without the part that the unknowns of
+    the fit explain."""
     soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
@@ -254,7 +258,7 @@ def _cells_seen(
 
 
 def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
-    """The correlation and height of the inner pattern in grey (n * n,)."""
+    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,)."""
     rows, products = drawing.square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.illumination_basis[0][GAIN], grey
@@ -269,7 +273,7 @@ def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[f
 
 
 def _repeated(error: Array) -> float:
-    """Return how many neighbouring nodes measure the same."""
+    """Return the number of neighbouring nodes with the same information."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
     for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
@@ -286,7 +290,7 @@ def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
 
 @lru_cache(maxsize=32)
 def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
-    """Each node's cell number, and how many nodes each cell has."""
+    """Return the cell number of each node, and the number of nodes in each cell."""
     x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
     own = y.astype(np.intp) * n_cells + x.astype(np.intp)
@@ -295,12 +299,13 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
     return index, np.maximum(count, 1.0)
 
 
-# --- The light on a marker: what turns its drawing into grey values ---
-# Offset, gain, their slopes, the tone curve's bend, the grey beyond the sheet: all shift edges.
+# --- The light on a marker, which converts its drawing to grey values ---
+# Offset, gain, their slopes, the bend of the tone curve and the grey beyond the sheet all shift
+# edges.
 
 
 def _lit_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
-    """Changes (9, n * n) of grey with increment and the blur's square."""
+    """Return the derivatives (9, n * n) of grey by the increment and the blur's square."""
     gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
     bend = min(max(float(light[BEND]) / gain, -0.9), 0.9)
@@ -312,15 +317,16 @@ def _lit_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
     return change
 
 
-# --- A grid over a marker in its own coordinates, and the picture read at its nodes ---
+# --- A grid over a marker in its own coordinates, and the picture at its nodes ---
 
 
-_FEW = 9  # a side
+_FEW = 9  # per side
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """n by n nodes, at `axis` (n,) in both directions; `uv1` (3, n * n): (u, v, 1) of each."""
+    """n by n nodes, at `axis` (n,) in both directions; `uv1` (3, n * n) is (u, v, 1) of each
+    node."""
 
     n: int
     axis: Array
@@ -329,13 +335,13 @@ class Grid:
 
 @lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
-    """The nodes in the middle of n by n parts of a square from -reach to reach."""
+    """Return the nodes in the middle of n by n parts of a square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
     return Grid(n, axis, _crossings(axis))
 
 
 def _crossings(axis: Array) -> Array:
-    """Return u, v and 1 where the lines of a grid cross, (3, n * n)."""
+    """Return u, v and 1 at the crossings of the grid's lines, (3, n * n)."""
     u, v = np.meshgrid(axis, axis)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
@@ -347,7 +353,7 @@ def project_nodes(H: Array, uv1: Array) -> Array:
 
 
 def distort_px(pin_px: Array, camera: CameraModel) -> Array:
-    """Convert pinhole pixels (2, n) to pixels of the real lens."""
+    """Convert pinhole pixels (2, n) to pixels of the lens."""
     K = camera.K
     rays = np.empty((pin_px.shape[1], 2))
     rays[:, 1] = (pin_px[1] - K[1, 2]) / K[1, 1]
@@ -356,7 +362,7 @@ def distort_px(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """Each node's shift by the lens, px (2, n * n), interpolated from a few nodes."""
+    """Return the shift of each node by the lens, px (2, n * n), interpolated from a few nodes."""
     uv1, between = _few(grid)
     pin = project_nodes(H, uv1)
     shift = (distort_px(pin, camera) - pin).reshape(2, _FEW, _FEW)
@@ -365,7 +371,8 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 
 @lru_cache(maxsize=64)
 def _few(grid: Grid) -> tuple[Array, Array]:
-    """Chebyshev nodes over the grid (3, _FEW^2) and the weights (n, _FEW) of its own."""
+    """Return Chebyshev nodes over the grid (3, _FEW^2), and the weights (n, _FEW) for the grid's
+    own nodes."""
     reach = float(grid.axis[-1])
     x = chebyshev.chebpts2(_FEW)
     degree = _FEW - 1
@@ -376,7 +383,7 @@ def _few(grid: Grid) -> tuple[Array, Array]:
 def _patch_around(
     image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """The part of the picture that is needed, and its first pixel (2, 1)."""
+    """Return the required part of the picture, and its first pixel (2, 1)."""
     h, w = image.shape
     x, y = project_nodes(H, grid.uv1) + lens_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -390,22 +397,22 @@ def _patch_around(
 
 
 def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
-    """Grey values (n * n,) at nodes of a patch moved by the lens's shift (2, n * n)."""
+    """Return the grey values (n * n,) at the nodes of a patch, shifted by the lens (2, n * n)."""
     at = (project_nodes(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float64).ravel()
 
 
-# --- Products of long rows, a value for each node of a square grid ---
-# They are taken block by block: large products wake threads, which cost more than they save.
+# --- Products of long rows with a value for each node of a square grid ---
+# They are computed block by block: large products wake threads, which cost more than they save.
 
 
-_BLOCK = 256  # values of a row
+_BLOCK = 256  # values per row
 
 
 def gram_matrix(rows: Array) -> Array:
-    """The Gram matrix (k, k), ``rows @ rows.T``, of rows (k, n)."""
+    """Return the Gram matrix (k, k), ``rows @ rows.T``, of rows (k, n)."""
     k, n = rows.shape
     whole = n - n % _BLOCK
     blocks = rows[:, :whole].reshape(k, -1, _BLOCK).transpose(1, 0, 2)
@@ -417,8 +424,8 @@ def gram_matrix(rows: Array) -> Array:
 # --- A marker's drawing at the nodes of a grid, blurred ---
 
 
-_STEP = 0.02  # of the blur
-# Rows of the light: offset and its slopes, gain and its slopes, bend, what is beyond the sheet.
+_STEP = 0.02  # relative step of the blur
+# Rows of the light: offset and its slopes, gain and its slopes, bend, grey beyond the sheet.
 OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
 
@@ -432,8 +439,8 @@ class RenderedDrawing:
 
     @cached_property
     def sheets(self) -> tuple[tuple[Array, Array], ...]:
-        """Each sheet at the nodes (n * n,), and its changes (9, n * n) with the eight terms of a
-        homography's increment and with the blur's square."""
+        """Each sheet at the nodes (n * n,), and its derivatives (9, n * n) by the eight terms of a
+        homography's increment and by the blur's square."""
         sharp = render_sheets(self.drawing, self.grid.n)
         return tuple(_blurred_with_slope(each, self.sigma, self.grid.axis) for each in sharp)
 
@@ -449,7 +456,7 @@ class RenderedDrawing:
 
     @cached_property
     def square_illumination_basis(self) -> tuple[Array, Array]:
-        """Basis of a black square's grey values under any light but slopes of the gain and bend:
+        """Basis of a black square's grey values under any light except slopes of the gain and bend:
         rows (4 or 5, n * n), and their Gram matrix."""
         soft = blur_nodes(black_square(len(self.drawing.cells), self.grid.n), self.sigma)
         black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
@@ -466,7 +473,7 @@ class RenderedDrawing:
 
 @lru_cache(maxsize=16)
 def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
-    """The drawing at n by n nodes over its reach, blurred by ``exp(_STEP * step)`` nodes."""
+    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_STEP * step)`` nodes."""
     return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
 
 

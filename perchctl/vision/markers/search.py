@@ -1,12 +1,12 @@
-"""The search for both markers: in a window, then in the whole picture; the choice among them.
+"""Search for both markers, in a window and then in the whole picture, and choose among the results.
 
 OpenCV's ArUco detector thresholds the picture adaptively and decodes the quadrilaterals. Its
-corners are raw: off by about 0.5 px, mostly inwards, and the picture's edge passes for a side. A
-pixel p' of a window at half size that begins at pixel o is at
+corners are raw: they are about 0.5 px off, mostly inwards, and the picture's edge may be mistaken
+for a side. A pixel p' of a window at half size that starts at pixel o is at
 
     p = 2 p' + 1/2 + o
 
-Nothing is found where blur or the picture's edge hides the bits. Corners are (4, 2) px.
+The search fails where blur or the picture's edge hides the bits. Corners are (4, 2) px.
 """
 
 from __future__ import annotations
@@ -33,15 +33,17 @@ from perchctl.vision.target_selection import OwnOffset
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
-"""Where a target is looked for: near to where it is expected by a search (window), by fits to a
-blurred one, or both (near); all over if sharp, or blurred; or all that."""
-_WINDOW_MARGIN = 0.25  # of the target's size in the picture, on each side
+"""Kinds of search: near the expected position by a search ("window"), by fits to a blurred target
+("fits"), or by both ("near"); in the whole picture for a "sharp" or a "blurred" target; or
+"all"."""
+_WINDOW_MARGIN = 0.25  # share of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
-_MAX_WINDOW = 0.8  # of the picture
+_MAX_WINDOW = 0.8  # share of the picture
 _HALVED_SIDE_PX = 60.0
-"""Markers as large as this are found in a quarter of the time in a picture of half the size."""
-_CENTRE_TOLERANCE = 0.35  # of the small marker's side
+"""Side above which markers are found in a picture of half the size, in a quarter of the time,
+px."""
+_CENTRE_TOLERANCE = 0.35  # share of the small marker's side
 
 
 Window = tuple[slice, slice]
@@ -50,8 +52,8 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class FoundMarkers:
-    """Raw corners (4, 2) px of at most one large and one small marker, whether a marker's mirror
-    image was found, and the number of whole targets to choose from."""
+    """Raw corners (4, 2) px of at most one large and one small marker, whether a mirrored marker
+    was found, and the number of complete targets to choose from."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     mirrored: bool = False
@@ -67,8 +69,9 @@ def search(
     """Search the window around the expected markers, then the whole picture if the window shows too
     little.
 
-    `look` "near" or "window": the window only; "sharp": the picture only. `own` chooses among
-    several targets if none is expected."""
+    With `look` "near" or "window", only the window is searched; with "sharp", only the whole
+    picture. `own` selects one of several targets if none is expected.
+    """
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
     if setup.fits_lines and expected and look != "sharp":
@@ -91,7 +94,7 @@ def search(
 def search_halved(
     picture: Picture, expected: Mapping[MarkerName, Array], own: OwnOffset | None = None
 ) -> FoundMarkers | None:
-    """Search the window at half size, in 1 ms; None if an expected whole marker is missed."""
+    """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
     shape = picture.image.shape
     in_view = [quad for quad in expected.values() if within(quad, shape)]
     if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
@@ -105,8 +108,8 @@ def search_halved(
 def search_window(
     expected: Mapping[MarkerName, Array], ratio: float, shape: tuple[int, ...]
 ) -> Window | None:
-    """The part of the picture to search, None if a window would save little time. The window holds
-    the whole large marker if that can be in the picture."""
+    """Return the part of the picture to search; None if a window would save little time. The window
+    contains the whole large marker if that may be in the picture."""
     h, w = shape[:2]
     if "large" in expected:
         corners = expected["large"]
@@ -151,7 +154,7 @@ def _pass(
             continue
         name = MARKERS[int(dictionary)]
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
-        # A pixel of half the size has its centre between two.
+        # The centre of a pixel at half size is between two pixels.
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_wholes(candidates, setup.ratio))
     chosen = choose_markers(candidates, expected, setup.ratio, own)
@@ -166,8 +169,10 @@ def choose_markers(
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
-    A small marker in the centre of a large one, of the right size and turn, verifies both. Markers
-    at expected places win over a pair elsewhere; among single markers, the nearest by `own`."""
+    A small marker in the centre of a large one, with the right size and rotation, verifies both.
+    Markers at expected positions take precedence over a pair elsewhere; among single markers, the
+    closest by `own` is chosen.
+    """
     if own is not None and not expected:
         candidates = _nearest_first(candidates, own)
     large, small = candidates["large"], candidates["small"]
@@ -191,7 +196,7 @@ def choose_markers(
         return {"small": near_small}
     if own is not None and not expected:
         large, small = large[:1], small[:1]
-    # A small marker beside a whole large one is not the target's.
+    # A small marker next to a complete large one does not belong to the target.
     if len(large) == 1:
         return {"large": large[0]}
     if len(small) == 1 and not large:
@@ -202,9 +207,9 @@ def choose_markers(
 def _nearest_first(
     candidates: Mapping[MarkerName, list[Array]], own: OwnOffset
 ) -> Mapping[MarkerName, list[Array]]:
-    """The candidates that are least far aside first, without those that are too far.
+    """Return the candidates sorted by their distance, without those that are too far away.
 
-    A lone one is left to the pipeline, which says why it is not taken.
+    A single candidate is left to the pipeline, which explains why it is refused.
     """
     if sum(map(len, candidates.values())) < 2:
         return candidates
@@ -219,7 +224,7 @@ def _nearest_first(
 def _wholes(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
-    """The pairs that belong together, misfit and indices, best first."""
+    """Return the pairs of markers that form a target: error and indices, best first."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
         (nesting_error(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)
@@ -232,7 +237,8 @@ def _wholes(
 
 
 def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
-    """The small marker's distance from its place in the large one, in units of the tolerance."""
+    """Return the distance of the small marker from its position in the large one, in units of the
+    tolerance."""
     mapped = scale_square(large_px, ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_CENTRE_TOLERANCE * side_px, 2.5)
