@@ -1,4 +1,4 @@
-"""From frames and telemetry to the target: the one session that every command uses."""
+"""Estimate the target from frames and telemetry: the one session that every command uses."""
 
 import lazy_loader
 

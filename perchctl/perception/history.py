@@ -1,4 +1,4 @@
-"""The vehicle's recent past: its attitude and position at a frame's time."""
+"""The vehicle's recent telemetry, with its attitude and position at a frame's time."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ _time_s = attrgetter("t_s")
 KEEP_S = 2.0
 SMEARED_S = 0.15
 FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
-"""What a flight does between two samples: 400 deg/s, 2 g."""
+"""Limits of a flight between two samples: 400 deg/s and 2 g. Smaller: a fast motion counts as a
+jump of the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first, and the one sample before: together they show
-    the whole of that time, however far apart the samples are.
+    """Telemetry of the last `KEEP_S`, oldest first, plus one earlier sample, so that the samples
+    cover all of that time at any sample rate.
 
-    In the newest samples, `jumped`: the estimate stepped; `turned_rad`: the heading's largest step.
-    `battery_changed_s`: when the battery's reading last changed, or first came; `imu`: motion by
-    accelerometer in the whole flight.
+    `jumped`: the state estimate jumped within the newest samples. `turned_rad`: largest step of the
+    heading within the newest samples, beyond a possible rotation. `battery_changed_s`: time at
+    which the battery's reading last changed, or first arrived. `imu`: motion from the accelerometer
+    over the whole flight.
     """
 
     samples: tuple[Telemetry, ...] = ()
@@ -45,18 +47,18 @@ class History:
         return self.samples[-1] if self.samples else None
 
     def battery_age_s(self, now_s: float) -> float:
-        """Seconds since the battery's last new reading; 0 before there is telemetry."""
+        """Seconds since the last new reading of the battery; 0 before there is telemetry."""
         return 0.0 if self.battery_changed_s is None else now_s - self.battery_changed_s
 
 
 def add_samples(
     history: History, new: list[Telemetry], safety: SafetyConfig, late: bool = False
 ) -> History:
-    """The history with new samples.
+    """Return the history with new samples.
 
-    `jumped` and `turned_rad` are about the new samples, with `late` also about the earlier
-    samples of the same turn. A sample without position or velocity gets both from the sample
-    before; other samples with NaN, or out of order, are left out (fault 35).
+    `jumped` and `turned_rad` describe the new samples; with `late`, also the earlier samples of the
+    same tick. A sample without position or velocity takes both from the previous sample. Other
+    samples with NaN, and samples out of order, are dropped (fault 35).
     """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu
@@ -82,10 +84,10 @@ def add_samples(
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:
-    """Attitude, position and velocity at `t_s`, linear between samples (yaw on the circle).
+    """Return attitude, position and velocity at `t_s`, linear between samples (yaw on the circle).
 
-    Before the oldest sample its values hold; after the newest sample its velocity carries
-    the position on for at most 0.1 s. None without samples.
+    Before the oldest sample, its values are used. After the newest sample, the position is
+    extrapolated with its velocity for at most 0.1 s. Returns None without samples.
     """
     samples = history.samples
     if not samples:
@@ -113,7 +115,8 @@ def _between(a: Vector, b: Vector, part: float) -> Vector:
 
 
 def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
-    """The velocity of the first sample from `t_s` on, else of the newest, else zero; world axes."""
+    """Return the velocity of the first sample at or after `t_s`, else of the newest, else zero;
+    world axes."""
     later = bisect.bisect_left(history.samples, t_s, key=_time_s)
     found = history.samples[later : later + 1] or history.samples[-1:]
     return found[0].velocity_mps if found else (0.0, 0.0, 0.0)
@@ -125,7 +128,7 @@ def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:
-    """True if the estimate stepped farther than any flight leads, at once or smeared."""
+    """True if the estimate moved further than any flight could, at once or within `SMEARED_S`."""
     last = before[-1]
     first = before[bisect.bisect_left(before, last.t_s - SMEARED_S, key=_time_s)]
     faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
@@ -138,7 +141,7 @@ def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> b
 
 
 def _turned_rad(a: Telemetry, b: Telemetry) -> float:
-    """The heading's step beyond what the vehicle can turn between two samples."""
+    """Return the step of the heading beyond a possible rotation between two samples, rad."""
     return abs(wrap_rad(b.yaw_rad - a.yaw_rad)) - FASTEST_TURN_RADPS * (b.t_s - a.t_s)
 
 
@@ -151,7 +154,7 @@ def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
 
 
 def _between_s(a: Telemetry, b: Telemetry) -> float:
-    """Seconds between two positions, which are as old as their own packets."""
+    """Return the seconds between two positions, each of which is as old as its own packet."""
     return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
 
 
@@ -167,7 +170,7 @@ def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
 
 
 def is_finite(s: Telemetry) -> bool:
-    """True if all values of a sample that steer a flight are finite, its times among them."""
+    """True if all values of a sample that affect the flight are finite, including its times."""
     times = s.t_s, s.behind_s
     attitude = s.roll_rad, s.pitch_rad, s.yaw_rad
     forces = s.acc_x_g, s.acc_y_g, s.acc_z_g, s.thrust

@@ -1,7 +1,8 @@
-"""The camera's latency and mounting, estimated picture by picture while the vehicle flies.
+"""Estimate the camera's latency and mounting picture by picture during the flight.
 
-With `camera.latency_s: measured` the latency is used, too: taken off the pictures' times, once
-it is sure, slowly, and within bounds. What is estimated rests on the times before that.
+With `camera.latency_s: measured`, the estimated latency is also applied: it is subtracted from the
+pictures' times once it is certain, slowly, and within bounds. The estimation itself uses the
+uncorrected times.
 """
 
 from __future__ import annotations
@@ -21,18 +22,22 @@ from perchctl.vision import Attitude, CameraErrors, MarkerPose, PoseSetup
 
 SOLVE_EVERY_S = 1.0
 LIKELY_S = 0.02
-"""A surer delay is where the next pictures' factors are taken."""
+"""Standard deviation of the delay below which the factors of the next pictures are computed at that
+delay, s."""
 USED_SIGMA_S = 0.008
-"""A delay that is less sure is not used: 30 ms make an alignment swing."""
+"""Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
+oscillate."""
 SLEW = 0.02
-"""Seconds a second: at 0.4 m/s the target moves by 8 mm/s, as a drift does."""
+"""Rate at which the applied latency changes, s/s: at 0.4 m/s, the target appears to move by 8 mm/s,
+as with a drift."""
 FAST_SLEW = 0.5
-"""The same while pictures and accelerometer agree on quite another latency: below 1, or the
-pictures' times would go back. Smaller: a vehicle swings for longer by positions that are late."""
+"""The same rate while pictures and accelerometer agree on a very different latency. It is below 1
+because the pictures' times would otherwise run backwards. Smaller: a vehicle with late positions
+oscillates for longer."""
 CHANGED_S = 0.05
-"""A latency that differs from a sure estimate by more has changed in flight."""
+"""Difference from a certain estimate above which the latency has changed in flight, s."""
 UNKNOWN_SIGMA_S = (USED_LATENCY_S[1] - USED_LATENCY_S[0]) / math.sqrt(12.0)
-"""Standard deviation of a latency that may be anywhere in `USED_LATENCY_S`."""
+"""Standard deviation of a latency that may be anywhere within `USED_LATENCY_S`, s."""
 LONGEST_STEP_S = 0.1
 
 
@@ -40,10 +45,11 @@ LONGEST_STEP_S = 0.1
 class OnlineCalibration:
     """Estimate of the camera's latency and mounting from pictures and telemetry.
 
-    `newest` is the solution of `sums` at `solved_s`; `applied_delay_s` is the latency beyond the
-    profile's that is subtracted from the pictures' times, since the picture of `last_picture_s`;
-    `coarse_delay_s` is where a correction is taking it, None once it is there. `changed_s`: the
-    newest change of a latency that had been sure, from and to seconds beyond the profile's.
+    `newest` is the solution of `sums` at `solved_s`. `applied_delay_s` is the latency beyond the
+    profile's that is subtracted from the pictures' times, since the picture at `last_picture_s`.
+    `coarse_delay_s` is the goal of a correction in progress, None once it is reached. `changed_s`
+    is the newest change of a latency that had been certain: its old and new value, s beyond the
+    profile's.
     """
 
     sums: ConsistencySums = field(default_factory=lambda: ConsistencySums())
@@ -56,8 +62,8 @@ class OnlineCalibration:
 
     @property
     def delay_sigma_s(self) -> float:
-        """Standard deviation of a measured latency: that of `newest`, and at the most that of one
-        which is not known, however much the pictures scatter."""
+        """Standard deviation of a measured latency, s: that of `newest`, at most that of an unknown
+        latency, however much the pictures scatter."""
         if self.newest is None:
             return UNKNOWN_SIGMA_S
         return min(UNKNOWN_SIGMA_S, self.newest.delay_sigma_s)
@@ -71,10 +77,11 @@ def update_calibration(
     setup: PoseSetup,
     attitude_sigma_rad: float,
 ) -> OnlineCalibration:
-    """The estimate with one more picture in its sums, and once a second with the sums' solution.
+    """Return the estimate with one more picture in its sums and, once a second, the solution of the
+    sums.
 
-    `t_s` is the picture's arrival less the profile's latency. A pose that is not finite, too near,
-    or without the attitude of its time is ignored.
+    `t_s` is the picture's arrival minus the profile's latency. A pose is ignored if it is not
+    finite, too close, or without the attitude at its time.
     """
     new, likely = old, old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
@@ -95,14 +102,14 @@ def update_calibration(
 def apply_latency(
     old: OnlineCalibration, t_s: float, start_latency_s: float, correction_s: float | None
 ) -> OnlineCalibration:
-    """The calibration with the latency that the next picture's time is corrected by, for
+    """Return the calibration with the latency by which the next picture's time is corrected, for
     `camera.latency_s: measured`; `t_s` as in `update_calibration`.
 
-    `correction_s`, quite another latency by the accelerometer
-    (`VisualInertialWindow.correction_s`), is taken over within half a second: the sums need
-    seconds, and in these a vehicle that flies by the target alone swings. A sure solution of the
-    sums, which is finer, is followed slowly. Sums that contradict the correction are of an earlier
-    latency, and begin anew.
+    `correction_s`, a very different latency according to the accelerometer
+    (`VisualInertialWindow.correction_s`), is applied within half a second: the sums take seconds,
+    during which a vehicle that flies with the target alone oscillates. A certain solution of the
+    sums is more accurate and is followed slowly. Sums that contradict the correction belong to an
+    earlier latency and restart.
     """
     new, coarse_s, found = old, old.coarse_delay_s, old.newest
     sure_s = found.delay_s if found is not None and found.delay_sigma_s <= USED_SIGMA_S else None
@@ -122,42 +129,46 @@ def apply_latency(
     return replace(new, last_picture_s=t_s, applied_delay_s=used_s, coarse_delay_s=coarse_s)
 
 
-# --- What a flight tells about the latency and the mounting ---
-# Where the pictures are later than the profile says by d, the target is placed beside its place by
-# d times the speed at which the vehicle's motion and turning sweep the line of sight; where the
-# camera is turned, by the turn times the way to it. So its place in the estimate's world is linear
-# in the delay and the turn, and one least squares over a flight gives both.
+# --- Estimation of latency and mounting from a flight ---
+# If the pictures are later than the profile says by d, the target appears displaced by d times the
+# speed at which the vehicle's translation and rotation sweep the line of sight. If the camera is
+# rotated, the target appears displaced by the rotation times the vector to it. The target's
+# position in the estimate's world is therefore linear in the delay and the rotation, and one
+# least-squares fit over a flight yields both.
 #
-# The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
-# each row (`X`, `Y`, `HEADING`) and the factors go through the Kalman filter of a level that walks,
-# and what is summed are the innovations (de Jong 1991, "The diffuse Kalman filter").
+# The remaining variation of the position is not white noise: the vehicle's estimate is a random
+# walk with drift. Each row (`X`, `Y`, `HEADING`) and the factors therefore pass the Kalman filter
+# of a random-walk level, and the sums contain the innovations (de Jong 1991, "The diffuse Kalman
+# filter").
 
 
 X, Y, HEADING = range(3)
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
-"""Columns: the place (rad for the heading), and what may explain its moves."""
+"""Columns: the position (rad for the heading), and the possible causes of its motion."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
-"""What is thought possible before anything is seen, standard deviations."""
+"""Prior standard deviations of all columns but the first."""
 
 ATTITUDE_STEP_S = 0.02
-"""Of the difference that stands for a speed."""
+"""Half the time difference over which speeds are computed, s."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
-"""Of the vehicle's speed and rates of turn: what is not well above it is taken for rest."""
+"""Noise of the vehicle's speed and rotation rates; a motion that is not well above it counts as
+rest."""
 PICTURE_JITTER_S = 0.008
-"""By which single pictures are early or late."""
+"""Jitter of single pictures' times, s."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
-"""Of the estimate's place and attitude, in a second's random walk."""
+"""Random walk of the estimate's position and attitude within one second, standard deviations."""
 MOST_GAP_S = 0.5
 GATE_SIGMAS = 5.0
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
-"""What the gate allows beyond the noise: 200 ms, and 0.4 rad."""
+"""Factors for the gate beyond the noise: 200 ms, and 0.4 rad."""
 LEAST_RANGE_M = 0.15
-"""Nearer, nothing is swept: it is pressed soon."""
+"""Least range of the target, m; at closer range, the line of sight hardly moves and the press
+follows soon."""
 STAMPS_S = 0.003
-"""What an average does not take away, of the stamps of telemetry and exposure."""
+"""Errors of the time stamps of telemetry and exposure that averaging does not reduce, s."""
 LARGE_TURN = 0.03
-"""The speeds are by the profile's mounting: a large turn is known so well."""
+"""Relative error of a large rotation, since the speeds assume the profile's mounting."""
 LEAST_FRAMES = 30
 
 
@@ -165,8 +176,9 @@ LEAST_FRAMES = 30
 class ConsistencySums:
     """A flight's sums for `solve_consistency`.
 
-    `level` (3, 8), the filtered rows, and their `variance` (3,) after the newest frame, None before
-    the first; `information` (8, 8) of the innovations; `row_count`: how many rows gave them.
+    `level` (3, 8) holds the filtered rows and `variance` (3,) their variance after the newest
+    frame; `level` is None before the first. `information` (8, 8) is that of the innovations, and
+    `row_count` the number of rows in it.
     """
 
     t_s: float = -math.inf
@@ -185,16 +197,16 @@ def consistency_rows(
     delay_s: float,
     setup: PoseSetup,
 ) -> tuple[Array, Array, float]:
-    """A frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
+    """Return a frame's rows (3, 8) for x, y and heading, with the columns `PLACE` to `DRIFT_Y`; the
     variance (3,) of each row's noise; and the target's range, m.
 
     `before` and `after` are the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
-    time less `delay_s`, the likely delay; `velocity_mps` is the vehicle's velocity then.
+    time minus `delay_s`, the likely delay; `velocity_mps` is the vehicle's velocity at that time.
     """
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
-    x, y, z = (R_body_cam @ pose.tvec_m).tolist()  # from the camera, body axes
+    x, y, z = (R_body_cam @ pose.tvec_m).tolist()  # vector from the camera, body axes
     place = (R_body_cam @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
     axis = (R_body_cam @ np.asarray(cv2.Rodrigues(pose.rvec_rad)[0])[:, 0]).tolist()
     R0, R1 = _upper_rows(before), _upper_rows(after)
@@ -211,7 +223,7 @@ def consistency_rows(
         at = before.position_m[i] + after.position_m[i] + _dot(R0[i], place) + _dot(R1[i], place)
         speed = moves * speeds[i]
         u, v, w = (0.5 * (p + q) for p, q in zip(R0[i], R1[i], strict=True))
-        # Minus the cross products of the body's axes with the way, and the way itself.
+        # Negative cross products of the body's axes with the vector, and the vector itself.
         factors = [speed, v * z - w * y, w * x - u * z, u * y - v * x, u * x + v * y]
         rows.append([0.5 * at + delay_s * speed, *factors, 0.0, 0.0])
         noise.append(aside_m2 + LEAST_SIGMA_M**2 + (PICTURE_JITTER_S * speed) ** 2)
@@ -223,12 +235,12 @@ def consistency_rows(
 
 
 def _above(size: float, noise: float) -> float:
-    """The part of a motion that counts: none of what noise can be."""
+    """Return the share of a motion that counts: 0 if noise may explain it."""
     return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
 
 
 def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
-    """The first two rows of ``R_world_body``, without arrays."""
+    """Return the first two rows of ``R_world_body`` without arrays."""
     cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
     cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
     cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
@@ -245,9 +257,9 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def add_rows(
     old: ConsistencySums, t_s: float, rows: Array, variance: Array, range_m: float
 ) -> ConsistencySums:
-    """The sums with one more frame, given by its `consistency_rows`.
+    """Return the sums with one more frame, given by its `consistency_rows`.
 
-    After a gap, or a jump, the level starts anew; what was learned of delay and turn is kept.
+    After a gap or a jump, the level restarts; the information on delay and rotation is kept.
     """
     if old.level is None:
         return replace(old, t_s=t_s, began_s=t_s, level=rows, variance=variance)
@@ -277,7 +289,7 @@ def add_rows(
 
 
 def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> CameraErrors | None:
-    """The errors of latency and mounting; None with less than a second of frames.
+    """Return the errors of latency and mounting; None with less than a second of frames.
 
     `attitude_sigma_rad` is the constant error of the estimate's roll and pitch.
     """
@@ -288,7 +300,7 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Camer
     covariance = np.linalg.inv(information)
     found = covariance @ moved
     left = float(sums.information[PLACE, PLACE] - found @ moved)
-    # More scatter than claimed widens what is claimed, less of it narrows nothing.
+    # More scatter than claimed widens the covariance; less scatter does not narrow it.
     covariance *= max(1.0, left / sums.row_count)
     sigma = np.sqrt(np.diagonal(covariance))
     tilt_x, tilt_y = (

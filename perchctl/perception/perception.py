@@ -1,8 +1,8 @@
-"""From the frames of one stream, and the vehicle's telemetry, to the target.
+"""Estimate the target from the frames of one stream and the vehicle's telemetry.
 
-Flying, tracking, measuring the mounting and replaying all look through a `Perception`. It judges
-whether a frame can be a measurement, separates the fields of an interlaced one, runs each picture
-through the pipeline of `perchctl.vision` and keeps the memory that this needs.
+Flying, tracking, measuring the mounting and replaying all use a `Perception`. It decides whether a
+frame can be a measurement, separates the fields of an interlaced frame, runs each picture through
+the pipeline of `perchctl.vision`, and keeps the required memory.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ MIRRORED_FRAMES = 5
 
 @dataclass(eq=False)
 class Perception:
-    """The session that turns one stream's frames into the target's place.
+    """The session that estimates the target from the frames of one stream.
 
     Attributes:
-        stills: each frame is searched thoroughly, without memory of others.
-        history: the vehicle's telemetry; empty where there is no vehicle.
-        attitude: the vehicle's attitude by time, instead of the history's.
+        stills: each frame is searched thoroughly, without memory of other frames.
+        history: the vehicle's telemetry; empty without a vehicle.
+        attitude: function that returns the vehicle's attitude at a time; replaces the history's.
         state: the pipeline's memory.
-        calibration, motion: estimates, from pictures and telemetry, of latency and mounting, and
-            of the vehicle's motion.
-        refused: why a target was taken for another vehicle's; None if none was.
-        health: judges whether a frame can be a measurement at all.
+        calibration, motion: estimates, from pictures and telemetry, of latency and mounting, and of
+            the vehicle's motion.
+        refused: why a target was refused as another vehicle's; None if none was.
+        health: decides whether a frame can be a measurement at all.
     """
 
     pipeline: Pipeline
@@ -68,18 +68,19 @@ class Perception:
     refused: str | None = None
     health: FrameHealth = field(default_factory=FrameHealth)
     attitude: Callable[[float], Attitude | None] | None = None
-    _mirrored: int = 0  # frames with the target's mirror image since one showed the target
+    _mirrored: int = 0  # successive frames with the target's mirror image
 
     def exposure_s(self, frame: Frame) -> float:
-        """When a frame was exposed, s on the loop's clock, as far as the flight knows by then.
+        """Return the time of a frame's exposure, s on the loop's clock, as far as it is known.
 
-        The source stamps a frame with its arrival less the latency that the profile gives; what the
-        flight has measured beyond that is taken off here, and nowhere else."""
+        The source stamps a frame with its arrival minus the profile's latency. Only this function
+        subtracts the additional latency that the flight has measured.
+        """
         return frame.t_s - self.calibration.applied_delay_s
 
     def process_fields(self, frame: Frame) -> Iterator[tuple[Frame, PipelineOutput]]:
         """Yield each field of an interlaced frame, or the whole frame, with its time of exposure,
-        and the pipeline's output. `frame` is as its source gave it."""
+        and the pipeline's output. `frame` is the frame as received from its source."""
         used_s = self.calibration.applied_delay_s
         frame = replace(frame, t_s=self.exposure_s(frame)) if used_s else frame
         if self.stills:
@@ -107,27 +108,28 @@ class Perception:
         return self._mirrored >= MIRRORED_FRAMES
 
     def target(self, t_s: float, spread: bool = True) -> TargetEstimate | None:
-        """The target at `t_s` (now) for the vehicle's newest attitude; None before any sight.
-        Without `spread` the standard deviations remain those of the newest frame."""
+        """Return the target at `t_s` (now) for the vehicle's newest attitude; None before the first
+        sighting. Without `spread`, the standard deviations remain those of the newest frame."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_at(self.history, newest.t_s)
         return estimate(self.state, t_s, attitude, self.pipeline, spread=spread)
 
     @property
     def latency_sigma_s(self) -> float:
-        """Standard deviation of the latency in use; 0 for one that the profile gives."""
+        """Standard deviation of the latency in use, s; 0 for a latency set in the profile."""
         return 0.0 if self._measured_latency is None else self.calibration.delay_sigma_s
 
     def camera_errors(self) -> CameraErrors | None:
-        """Errors of latency and mounting by all pictures so far; None after too few pictures."""
+        """Return the errors of latency and mounting from all pictures so far; None if there are too
+        few."""
         return solve_consistency(self.calibration.sums, self._attitude_sigma_rad)
 
     def drop_sightings(self) -> None:
-        """Forget the sights from which the vehicle's motion is estimated."""
+        """Discard the sightings from which the vehicle's motion is estimated."""
         self.motion = drop_sightings(self.motion)
 
     def _calibrate(self, output: PipelineOutput, used_s: float) -> None:
-        # By the source's stamp: a latency that is being corrected must not move it.
+        # Use the source's stamp: a correction of the latency in progress must not change it.
         pose, t_s = self.state.measured.surest, output.detections.t_s + used_s
         if pose is None:
             return
@@ -160,7 +162,7 @@ class Perception:
 
     @property
     def _measured_latency(self) -> MeasuredLatency | None:
-        """The latency in use where the flight measures it, else None."""
+        """The latency in use if the flight measures it, else None."""
         camera, (least_s, most_s) = self.profile.camera, USED_LATENCY_S
         if camera.latency_s != "measured":
             return None

@@ -1,9 +1,9 @@
-"""Checks whether the pictures show the motion that the accelerometer measures.
+"""Check whether the pictures show the motion that the accelerometer measures.
 
-The way from the body to the target, turned by the attitude at the exposure, and the body's own
-motion by its accelerometer add up to one place, but for the speed at the window's begin and a
-constant offset. If pictures are later than assumed, or the camera is turned about the upward axis,
-the sum wanders; with the right delay or turn it comes to rest.
+The vector from the body to the target, rotated by the attitude at the exposure, plus the body's own
+motion from the accelerometer, is a fixed position, except for the unknown speed at the start of the
+window and a constant accelerometer offset. If the pictures are later than assumed, or if the camera
+is rotated about the upward axis, the sum moves; with the correct delay or rotation, it is at rest.
 """
 
 from __future__ import annotations
@@ -23,41 +23,47 @@ from perchctl.vehicle import Telemetry
 Vector = tuple[float, float, float]
 
 MISMATCH_WINDOW_S = 1.2
-"""Older sights are left out."""
+"""Age at which a sighting is dropped, s."""
 MISMATCH_LEAST_S = 0.6
-"""Time that the sights must span before they are judged. Larger: a mismatch is found later."""
+"""Time that the sightings must span for a judgement, s. Larger: a mismatch is found later."""
 MISMATCH_LEAST_SIGHTS = 8
-"""Number of sights, and of samples, below which none is judged. Larger: as `MISMATCH_LEAST_S`."""
+"""Number of sightings, and of samples, that a judgement requires. Larger: a mismatch is found
+later."""
 MISMATCH_PERIOD_S = 0.05
-"""Time between judgements. Smaller: judgements in a row rest on nearly the same sights."""
+"""Time between judgements, s. Smaller: successive judgements use nearly the same sightings."""
 AGREED = 3
-"""Number of judgements in a row that have to agree. Larger: a mismatch is found later. Smaller: one
-that is none is reported."""
+"""Number of successive judgements that must agree. Larger: a mismatch is found later. Smaller: a
+false mismatch is reported."""
 AGREED_MEASURED = 2
-"""The same for a latency that the flight measures: what is taken for an error wrongly is taken
-back, and at ten pictures a second a third judgement is a tenth of a second later."""
+"""The same number for a latency that the flight measures: a false correction is undone, and at ten
+pictures per second, a third judgement costs a tenth of a second."""
 STEP_S = 0.02
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
 TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
-"""The hypotheses are delays beyond the profile's, and turns of the camera at the delay in use."""
-OFFSET_MPS2, SIGMA_M = 0.2, 0.003  # sigma of the offset (with 1 deg of attitude) and of a sight
-LEAST_LATER_S = 0.1  # less swings an alignment by centimetres, and is reported after the flight
+"""The hypotheses: delays beyond the profile's without rotation, then rotations of the camera at the
+delay in use."""
+# standard deviations of the offset (with 1 deg of attitude) and of a sighting
+OFFSET_MPS2, SIGMA_M = 0.2, 0.003
+# a smaller error makes an alignment oscillate by centimetres and is reported after the flight
+LEAST_LATER_S = 0.1
 BEYOND_S = 0.03
-"""What a measured latency may seem to be beyond those that can be used: the grid's step, and a
-picture's jitter. Larger: what cannot be corrected is taken for what can."""
+"""Tolerance of a measured latency beyond the usable range, s: the step of the grid plus a picture's
+jitter. Larger: an error that cannot be corrected counts as correctable."""
 MEASURED_LATER_S = 0.03
-"""A smaller error of a latency that the flight measures is left to the finer, slower estimate of
-`perchctl.perception.online_calibration`. Larger: an alignment swings for longer. Smaller: the
-grid's step and the jitter of single pictures are taken for an error."""
-WANDERS_M, WANDERS_MORE = 0.005, 3.0  # by so much, and so much more than with the right delay
-ROUGH_M = 0.03  # a sum that wanders so far within a second gives the speed to 0.05 m/s
+"""Smallest error of a measured latency that is corrected here, s; a smaller one is left to the more
+accurate, slower estimate in `perchctl.perception.online_calibration`. Larger: an alignment
+oscillates for longer. Smaller: the step of the grid and the jitter of single pictures count as an
+error."""
+# m, and ratio to the motion with the right delay, that show a mismatch
+WANDERS_M, WANDERS_MORE = 0.005, 3.0
+ROUGH_M = 0.03  # a sum that moves by this much within a second yields the speed to 0.05 m/s
 ALIKE_S = 3 * STEP_S
 
 
 @dataclass(frozen=True)
 class MeasuredLatency:
     """A latency that the flight measures, in seconds beyond the profile's: the one in use, and the
-    least and the largest that can be used."""
+    smallest and largest usable one."""
 
     in_use_s: float
     least_s: float
@@ -70,11 +76,11 @@ class MeasuredLatency:
 
 @dataclass(frozen=True, eq=False)
 class FeltSamples:
-    """What the hypotheses need of telemetry samples, kept from one sight to the next, since to work
-    it out for all of two seconds takes as long as the fit itself.
+    """The values of telemetry samples that the hypotheses need, cached between sightings because
+    computing them for two seconds takes as long as the fit itself.
 
     Attributes:
-        rows: (n, 7) of each sample: time, roll, pitch, yaw, and the acceleration in world axes.
+        rows: (n, 7) for each sample: time, roll, pitch, yaw, and the acceleration in world axes.
     """
 
     samples: tuple[Telemetry, ...] = ()
@@ -82,8 +88,8 @@ class FeltSamples:
     rows: Array = field(default_factory=lambda: np.empty((0, 7)))
 
     def of(self, samples: tuple[Telemetry, ...], offset_g: Vector) -> FeltSamples:
-        """The same for these samples, oldest first, of which the first ones may be known already,
-        and for what the accelerometer reads too much."""
+        """Return the values for these samples, oldest first, and for the accelerometer's offset
+        `offset_g`; rows that are known already are reused."""
         begin = bisect.bisect_left(self.samples, samples[0].t_s, key=attrgetter("t_s"))
         known = len(self.samples) - begin
         if self.offset_g != offset_g or self.samples[begin:] != samples[:known]:
@@ -98,28 +104,29 @@ class FeltSamples:
 
 @dataclass(frozen=True)
 class VisualInertialWindow:
-    """The sights of the last `MISMATCH_WINDOW_S`, and the mismatch and motion that they show.
+    """The sightings of the last `MISMATCH_WINDOW_S`, and the mismatch and motion that follow from
+    them.
 
-    Times and delays are relative to the profile's latency. `mismatch` is for the planner, None
-    while there is none, or one that is corrected; `correction_s` is the delay by which a measured
-    latency is to be corrected, None while the latency in use fits.
+    Times and delays are relative to the profile's latency. `mismatch` is for the planner: None if
+    there is none, or if it is being corrected. `correction_s` is the delay to which a measured
+    latency should be corrected, None while the latency in use fits.
     """
 
-    sights: tuple[tuple[float, Vector], ...] = ()  # time, way from body to target, body axes, m
+    sights: tuple[tuple[float, Vector], ...] = ()  # time, vector from body to target, body axes, m
     judged_s: float = -math.inf
-    latest: Mismatch | None = None  # the newest judgement; once enough agree, it stays
+    latest: Mismatch | None = None  # newest judgement; once enough judgements agree, it stays
     latest_s: float = -math.inf
-    agree_count: int = 0  # judgements in a row that say the same
+    agree_count: int = 0  # number of successive judgements that agree
     is_corrected: bool = False  # `latest` is an error of a measured latency
-    in_use_s: float = 0.0  # the delay from which `mismatch` counts
-    motion: VisualInertialMotion | None = None  # the newest in which the sum wandered by at most
-    motion_within_m: float = WANDERS_M  # ... this
+    in_use_s: float = 0.0  # delay relative to which `mismatch` is given
+    motion: VisualInertialMotion | None = None  # newest motion for which the sum moved by at most
+    motion_within_m: float = WANDERS_M  # this distance
     felt: FeltSamples = field(default_factory=FeltSamples, compare=False, repr=False)
 
     @property
     def mismatch(self) -> Mismatch | None:
-        """The newest mismatch, once enough judgements in a row agree; None before that, and for
-        one that is corrected. Its `later_s` counts from the latency in use."""
+        """The newest mismatch, once enough successive judgements agree; None before that, and for
+        one that is being corrected. Its `later_s` is relative to the latency in use."""
         if self.latest is None or self.is_corrected or self.agree_count < AGREED:
             return None
         later_s = 0.0 if self.latest.turn_rad else self.latest.later_s - self.in_use_s
@@ -127,13 +134,14 @@ class VisualInertialWindow:
 
     @property
     def correction_s(self) -> float | None:
-        """What a measured latency is beyond the profile's, where that is not the one in use."""
+        """The measured latency beyond the profile's if it differs from the latency in use, else
+        None."""
         enough = self.is_corrected and self.agree_count >= AGREED_MEASURED
         return self.latest.later_s if self.latest is not None and enough else None
 
 
 def drop_sightings(old: VisualInertialWindow) -> VisualInertialWindow:
-    """The window without its sights; from now on the window accepts a rougher motion."""
+    """Return the window without its sightings; from now on, it accepts a less accurate motion."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
@@ -145,13 +153,13 @@ def estimate_motion(
     offset_g: Vector,
     measured: MeasuredLatency | None = None,
 ) -> VisualInertialWindow:
-    """The window with one more sight, `body_to_target_m` in body axes at `t_s`.
+    """Return the window with one more sighting, `body_to_target_m` in body axes at `t_s`.
 
     Args:
-        t_s: the sight's arrival less the profile's latency.
+        t_s: arrival of the sighting minus the profile's latency.
         samples: telemetry of the last 2 s, oldest first.
-        offset_g: what the accelerometer reads too much.
-        measured: the latency in use, with `camera.latency_s: measured`; without it the latency is
+        offset_g: offset of the accelerometer.
+        measured: the latency in use with `camera.latency_s: measured`; without it, the latency is
             the profile's, and a mismatch stays.
     """
     kept = tuple(s for s in old.sights if t_s - MISMATCH_WINDOW_S <= s[0] < t_s)
@@ -164,10 +172,11 @@ def estimate_motion(
     wanders_m, upwards_m, velocity_mps, bias_mps2 = fit_hypotheses(
         new.sights, new.felt, hypotheses_s
     )
-    if old.mismatch is None or measured is not None:  # else it stays
+    if old.mismatch is None or measured is not None:  # otherwise the mismatch stays
         found, before = _found(wanders_m, hypotheses_s, measured), old.latest
         if found is None and measured is not None:
-            # An ascent hardly moves sideways. No turn of the camera shows upwards.
+            # An ascent has little lateral motion. A rotation of the camera does not show
+            # vertically.
             found = _found(np.hypot(wanders_m, upwards_m), hypotheses_s, measured)
             found = None if found is not None and found.turn_rad else found
         agreed = 0 if found is None else 1
@@ -198,22 +207,23 @@ def estimate_motion(
 
 
 def delay_hypotheses(in_use_s: float) -> Array:
-    """The delay of each hypothesis, s, (n,); those of `TURNS_RAD` have the one in use."""
+    """Return the delay of each hypothesis, s, (n,); those of `TURNS_RAD` have the delay in use."""
     return np.concatenate([_DELAYS_S, np.full(len(_QUARTERS_RAD), in_use_s)])
 
 
 def _best_about(mismatch: Mismatch, wanders_m: Array, later_s: Array) -> int:
-    """The index that wanders least among those that are no other mismatch."""
+    """Return the index with the least motion among the hypotheses close to `mismatch`."""
     about = np.abs(later_s - mismatch.later_s) < LEAST_LATER_S
     about &= mismatch.turn_rad == TURNS_RAD
     return int(np.argmin(np.where(about, wanders_m, np.inf)))
 
 
 def _found(wanders_m: Array, later_s: Array, measured: MeasuredLatency | None) -> Mismatch | None:
-    """The mismatch that explains the pictures; None if the latency in use does, or one near it.
+    """Return the mismatch that explains the pictures; None if the latency in use does, or one close
+    to it.
 
-    A measured latency is looked for among those that can be used first: for a moment after the
-    lift-off any delay explains a target that stood still.
+    A measured latency is first searched among the usable ones: just after the lift-off, any delay
+    explains a target that stood still.
     """
     in_use_s, least_later_s = 0.0, LEAST_LATER_S
     best = int(np.argmin(wanders_m))
@@ -232,8 +242,8 @@ def _found(wanders_m: Array, later_s: Array, measured: MeasuredLatency | None) -
 
 
 def _refined_s(wanders_m: Array, later_s: Array, best: int) -> float:
-    """The delay at which a parabola through the squares about the `best` of `_DELAYS_S` is least;
-    that of the grid at its ends, and for a turn."""
+    """Return the delay at the minimum of a parabola through the squares around the `best` of
+    `_DELAYS_S`; the grid's delay at its ends, and for a rotation."""
     if not 0 < best < len(_DELAYS_S) - 1:
         return float(later_s[best])
     before, here, after = np.square(wanders_m[best - 1 : best + 2]).tolist()
@@ -246,11 +256,12 @@ def fit_hypotheses(
     felt: FeltSamples,
     later_s: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """The motion under each of n hypotheses: the delay `later_s[i]` and camera turn `TURNS_RAD[i]`.
+    """Fit the motion under each of n hypotheses: the delay `later_s[i]` and the rotation
+    `TURNS_RAD[i]`.
 
-    `sights`: times, and ways from body to target, m, body axes. Returns the target's apparent
-    motion, rms in m, sideways (n,) and upwards (n,); the vehicle's velocity at the newest sample,
-    m/s, (3, n); and the offset of its acceleration, m/s2, (3, n).
+    `sights` are times, and vectors from body to target, m, body axes. Returns the target's apparent
+    motion, rms in m, lateral (n,) and vertical (n,); the vehicle's velocity at the newest sample,
+    m/s, (3, n); and the offset of its acceleration, m/s^2, (3, n).
     """
     stamps_s, attitudes, forces = felt.rows[:, 0], felt.rows[:, 1:4].copy(), felt.rows[:, 4:]
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])
@@ -267,7 +278,7 @@ def fit_hypotheses(
     x, y = _turned(x, y, yaw)
     x, y, z = (a + np.interp(then_s, stamps_s, b) for a, b in zip((x, y, z), moved.T, strict=True))
 
-    # What is left of both beyond a place, a speed and an offset.
+    # Residual of both after the fit of a position, a speed and an offset.
     u = seen_s - seen_s.mean()
     unknown = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
     known = np.diag([0.0, 0.0, (SIGMA_M / OFFSET_MPS2) ** 2])
@@ -288,6 +299,6 @@ def _turned(a: Array, b: Array, by_rad: Array) -> tuple[Array, Array]:
 
 
 def _integral(t_s: Array, values: Array) -> Array:
-    """The integral by trapezia, (n, k); 0 at the first."""
+    """Return the integral by the trapezoid rule, (n, k); 0 at the first sample."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
