@@ -1,8 +1,8 @@
-"""A motion-capture system behind the library `motioncapture`, in a process of its own.
+"""Read a motion-capture system with the library `motioncapture`, in a separate process.
 
-What "not seen" means differs: Vicon, OptiTrack and Qualisys send each frame whole and leave a
-hidden body out; VRPN sends one body at a time, nothing of a hidden one, and does not say when
-its server is gone. So with VRPN silence is all that can be told.
+The systems differ in how they report a hidden body. Vicon, OptiTrack and Qualisys send complete
+frames and omit a hidden body. VRPN sends one body at a time, nothing for a hidden one, and does not
+report that its server is gone. With VRPN, only the silence can be detected.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from perchctl.profile import PositioningConfig
 
 CAPTURE_SILENT_S = 0.3
 LATE_S = 0.5
-"""So long after a burst of late frames it still explains that no frame is used."""
+"""Time after a burst of late frames during which it explains why no frame is used, s."""
 KEPT = 64
-"""Frames that wait to be read; older ones fall out."""
+"""Largest number of frames that wait to be read; older ones are dropped."""
 LONGEST_LINE = 300
 UP_TIMEOUT_S = 15.0
-"""For the child's Python to start: a busy computer is no silent motion capture."""
+"""Time for the child's Python to start, s: a busy computer is not a silent motion capture."""
 _END_TIMEOUT_S = 2.0
 _PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
 _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
@@ -41,9 +41,9 @@ _CHILD = "from perchctl.positioning.capture import serve_parent; serve_parent()"
 
 @dataclass(frozen=True)
 class CaptureSetup:
-    """The child process's connection: the library's name of the system, and options for it.
+    """The connection of the child process: the library's name of the system, and options for it.
 
-    `skip_empty`: drop frames without a body, which the library returns without any arrival.
+    `skip_empty` drops frames without a body, which the library returns without any arrival.
     """
 
     kind: str
@@ -54,7 +54,8 @@ class CaptureSetup:
 
 @dataclass(frozen=True)
 class CaptureFailure:
-    """The library's failure, with its message; `is_loaded` is False if Python cannot import it."""
+    """A failure of the library, with its message; `is_loaded` is False if Python cannot import
+    it."""
 
     text: str
     is_loaded: bool = True
@@ -62,14 +63,15 @@ class CaptureFailure:
 
 @dataclass(frozen=True)
 class LateFrames:
-    """Frames after a pause of `pause_s` are not used: how long they have waited is not known.
-    `count`: how many came at once after the pause before; 0 if these were no burst."""
+    """Frames after a pause of `pause_s`, which are not used because their waiting time is unknown.
+    `count` is the number of frames that arrived at once after the previous pause; 0 if they were no
+    burst."""
 
     count: int
     pause_s: float
 
     def text(self, who: str) -> str:
-        """What is wrong with the capture `who`, and what to do."""
+        """Return what is wrong with the capture `who`, and what to do."""
         if self.count == 0:
             return (
                 f"{who} has paused for {self.pause_s:.2f} s, and a frame after a pause may be old: "
@@ -87,8 +89,8 @@ class LateFrames:
 
 
 def capture_setup(config: PositioningConfig) -> CaptureSetup:
-    """The child process's connection. Vicon and VRPN take a port in the host's name, the other
-    systems as a separate option."""
+    """Return the connection of the child process. Vicon and VRPN take the port as a part of the
+    host's name, the other systems as a separate option."""
     options = {"hostname": config.host.strip()}
     name, colon, port = options["hostname"].rpartition(":")
     if colon and config.system in _PORT_OPTION and port.isdecimal():
@@ -99,11 +101,11 @@ def capture_setup(config: PositioningConfig) -> CaptureSetup:
 def open_capture(
     config: PositioningConfig, clock: Callable[[], float] = time.monotonic
 ) -> CaptureSource:
-    """The motion capture once it is connected and its first frame has come. Your own source,
-    ``my_module:MySource``, is called with `clock` and `config`.
+    """Return the motion capture once it is connected and its first frame has arrived. Your own
+    source, ``my_module:MySource``, is called with `clock` and `config`.
 
-    Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
-    without an answer in `config.connect_timeout_s`.
+    Raises InvalidValue, UsageError if the library cannot be loaded, and ConnectionFailed without an
+    answer within `config.connect_timeout_s`.
     """
     PositionFeed.check_config(config)
     if ":" in config.system:
@@ -115,11 +117,11 @@ def open_capture(
 
 
 class MotionCapture:
-    """A `perchctl.positioning.feed.CaptureSource`, whose child process ends with it.
+    """A `perchctl.positioning.feed.CaptureSource` whose child process ends with it.
 
-    `who` names the capture in sentences; `poll` prefers a frame that shows `body`.
-    Creating it waits for the first frame. Errors: ConnectionFailed, UsageError for a library that
-    does not load.
+    `who` names the capture in messages; `poll` prefers a frame that contains `body`. The
+    constructor waits for the first frame. It raises ConnectionFailed, and UsageError if the library
+    cannot be loaded.
     """
 
     def __init__(
@@ -128,8 +130,8 @@ class MotionCapture:
         self._setup, self._who, self._body, self._clock = setup, who, body, clock
         self._frames: deque[CaptureFrame] = deque(maxlen=KEPT)
         self._framed_s: float | None = None
-        self._late: tuple[float, LateFrames] | None = None  # when it was heard of
-        self._settled = threading.Event()  # by a first frame, or an end before it
+        self._late: tuple[float, LateFrames] | None = None  # time of its arrival, and message
+        self._settled = threading.Event()  # set by the first frame, or by an end before it
         self._closed = False
         self._ended: str | None = None
         self._failed: CaptureFailure | None = None
@@ -144,14 +146,15 @@ class MotionCapture:
             raise
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame since the last call, preferably with the body; None without a frame."""
+        """Return the newest frame since the last call, preferably with the body; None without a
+        frame."""
         frames = self.frames()
         return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
             frames[-1] if frames else None
         )
 
     def frames(self) -> list[CaptureFrame]:
-        """All frames since the last `frames` or `poll`, oldest first."""
+        """Return all frames since the last `frames` or `poll`, oldest first."""
         return [self._frames.popleft() for _ in range(len(self._frames))]
 
     def problem(self, now_s: float) -> str | None:
@@ -166,7 +169,7 @@ class MotionCapture:
         return f"{self._who} has sent {what} for {silent_s:.1f} s"
 
     def close(self) -> None:
-        """End the child process, wherever in its library it is, in bounded time."""
+        """End the child process in bounded time, whatever its library is doing."""
         self._closed = True
         if self._child.poll() is None:
             self._child.kill()
@@ -231,7 +234,7 @@ class MotionCapture:
         return f"{'no ' if self._framed_s is None else ''}{self._who}"
 
     def _read_output(self) -> None:
-        """Read all output, so that the child never waits; keep its last line."""
+        """Read all output, so that the child never blocks, and keep its last line."""
         output = self._child.stdout
         assert output is not None
         for raw in iter(lambda: output.readline(LONGEST_LINE), b""):
@@ -242,54 +245,59 @@ class MotionCapture:
         return f": {self._last_line}" if self._last_line else ""
 
 
-# --- The child process in which the library of motion capture runs, away from the flight ---
-# Some of its systems wait in `connect` for ever, without letting any other thread of their process
-# run, and some end the process without a word (docs/positioning.md). Here that stops nobody.
+# --- The child process that runs the motion-capture library ---
+# Some systems of the library wait in `connect` forever without letting any other thread of their
+# process run, and some end the process without a message (docs/positioning.md). In a child process,
+# neither stops the flight.
 
 
 START_TIMEOUT_S = 30.0
 MOST_HZ = 500.0
-"""No system is faster; what comes faster is not a measurement, and would keep the parent busy."""
+"""Largest frame rate, Hz. No system is faster; faster frames are not measurements and would keep
+the parent busy."""
 QUEUE_PAUSE_S = 0.1
-"""After a pause as long as this the library may hand out what waited in its queue."""
+"""Length of a pause after which the library may return frames that waited in its queue, s."""
 AT_ONCE_S = 1e-3
-"""Frames closer than this waited in the queue: no system sends so fast."""
+"""Time between frames below which they waited in the queue, s: no system sends so fast."""
 
 Bodies = dict[str, tuple[tuple[float, float, float], tuple[float, float, float, float]]]
-"""Position and quaternion (w, x, y, z) by name: nothing of the library travels."""
+"""Position and quaternion (w, x, y, z) by name; no objects of the library cross the process
+boundary."""
 
 
 def serve_parent() -> None:
-    """Send the capture's frames to the parent process until it ends, or the library fails."""
+    """Send the capture's frames to the parent process until it ends or the library fails."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_to_parent()
     setup = channel.receive(START_TIMEOUT_S)
     is_loaded = False
-    # A library that lets no thread have a turn outlives a parent that was killed, but not this.
+    # A library that blocks all threads survives the end of the parent, but not this timer.
     faulthandler.dump_traceback_later(setup.timeout_s + 1.0, exit=True)
     try:
         import motioncapture
 
         is_loaded, options = True, setup.options
-        if setup.kind == "optitrack":  # its reader knows no names
+        if setup.kind == "optitrack":  # its reader does not resolve names
             options = options | {"hostname": socket.gethostbyname(options["hostname"])}
         client = motioncapture.connect(setup.kind, options)
         faulthandler.cancel_dump_traceback_later()
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.skip_empty)
-    except Exception as error:  # of the library, or of its imports
-        with contextlib.suppress(OSError):  # the parent may be gone
+    except Exception as error:  # errors of the library, or of its imports
+        with contextlib.suppress(OSError):  # the parent may have ended
             channel.send(CaptureFailure(str(error) or type(error).__name__, is_loaded))
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
-    """Send frames as they come, but none of an unknown age.
+    """Send frames as they arrive, but none of an unknown age.
 
-    After a pause the library may hand out what has waited in its queue: the first frame, and each
-    that then comes without any waiting, is not passed on. The parent is told why.
+    After a pause, the library may return frames that waited in its queue. The first frame, and each
+    further one that arrives without any waiting, is therefore not sent, and the parent receives the
+    reason.
     """
     sent_s, behind = -1.0, False
-    began_s, newest_s, count = -1.0, -1.0, 0  # of the frames since the last pause
+    # start, newest and count of the frames since the last pause
+    began_s, newest_s, count = -1.0, -1.0, 0
     while True:
         asked_s = time.monotonic()
         client.waitForNextFrame()
@@ -313,7 +321,8 @@ def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
 
 
 def _end_with(channel: Channel) -> None:
-    """End the process with the parent, which never speaks again; the library may be anywhere."""
+    """End the process with the parent, which sends nothing more; the library may be blocked
+    anywhere."""
     with contextlib.suppress(EOFError, OSError):
         channel.recv()
     os._exit(0)

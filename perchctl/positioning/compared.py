@@ -1,8 +1,9 @@
-"""What a comparison by hand found of a motion capture (`perchctl check --lift`), kept for `fly`.
+"""The result of comparing a motion capture with the vehicle by hand (`perchctl check --lift`),
+stored for `fly`.
 
-Swapped axes do not show on a vehicle that stands as when its body was defined; only a hand that
-lifts and turns it tells. So each comparison is written down for its very vehicle and set-up, and a
-flight asks for one that passed, at most `VALID_S` old.
+Swapped axes do not show while a vehicle stands as it did when its body was defined; they show only
+when it is lifted and rotated by hand. Each comparison is therefore stored for its vehicle and
+set-up, and a flight requires one that passed at most `VALID_S` ago.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from perchctl.profile import PositioningConfig
 
 VALID_S = 24 * 3600.0
 CLOCK_ADJUSTMENT_S = 60.0
-"""A computer's clock is set by so much, now and then."""
+"""Largest adjustment of the computer's clock that is not an error, s."""
 AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 _TRUE_OF = {"system", "host", "body", "body_rpy_deg", "body_position_m"}
 
 
 class CaptureComparison(BaseModel):
-    """The result of comparing one vehicle with its motion capture by hand, as its file stores it.
+    """The result of comparing one vehicle with its motion capture by hand, in the form of its file.
 
-    `set_up` identifies vehicle, capture, body and mounting of the body; the result holds for that
-    set-up only. `at` is None if no comparison was made; `found`: the result in words.
+    `set_up` identifies vehicle, capture, body and mounting of the body; the result applies to that
+    set-up only. `at` is None if no comparison was made. `found` is the result in words.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -42,7 +43,7 @@ class CaptureComparison(BaseModel):
     found: str = ""
 
     def objection_and_advice(self, now: datetime) -> tuple[str, str] | None:
-        """Return why no flight may rely on this comparison, and what to do; None if it passed, at
+        """Return why no flight may rely on this comparison, and what to do; None if it passed at
         most `VALID_S` ago. `now` has a time zone, in which dates are shown."""
         if self.at is None:
             return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
@@ -56,7 +57,7 @@ class CaptureComparison(BaseModel):
         return None
 
     def text(self, now: datetime) -> str:
-        """The comparison's date in words."""
+        """Return the comparison's date in words."""
         assert self.at is not None
         return f"compared by hand on {self.at.astimezone(now.tzinfo):%d %b %Y %H:%M}"
 
@@ -66,13 +67,14 @@ def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:
 
 
 def comparison_path(config: PositioningConfig, vehicle: str) -> Path:
-    """A vehicle's comparison file; `vehicle` is as `perchctl.link.vehicle_uri` has it."""
+    """Return the path of a vehicle's comparison; `vehicle` is in the form of
+    `perchctl.link.vehicle_uri`."""
     of = repr(_set_up(config, vehicle)).encode()
     return user_folder("state") / "compared" / f"{hashlib.sha256(of).hexdigest()[:16]}.json"
 
 
 def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureComparison:
-    """The vehicle's comparison in this set-up; with `at` None if no file can be read."""
+    """Return the vehicle's comparison in this set-up; its `at` is None if no file can be read."""
     none = CaptureComparison(set_up=_set_up(config, vehicle))
     try:
         kept = CaptureComparison.model_validate_json(comparison_path(config, vehicle).read_bytes())
@@ -84,9 +86,9 @@ def load_comparison(config: PositioningConfig, vehicle: str) -> CaptureCompariso
 def save_comparison(
     config: PositioningConfig, vehicle: str, at: datetime, passed: bool, found: str
 ) -> str | None:
-    """Write a comparison over the old comparison of this vehicle and set-up.
+    """Replace the stored comparison of this vehicle and set-up.
 
-    `at` has a time zone; `found`: the result in words. Returns None, or why the file could not be
+    `at` has a time zone; `found` is the result in words. Returns None, or why the file could not be
     written; then the old comparison is deleted if the new comparison did not pass.
     """
     path = comparison_path(config, vehicle)

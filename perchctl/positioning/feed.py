@@ -1,8 +1,9 @@
-"""Hands the vehicle its position from outside, or says why not.
+"""Send the vehicle its external position, or explain why it is not sent.
 
-What if a position is the last one, late, or sent twice? The vehicle's estimator takes each for
-the place where it is now. So nothing is repeated, nothing waits in a queue, and what the judge
-does not believe is not sent: the age grows, and the planner holds and lands by it (fault 10).
+Any position may be the last one, late, or a duplicate, and the vehicle's estimator takes each as
+its present position. Therefore, no position is repeated, none waits in a queue, and none that the
+validator rejects is sent. The age of the position then grows, and the planner holds or lands
+because of it (fault 10).
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z
 @dataclass(frozen=True)
 class BodyPose:
     """A rigid body's pose in the capture's world: the position of its origin, m, and the rotation
-    from its axes to the world's. As the system reports it, before the profile's offsets."""
+    from its axes to the world's, as the system reports them, before the profile's offsets."""
 
     position_m: tuple[float, float, float]
     quaternion: Quaternion
@@ -41,30 +42,31 @@ class BodyPose:
 
 @dataclass(frozen=True)
 class CaptureFrame:
-    """A frame that arrived at `t_s` on the loop's clock; a body that is occluded is not in it."""
+    """A frame that arrived at `t_s` on the loop's clock; an occluded body is not in it."""
 
     t_s: float
     bodies: Mapping[str, BodyPose] = field(default_factory=dict)
 
 
 class CaptureSource(Protocol):
-    """A motion-capture system, real or simulated; nothing in it blocks. One of your own is called
-    with the clock and the profile's section `positioning`."""
+    """A motion-capture system, real or simulated; none of its methods block. Your own source is
+    called with the clock and the profile's section `positioning`."""
 
     def poll(self, now_s: float) -> CaptureFrame | None:
-        """The newest frame that has arrived by `now_s`; None if no frame is new."""
+        """Return the newest frame that has arrived by `now_s`; None if no frame is new."""
 
     def problem(self, now_s: float) -> str | None:
-        """None while the system works; otherwise one sentence with the cause."""
+        """Return None while the system works; otherwise one sentence with the cause."""
 
     def close(self) -> None:
-        """Release it."""
+        """Release the source."""
 
 
 QUIET_S = 0.1
-"""Without a position for so long, or for two periods, it is said why."""
+"""Time without a position after which the status explains it, s; at least two periods."""
 FEED_HANG_S = 0.2
-"""The turns come every 10 ms, or as often as a simulated flight's loop turns."""
+"""Time without a poll after which the feed counts as blocked, s. Polls come every 10 ms, or once
+per tick in a simulated flight."""
 RATE_OVER_S = 1.0
 END_TIMEOUT_S = 1.0
 UNSEEN = "the target is not seen"
@@ -74,13 +76,14 @@ BUSY = "the link is busy with something else, and a position does not wait"
 
 @dataclass(frozen=True)
 class FeedStatus:
-    """The state of a position feed, which the flight loop reads in each turn.
+    """The state of a position feed, which the flight loop reads in each tick.
 
     `age_s`: time since the exposure of the newest position that was sent; inf before the first.
-    `problem`: None while positions are sent, else one sentence with the cause. `sent`: positions
-    sent so far; `rate_hz`: in the last second. `pose`: the newest position sent; `measured`: that
-    with its attitude, also where only the position is sent. `beside_m`: distance of the newest
-    sight from the estimate if it is too large to be believed, else 0.
+    `problem`: None while positions are sent, otherwise one sentence with the cause. `sent`: number
+    of positions sent so far; `rate_hz`: their rate in the last second. `pose`: the newest position
+    sent. `measured`: the same position with its attitude, even if only the position is sent.
+    `beside_m`: distance of the newest sighting from the estimate if it is too large to be accepted,
+    else 0.
     """
 
     age_s: float = math.inf
@@ -93,19 +96,20 @@ class FeedStatus:
 
 
 class SendingRate:
-    """Limits how often positions are sent, and counts them."""
+    """Limit the rate at which positions are sent, and count them."""
 
     def __init__(self, rate_hz: float) -> None:
         self.period_s = 1.0 / rate_hz
         self.count = 0
         self._due_s = -math.inf
-        self._times_s: deque[float] = deque()  # of the last `RATE_OVER_S`, and the newest
+        self._times_s: deque[float] = deque()  # times within the last `RATE_OVER_S`, and the newest
 
     def is_due(self, now_s: float) -> bool:
         return now_s >= self._due_s - 1e-6
 
     def note_sent(self, now_s: float) -> None:
-        """Note a sent position: a late call delays no later position, and is not made up for."""
+        """Record a sent position. A late call does not delay later positions and is not made up
+        for."""
         self._due_s = max(self._due_s + self.period_s, now_s)
         self.count += 1
         self._times_s.append(now_s)
@@ -113,19 +117,19 @@ class SendingRate:
             self._times_s.popleft()
 
     def silent_s(self, now_s: float) -> float:
-        """The seconds since the newest position was sent; infinite before the first."""
+        """Return the seconds since the newest position was sent; infinite before the first."""
         return now_s - self._times_s[-1] if self._times_s else math.inf
 
     def sent_hz(self, now_s: float) -> float:
-        """Return how many positions were sent in the last second."""
+        """Return the rate of positions in the last second, Hz."""
         return sum(now_s - t_s < RATE_OVER_S for t_s in self._times_s) / RATE_OVER_S
 
 
 class PositionFeed:
-    """Hands on the positions of a capture.
+    """Send the positions of a motion capture to the vehicle.
 
     `poll_and_send` is called every `PERIOD_S`: by a thread from `start` until `close`, or in
-    lockstep; `status` from any thread.
+    lockstep. `status` may be called from any thread.
     """
 
     PERIOD_S = 0.01
@@ -152,7 +156,7 @@ class PositionFeed:
     def check_config(config: PositioningConfig) -> None:
         """Raise InvalidValue without a host, UsageError without the library; opens nothing."""
         if ":" in config.system:
-            return  # your own source knows what it needs
+            return  # your own source checks its configuration itself
         if not config.host.strip():
             raise InvalidValue(
                 "positioning.host, the computer of the motion capture, is not given: write it into "
@@ -164,8 +168,8 @@ class PositionFeed:
             raise no_motion_capture()
 
     def start(self, clock: Callable[[], float]) -> None:
-        """Call `poll_and_send` in a thread from now on. `clock`: the flight loop's. A call may
-        hang in the link's library; then `status` says so."""
+        """Call `poll_and_send` in a thread from now on. `clock` is the flight loop's. If a call
+        blocks in the link's library, `status` reports it."""
 
         def run() -> None:
             due_s = clock()
@@ -178,29 +182,30 @@ class PositionFeed:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread: no position is sent any more. Does not wait for long."""
+        """End the thread, so that no more positions are sent. Waits for at most `END_TIMEOUT_S`."""
         self._closed.set()
         if self._thread is not None:
             self._thread.join(END_TIMEOUT_S)
 
     def stop(self) -> None:
-        """Send nothing from here on: the positions contradict the vehicle's own sensors."""
+        """Send nothing from now on: the positions contradict the vehicle's own sensors."""
         self._stopped = True
 
     def poll_and_send(self, now_s: float) -> None:
         """Poll the source, and send its position if it is plausible and due.
 
-        Raises nothing: after a failure the age in `status` grows, with the cause.
+        Raises nothing: after a failure, the age in `status` grows, with the cause.
         """
         try:
             problem = STOPPED if self._stopped else self._one(now_s)
-        except Exception as error:  # of a source or a link: the flight is ended by the age
+        except Exception as error:  # errors of source or link: the growing age ends the flight
             problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
         with self._lock:
             self._turned_s, self._problem = now_s, problem
 
     def sent_pose(self) -> VehiclePose | None:
-        """The newest pose that was sent, even if only its position was; None before that."""
+        """Return the newest pose that was sent, even if only its position was; None before the
+        first."""
         return self._placed
 
     def status(self, now_s: float) -> FeedStatus:
@@ -245,29 +250,30 @@ class PositionFeed:
         return f"no frame has come from {who} {for_s}"
 
 
-# --- Which of a capture's frames may be believed, and where the vehicle's body is in them ---
-# Motion capture fails in ways that look like data: a body that is hidden keeps its last pose,
-# two bodies swap their names, a symmetric one flips, a pose arrives late (faults 10 and 11).
-# Each is refused here, with one sentence that names it.
+# --- Validation of a capture's frames, and the vehicle's pose in them ---
+# Motion capture fails in ways that look like data: a hidden body keeps its last pose, two bodies
+# swap their names, a symmetric one flips, a pose arrives late (faults 10 and 11). Each is rejected
+# with one sentence that names the cause.
 
 
 STALE_FRAME_S = 0.05
-"""A frame that waited longer after its arrival is for another moment: a vehicle that climbs at
-0.5 m/s is 25 mm from there, five times what the capture is trusted for."""
+"""Waiting time after its arrival at which a frame is too old, s: a vehicle that climbs at 0.5 m/s
+has moved by 25 mm, five times the capture's assumed error."""
 UNIT_WITHIN = 0.01
-"""Of a quaternion's length; single precision keeps 1e-6."""
+"""Tolerance of a quaternion's length; single precision is accurate to 1e-6."""
 NOISE_M, NOISE_RAD = 0.05, math.radians(20.0)
-"""What a pose may move between two frames without the body having moved."""
+"""Largest change of a pose between two frames without motion of the body."""
 FASTEST_FALL_MPS = 5.0
-"""Speed that is allowed for the first moment: of a vehicle that falls 1.3 m. Smaller: its positions
-are refused."""
+"""Speed allowed for the first moment after a pose, m/s: that of a fall of 1.3 m. Smaller: the
+positions of a falling vehicle are rejected."""
 FASTEST_TIP_RADPS = 10.0
-"""The same for a vehicle that is pushed over."""
+"""Rotation rate allowed for the first moment, rad/s: that of a vehicle that is pushed over."""
 AT_FASTEST_S = 0.02
-"""The first moment, after which `HELD_MPS` and `HELD_RADPS` count. Larger: a pose that jumped is
-believed."""
+"""Length of the first moment, s, after which `HELD_MPS` and `HELD_RADPS` apply. Larger: a pose that
+jumped is accepted."""
 HELD_MPS, HELD_RADPS = 0.5, 1.0
-"""After that moment: without a position it is held where it is, and drifts."""
+"""Speed, m/s, and rotation rate, rad/s, allowed after the first moment: without positions, the
+vehicle holds and drifts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,8 +286,8 @@ class VehiclePose:
 
     @classmethod
     def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> VehiclePose:
-        """The vehicle's pose, from that of the capture's rigid body and the profile's
-        offset: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
+        """Return the vehicle's pose from the capture's rigid body and the profile's offset:
+        ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
         roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
         length = math.sqrt(sum(part * part for part in pose.quaternion))
         w, x, y, z = (part / length for part in pose.quaternion)
@@ -294,7 +300,8 @@ class VehiclePose:
 
 
 class PoseValidator:
-    """Checks each frame's pose for plausibility; keeps the last accepted and last rejected pose."""
+    """Check the pose in each frame for plausibility; keep the last accepted and last rejected
+    pose."""
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
@@ -304,12 +311,12 @@ class PoseValidator:
         self._believed: VehiclePose | None = None
         self._stranger: VehiclePose | None = None
         self.problem: str | None = None
-        """Why the newest frame with news was not believed; None if it was."""
+        """Why the newest frame with a new pose was rejected; None if it was accepted."""
 
     def validate(self, frame: CaptureFrame, now_s: float) -> VehiclePose | None:
-        """The vehicle's pose at the frame's exposure; None if it may not be sent, for the
+        """Return the vehicle's pose at the frame's exposure; None if it must not be sent, for the
         cause in `problem`, or if the frame is not new."""
-        arrived_s = min(frame.t_s, now_s)  # nothing arrives later than now
+        arrived_s = min(frame.t_s, now_s)  # no frame arrives in the future
         if not math.isfinite(arrived_s) or arrived_s <= self._arrived_s:
             return None
         self._arrived_s = arrived_s
@@ -326,8 +333,8 @@ class PoseValidator:
             self.problem = f"{self._who} has a pose that is none: {pose}"
             return None
         if pose == self._newest:
-            # Measured noise never repeats all seven numbers; a filter or a doubled frame may,
-            # for a frame or two, and then nothing is lost.
+            # Measurement noise never repeats all seven numbers. A filter or a duplicated frame may
+            # repeat them for a frame or two, which does no harm.
             if self._stranger is None:
                 self.problem = f"{self._who} is frozen: is it hidden, or the capture paused?"
             return None
@@ -337,11 +344,11 @@ class PoseValidator:
         )
 
     def _followed(self, placed: VehiclePose, now_s: float) -> VehiclePose | None:
-        """The pose, or None and a `problem` if no vehicle gets there so soon.
+        """Return the pose; None, with a `problem`, if no vehicle can get there in time.
 
-        Time does not make a jump true: poses near a refused one are refused too, until the body is
-        seen again where it was last believed. Meanwhile the age of the position grows, and ends
-        the flight.
+        Waiting does not make a jump plausible: poses near a rejected one are rejected too, until
+        the body is seen again near its last accepted pose. Meanwhile the age of the position grows
+        and ends the flight.
         """
         last, stranger = self._believed, self._stranger
         if last is not None:

@@ -1,14 +1,14 @@
-"""The printed target as the vehicle's positioning system: each measured pose becomes the body's
-place in a world fixed to the target, carried on by what the vehicle's estimate has moved since,
-and is handed to its estimator.
+"""The printed target as the vehicle's positioning system: convert each measured pose to the body's
+position in a world fixed to the target, add the motion of the vehicle's estimate since the
+exposure, and send the result to its estimator.
 
-The world is that of the vehicle at rest on the ground, where its estimate is reset: its origin is
-sent until the target was seen often enough from there, and where it is seen then it stays. So
-ground, fence and heights keep their meaning.
+The world is that of the vehicle at rest on the ground, where its estimate is reset. The world's
+origin is sent until the target was seen often enough from there; then the target's position is
+fixed. Ground, fence and heights thus keep their meaning.
 
-No exposure is sent twice, none out of order and none that is older than `OLDEST_S`; and
-what lies farther from the estimate than both can explain is not believed. The age grows, and the
-planner holds, sinks and comes down by it.
+No exposure is sent twice, none out of order, and none older than `OLDEST_S`. A position that is
+further from the estimate than the errors of both explain is rejected. Its age then grows, and the
+planner holds, sinks and lands because of it.
 """
 
 from __future__ import annotations
@@ -32,43 +32,48 @@ from perchctl.vision import (
 )
 
 GROUND_FRAMES = 15
-"""From rest, half a second of a camera of 30 Hz: their median is where the target is."""
+"""Number of frames at rest whose median is the target's position: half a second of a 30 Hz
+camera."""
 OLDEST_S = 0.3
 GATE_M, GATE_MPS, GATE_SIGMAS = 0.10, 0.35, 5.0
-"""What estimate and sight may be apart, and more for each second without a sight: blind for 2 s a
-vehicle is half a metre aside (docs/firmware.md, "Target as position")."""
+"""Allowed distance between estimate and sighting, m, and its growth per second without a sighting,
+m/s: after 2 s without one, a vehicle is displaced by half a metre (docs/firmware.md, "Target as
+position")."""
 GATE_LONGEST_S = 4.0
 WORST_SIGMA_M = 0.05
 LEARN_NEAR_M = 0.3
-"""Distance to the target up to which the difference of estimate and sights is learned within
-`LEARN_NEAR_S`."""
+"""Distance to the target below which the difference between estimate and sightings is learned with
+the time constant `LEARN_NEAR_S`, m."""
 LEARN_FAR_M = 1.0
-"""Distance from which on it is learned within `LEARN_FAR_S`: slower, since a pixel is more."""
+"""Distance above which it is learned with `LEARN_FAR_S`, m: more slowly, because a pixel is a
+larger distance."""
 LEARN_NEAR_S = 0.3
-"""Time constant near the target. Smaller: the noise of single sights is learned."""
+"""Time constant near the target, s. Smaller: the noise of single sightings is learned."""
 LEARN_FAR_S = 1.0
-"""The same far from it. Larger: a difference that changes is followed late."""
+"""Time constant far from the target, s. Larger: a changing difference is followed late."""
 NOWHERE = Place(np.zeros(3), 0.0)
-"""No difference between two places."""
+"""Zero difference between two places."""
 
 
 def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Place:
-    """The target's place by its pose in a picture and the body's attitude and position."""
+    """Return the target's place from its pose in a picture and the body's attitude and position."""
     return Place(*to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
 
 
 def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
-    """The body's place under a still target; of `attitude` only roll and pitch count."""
+    """Return the body's place below a stationary target; only roll and pitch of `attitude` are
+    used."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 
 class TargetFeed:
-    """Sends the vehicle's position by sights of the target, called by the flight loop's thread.
+    """Send the vehicle's position from sightings of the target; called by the flight loop's thread.
 
-    `target`: the target's place; None until it was seen from the ground. `off`: the body's place by
-    the sights less its estimate, averaged against noise: the estimator lags behind late positions.
+    `target` is the target's place, None until it was seen from the ground. `off` is the body's
+    place from the sightings minus its estimate, low-passed against noise: the estimator lags behind
+    late positions.
     """
 
     def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
@@ -93,7 +98,7 @@ class TargetFeed:
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:
-        """The position, m, of a level body with the gear in the target's centre and the
+        """Return the position, m, of a level body with the gear in the target's centre and the
         estimated heading `yaw_rad`; None before the target's place is known."""
         if self.target is None:
             return None
@@ -102,8 +107,8 @@ class TargetFeed:
         return float(x), float(y), float(z)
 
     def with_fixed_target(self, seen: TargetEstimate, attitude: Attitude) -> TargetEstimate:
-        """`seen` with the target where the feed knows it to be, in the state estimate's world as
-        the vehicle with this `attitude` has it; unchanged until the feed knows the place."""
+        """Return `seen` with the target at the place known to the feed, in the world frame of the
+        state estimate, for a vehicle with this `attitude`; unchanged while the place is unknown."""
         if self.target is None:
             return seen
         world_m = self.target.position_m - self.off.position_m
@@ -116,12 +121,12 @@ class TargetFeed:
     def add_pose(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool
     ) -> None:
-        """Send the vehicle's position by a pose of this turn's picture; while the target's place is
-        unknown, learn it instead if the vehicle is `at_rest`. `then`, `now`: the vehicle's attitude
-        and estimated position at the exposure and at `now_s`."""
+        """Send the vehicle's position from a pose in this tick's picture. While the target's place
+        is unknown, learn it instead if the vehicle is `at_rest`. `then` and `now` are the vehicle's
+        attitude and estimated position at the exposure and at `now_s`."""
         if pose.t_s <= self._seen_s:
             return
-        # A known place may be newer than a picture that is still on its way.
+        # A known position may be newer than a picture that has not arrived yet.
         silent_s = max(0.0, min(pose.t_s - max(self._seen_s, self._placed_s), GATE_LONGEST_S))
         if self.target is None:
             self._seen_s = pose.t_s
@@ -143,7 +148,8 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """The feed's status; a target not seen from the ground is a problem, too."""
+        """Return the feed's status; a target that was not seen from the ground is a problem,
+        too."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None
@@ -160,7 +166,7 @@ class TargetFeed:
     def _refused(
         self, pose: MarkerPose, place: Place, then: Attitude, silent_s: float, now_s: float
     ) -> str:
-        """Say why a sight is not believed; an empty string if it is."""
+        """Return why a sighting is rejected; an empty string if it is accepted."""
         age_s, sigma_m = now_s - pose.t_s, float(np.max(pose.sigma_m))
         self._beside_m = 0.0
         if not age_s <= OLDEST_S:
@@ -194,8 +200,8 @@ class TargetFeed:
         )
 
     def _hand_over(self, place: ExternalPosition, placed_s: float, now_s: float) -> None:
-        """Send a place; `placed_s`: when the body was there. What comes too soon waits for nothing:
-        the next one is newer."""
+        """Send a place; `placed_s` is the time at which the body was there. A place that is not due
+        is dropped because the next one is newer."""
         if self._rate.is_due(now_s) and self._send(place) is not False:
             self._rate.note_sent(now_s)
             self._placed_s, self._pose = placed_s, place
