@@ -1,8 +1,8 @@
-"""Disarming at the end of a session, for each kind of link.
+"""Disarm the vehicle at the end of a session, for every kind of link.
 
-A vehicle that does not arm itself turns its propellers for as long as it is armed, on the ground,
-too. `perchctl.flight` arms it once everything else is ready; whatever ends the session on the
-ground, the link disarms it as it closes.
+A vehicle that does not arm itself spins its propellers while it is armed, even on the ground.
+`perchctl.flight` arms it once everything else is ready. Whatever ends the session on the ground,
+the link disarms the vehicle as it closes.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from perchctl.vehicle import (
 )
 
 DISARM_S = 2.0
-"""The order is repeated for so long. A longer time delays the end of a session without a radio, a
-shorter one gives up on a radio that is silent for a moment."""
+"""Time for which the order is repeated, s. Larger: without a radio, the end of a session is
+delayed. Smaller: a radio that is silent for a moment is given up."""
 DISARM_PERIOD_S = 0.1
 ANSWERED_S = 0.1
-"""A sample that is so much younger than the order shows its effect: the supervisor has 40 ms."""
+"""Time after the order from which a sample shows its effect, s: the supervisor reacts within 40
+ms."""
 
 
 def disarm(
@@ -36,18 +37,19 @@ def disarm(
     *,
     was_ordered: bool,
 ) -> bool:
-    """Disarm a vehicle on the ground until its telemetry says so; bounded by `DISARM_S`.
+    """Disarm a vehicle on the ground until its telemetry confirms it; bounded by `DISARM_S`.
 
     Nothing is sent to a vehicle that arms itself, or that nobody has armed. The order is sent only
-    while fresh telemetry says that the vehicle does not fly: in the air it would cut the motors,
-    and the flying bit outlives them by 2 s. Returns False if the vehicle may still be armed.
+    while fresh telemetry says that the vehicle does not fly: in the air, it would cut the motors.
+    The flying bit stays set for 2 s after they stop. Returns False if the vehicle may still be
+    armed.
 
     Args:
-        newest: the newest telemetry, None if there was none.
-        send: hands an order to the vehicle, behind those before it.
-        clock, wait: the present time, s, and how to let seconds pass.
-        was_ordered: this session has sent `Arm(True)`, which may take effect any moment: then only
-            a sample from after the order to disarm is believed.
+        newest: function that returns the newest telemetry, None without any.
+        send: function that sends an order to the vehicle, after the orders before it.
+        clock, wait: functions that return the present time, s, and wait for some seconds.
+        was_ordered: this session has sent `Arm(True)`, which may take effect at any time; then only
+            a sample from after the order to disarm counts.
     """
     end_s, ordered_s = clock() + DISARM_S, None
     while True:
@@ -68,7 +70,7 @@ def disarm(
 
 
 def warn_of_armed(vehicle: str) -> None:
-    """Tell people that the vehicle may still be armed."""
+    """Warn that the vehicle may still be armed."""
     warnings.warn(
         f"{vehicle} may still be armed: keep away until its propellers stand still",
         Note,

@@ -1,9 +1,9 @@
-"""A Crazyflie behind cflib, simulated or real: the flight's only way to the radio.
+"""Connect a simulated or real Crazyflie with cflib: the flight's only access to the radio.
 
-Nothing here blocks without a bound, nothing blocking is called from cflib's
-callbacks, and the link is closed only when nothing flies: `close_link` sends a
-zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints stop").
-A radio that falls silent is waited for, and a driver that has ended is opened again.
+No call blocks without a bound, and cflib's callbacks make no blocking calls. The link is closed
+only when nothing flies: `close_link` sends a zero setpoint, which drops a flying vehicle
+(docs/firmware.md, "When setpoints stop"). perchctl waits for a radio that falls silent, and reopens
+a driver that has ended.
 """
 
 from __future__ import annotations
@@ -59,16 +59,17 @@ from perchctl.vehicle import (
 SILENCE_S = 1.5
 DRAIN_S = 1.0
 UNHEARD_S = 0.5
-"""What went out so long before the vehicle was last heard is taken for lost with the link."""
+"""Time before the vehicle was last heard, s, from which on packets count as lost with the link."""
 FAREWELL = RawThrust(0)
-"""What cflib's `close_link` sends."""
+"""The command that cflib's `close_link` sends."""
 
 
 class CflibLink:
     """`perchctl.link.protocol.Link` on an unmodified cflib.
 
-    `connection` is None unless connected. `landing_wait_s`: how long `close` waits for a vehicle
-    that still flies. `positioning`: unless by decks, the estimator is set to external positions.
+    `connection` is None while not connected. `landing_wait_s` is the time for which `close` waits
+    for a vehicle that still flies. Unless `positioning` uses decks, the estimator is configured for
+    external positions.
     """
 
     def __init__(
@@ -89,8 +90,8 @@ class CflibLink:
         self._sender: Sender | None = None
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
-        self._lost_since_s: float | None = None  # last heard, while the link is lost
-        self._was_armed = False  # by an order of this session
+        self._lost_since_s: float | None = None  # time of the last arrival, while the link is lost
+        self._was_armed = False  # armed by an order of this session
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -98,7 +99,7 @@ class CflibLink:
         try:
             self._prepare(self.connection)
         except BaseException:
-            # As long as nothing is known of the vehicle, it may be flying for another.
+            # Without any telemetry, the vehicle may be flying for another program.
             self._leave(farewell=self._may_say_farewell() and not self._is_armed)
             raise
 
@@ -118,13 +119,13 @@ class CflibLink:
     def send_external(self, place: ExternalPosition) -> bool:
         try:
             return self.connection is not None and self.connection.send(*encode(place))
-        except Exception:  # the library's; commands report their own
+        except Exception:  # an error of the library; commands report their own
             return False
 
     def settle_estimator(self, feed: PositionFeed | None, ground_z_m: float = 0.0) -> None:
-        """Start the estimator where `feed` says that the vehicle is; without a feed, at the world's
-        origin, `ground_z_m` high. On the ground, after `connect`; bounded. Errors:
-        ConnectionFailed, NotFound, InvalidValue, TimedOut."""
+        """Start the estimator at the vehicle's position according to `feed`; without a feed, at the
+        world's origin with the height `ground_z_m`. On the ground, after `connect`; bounded. Raises
+        ConnectionFailed, NotFound, InvalidValue and TimedOut."""
         if self.connection is None:
             raise ConnectionFailed(f"{self._uri} is not connected")
         cf, config, clock = self.connection.cf, self._positioning, self._clock
@@ -148,15 +149,15 @@ class CflibLink:
         return None
 
     def new_notes(self) -> list[str]:
-        """Sentences on what went wrong and did not matter, since the last call."""
+        """Return sentences about harmless failures since the last call."""
         return [] if self._sender is None else self._sender.new_notes()
 
     def close(self) -> None:
         """Close when nothing flies; otherwise leave the link without its farewell packet.
 
-        On the ground a vehicle that does not arm itself is disarmed. A vehicle that still reports
-        flying after the wait, or of which nothing is known any more, is better off with its own
-        landing or level-out than with a zero setpoint.
+        On the ground, a vehicle that does not arm itself is disarmed. For a vehicle that still
+        reports flying after the wait, or whose state is unknown, its own landing or levelling is
+        safer than a zero setpoint.
         """
         if self._sender is not None:
             self._sender.drain(DRAIN_S)
@@ -184,7 +185,7 @@ class CflibLink:
         check_airframe(connection.cf, self._uri)
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
-        self._unlock_thrust(connection)  # from here on it is known to be on the ground
+        self._unlock_thrust(connection)  # the vehicle is known to be on the ground
         set_parameters(connection.cf, self._uri, estimator_parameters(self._positioning))
         self._sender = Sender(
             self._hand_over,
@@ -212,7 +213,7 @@ class CflibLink:
             time.sleep(UNLOCK_PERIOD_S)
 
     def _ask_guard(self) -> Command | None:
-        """Ask the guard, in the thread of the sender's that never touches cflib."""
+        """Call the guard, in the sender's thread that never calls cflib."""
         if self._guard is None:
             return None
         return self._guard(self._clock(), self._blocks.newest, self._blocks.waiting_samples)
@@ -222,7 +223,7 @@ class CflibLink:
         return self.connection is not None and self.connection.send(packet)
 
     def _tend(self, stuck_s: float, hangs: bool) -> None:
-        """See to the link, in the thread of the sender's that never touches cflib."""
+        """Maintain the link, in the sender's thread that never calls cflib."""
         connection, sender = self.connection, self._sender
         if connection is None or sender is None:
             return
@@ -240,22 +241,23 @@ class CflibLink:
             connection.reopen(f"the radio has taken nothing for {stuck_s:.1f} s, nor lost anything")
 
     def _may_hear_more(self) -> bool:
-        """True unless the link is lost for good: with a sender it is being opened again."""
+        """True unless the link is lost permanently: with a sender, it is being reopened."""
         connection = self.connection
         return connection is not None and (connection.lost is None or self._sender is not None)
 
     @property
     def _is_armed(self) -> bool:
-        """True if the vehicle does not arm itself, and is armed."""
+        """True if the vehicle is armed and does not arm itself."""
         newest = self._blocks.newest
         return newest is not None and is_armed_by_request(newest.supervisor)
 
     def _may_say_farewell(self) -> bool:
-        """True where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""
+        """True if a zero setpoint neither drops nor locks the vehicle, according to fresh
+        telemetry."""
         return not may_be_flying(self._blocks.newest, self._clock())
 
     def _leave(self, *, farewell: bool) -> None:
-        """Release the link. `farewell`: let cflib send its zero setpoint, which drops a flying
+        """Release the link. With `farewell`, cflib sends its zero setpoint, which drops a flying
         vehicle."""
         connection, self.connection = self.connection, None
         if connection is None:
@@ -263,5 +265,5 @@ class CflibLink:
         at_s, linked = self._clock(), connection.lost is None
         connection.close(farewell=farewell)
         if farewell and linked:
-            with contextlib.suppress(Exception):  # whatever looks on
+            with contextlib.suppress(Exception):  # errors of any observer
                 self._on_sent(SentCommand(at_s, "farewell", FAREWELL))

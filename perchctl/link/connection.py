@@ -1,5 +1,5 @@
-"""One opened `cflib.crazyflie.Crazyflie`: opened and closed within bounds, sent to,
-and locked against other programs."""
+"""An open `cflib.crazyflie.Crazyflie`: opening and closing within bounds, sending, and a lock
+against other programs."""
 
 from __future__ import annotations
 
@@ -22,41 +22,46 @@ from perchctl.places import user_folder
 CONNECT_TRIES = 2
 LINK_CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
-"""Lost packets in a row after which cflib gives a radio up: about 200 s, cflib's own 100 are 0.2 s.
-Waiting is the better way back: one that has given up agrees upon safelink anew."""
+"""Number of successive lost packets after which cflib gives a radio up: about 200 s, instead of 0.2
+s for cflib's own 100. Waiting recovers better: a radio that was given up must negotiate safelink
+again."""
 REOPEN_PAUSE_S = 0.05
 SAFELINK_S = 0.15
-"""The driver's ten attempts at a safelink take 20 to 50 ms."""
+"""Time for a driver to negotiate safelink, s: its ten attempts take 20 to 50 ms."""
 DEAD_S = 0.5
-"""For so long a dongle may answer nothing, not even that a packet was lost: that takes it 2 ms."""
+"""Time without any answer after which a dongle counts as dead, s: it reports even a lost packet
+within 2 ms."""
 
 
 class Connection:
-    """One opened `cflib.crazyflie.Crazyflie`.
+    """An open `cflib.crazyflie.Crazyflie`.
 
-    `lost` is None while connected, then the cause in one sentence. `cf` is cflib's object, for its
-    tables, parameters and log blocks. `claim`, the vehicle's lock, is closed when the connection
-    ends.
+    `lost` is None while connected, otherwise the cause in one sentence. `cf` is cflib's object, for
+    its tables, parameters and log blocks. `claim`, the vehicle's lock, is closed when the
+    connection ends.
     """
 
     def __init__(self) -> None:
         from cflib.crazyflie import Crazyflie
 
         cache = user_folder("cache") / "toc"
-        with contextlib.suppress(OSError):  # then the tables are read from the vehicle each time
+        # without a cache, the tables are read from the vehicle each time
+        with contextlib.suppress(OSError):
             cache.mkdir(parents=True, exist_ok=True)
         self.cf: Any = Crazyflie(rw_cache=str(cache) if cache.is_dir() else None)
         self.lost: str | None = None
         self.claim = contextlib.ExitStack()
-        self._settled = threading.Event()  # connected, or failed
-        self._change = threading.Lock()  # of what follows; cflib is never called with it
+        self._settled = threading.Event()  # set when connected, or failed
+        # guards the fields below; cflib is never called with it held
+        self._change = threading.Lock()
         self._left = False
-        self._number = 0  # of the present driver; what earlier ones report counts no more
+        self._number = 0  # number of the present driver; reports of earlier ones are ignored
         self._closer: threading.Thread | None = None
         self._opener: threading.Thread | None = None
         self._has_safelink = False
-        self._refused_since_s: float | None = None  # by the lock
-        self._asked_s = self._counted_s = 0.0  # `is_dead`, and since when it finds the same
+        self._refused_since_s: float | None = None  # since when the lock was not available
+        # last call of `is_dead`, and start of the unchanged count
+        self._asked_s = self._counted_s = 0.0
         self._counted: object = None
         internals.replace_error_callback(self.cf, partial(self._on_error, self._number))
         internals.stop_pings(self.cf)
@@ -64,8 +69,9 @@ class Connection:
         self.cf.connection_failed.add_callback(self._on_failed)
 
     def open(self, uri: str, timeout_s: float) -> bool:
-        """Open the link; True if within `timeout_s` it was connected, or refused (see `lost`)."""
-        # Opening a radio may block in its driver: it gets a thread and a bound.
+        """Open the link; return True if it was connected or refused (see `lost`) within
+        `timeout_s`."""
+        # Opening a radio may block in its driver, so it runs in a thread with a bound.
         start_thread("perchctl-open", lambda: self.cf.open_link(uri))
         if not self._settled.wait(timeout_s):
             return False
@@ -73,10 +79,10 @@ class Connection:
         return True
 
     def send(self, packet: Packet) -> bool:
-        """Send a packet now, or not at all; return True if the driver has taken it.
+        """Send a packet now, or not at all; return True if the driver has accepted it.
 
-        Unlike cflib's `send_packet` it never waits for cflib's lock or for the one place in its
-        radio's queue: that takes 2 s, after which the driver reports its end inside the call.
+        Unlike cflib's `send_packet`, it never waits for cflib's lock or for the single place in its
+        radio's queue. That wait takes 2 s, after which the driver reports its end inside the call.
         """
         if self.lost is not None:
             return False
@@ -98,12 +104,12 @@ class Connection:
             lock.release()
 
     def is_dead(self) -> bool:
-        """True if the driver has been stuck for `DEAD_S` and will never take a packet again.
+        """True if the driver has been stuck for `DEAD_S` and will never accept a packet again.
 
-        To be called repeatedly, and only while the driver takes none.
+        Must be called repeatedly, and only while the driver accepts no packet.
 
-        A radio out of reach counts its lost packets, and goes on by itself. A radio whose dongle
-        was pulled out counts nothing (cflib retries for ever, too).
+        A radio out of reach counts its lost packets and recovers by itself. A radio whose dongle
+        was unplugged counts nothing, and cflib retries forever in this case, too.
         """
         now_s, asked_s = time.monotonic(), self._asked_s
         self._asked_s = now_s
@@ -119,7 +125,7 @@ class Connection:
 
     def reopen(self, cause: str | None = None) -> None:
         """Open new drivers until one answers, to replace a driver that has ended or, with `cause`,
-        is given up. Returns at once; until a driver answers the link is `lost`."""
+        is given up. Returns at once; the link is `lost` until a driver answers."""
         with self._change:
             if self._left or (self._opener is not None and self._opener.is_alive()):
                 return
@@ -130,20 +136,20 @@ class Connection:
             self._opener = start_thread("perchctl-reconnect", self._open_again)
 
     def close(self, *, farewell: bool) -> None:
-        """Release the driver. `farewell`: let cflib send its zero setpoint, which drops a vehicle
-        that flies; else nothing more is sent."""
+        """Release the driver. With `farewell`, cflib sends its zero setpoint, which drops a flying
+        vehicle; otherwise nothing more is sent."""
         calls = [self.cf.close_link]
         with self._change:
             self._left = True
             if not farewell and self.cf.link is not None:
-                # Without its driver, close_link has nowhere to send the zero setpoint.
+                # Without its driver, close_link cannot send the zero setpoint.
                 calls.insert(0, self.cf.link.close)
                 self.cf.link = None
         _run_bounded(calls)
         self.claim.close()
 
     def _on_error(self, number: int, message: str) -> None:
-        """Note a driver's end; called in any thread, and in the middle of anything."""
+        """Record a driver's end; called in any thread, at any time."""
         with self._change:
             if number == self._number and not self._left:
                 self._give_up(readable_cause(message))
@@ -154,7 +160,7 @@ class Connection:
         self._settled.set()
 
     def _give_up(self, cause: str) -> None:
-        """Close the present driver and put none in its place; called with `_change` held."""
+        """Close the present driver without a replacement; called with `_change` held."""
         self._number += 1
         self.lost = cause
         driver, self.cf.link = self.cf.link, _Nowhere()
@@ -180,7 +186,7 @@ class Connection:
                 self.cf.link_statistics.radio_link_statistics_callback,
                 partial(self._on_error, number),
             )
-        except Exception:  # whatever the driver raises: not there, not yet
+        except Exception:  # any error of the driver: the radio is not available yet
             return False
         if driver is None:
             return False
@@ -195,11 +201,12 @@ class Connection:
         return False
 
     def _agrees_on_safelink(self, driver: Any) -> bool:
-        """Wait, bounded, for a new driver's safelink; True if it has one, or needs none.
+        """Wait, bounded, for a new driver's safelink; return True if it has one, or needs none.
 
-        A vehicle once spoken to by safelink hears one packet of a driver without it, then none
-        (docs/firmware.md, "Safelink"). A radio opened out of the vehicle's reach is such a driver
-        for as long as it lives."""
+        A vehicle that has used safelink accepts one packet of a driver without it, then none
+        (docs/firmware.md, "Safelink"). A radio opened out of the vehicle's reach remains such a
+        driver for its lifetime.
+        """
         end_s = time.monotonic() + SAFELINK_S
         while self._has_safelink and not internals.has_safelink(driver):
             if self._left or time.monotonic() >= end_s:
@@ -209,7 +216,8 @@ class Connection:
 
 
 class _Nowhere:
-    """Stands for cflib's missing driver, since cflib looks for a new one only once a second."""
+    """Placeholder for cflib's missing driver, since cflib checks for a new one only once a
+    second."""
 
     needs_resending = False
 
@@ -226,9 +234,9 @@ class _Nowhere:
 def open_connection(uri: str, timeout_s: float) -> Connection:
     """Open a vehicle's connection with all tables and parameters read.
 
-    `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
-    connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
-    program has the vehicle.
+    `timeout_s` is shared by `CONNECT_TRIES` attempts, since a single lost packet can block cflib's
+    connect permanently (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also if another
+    program uses the vehicle.
     """
     share_s = timeout_s / CONNECT_TRIES
     with lock_vehicle(uri) as claim:
@@ -254,8 +262,8 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
 def init_cflib() -> None:
     """Register cflib's drivers, keep its radio from giving up after the first lost packets, and
-    silence cflib, which logs what it also reports by callback, and prints on stdout. Raises
-    UsageError if this cflib lacks what perchctl needs of it."""
+    silence cflib, which logs what it also reports by callback and prints on stdout. Raises
+    UsageError if this cflib lacks a part that perchctl needs."""
     import cflib.crtp
 
     internals.check_internals()
@@ -269,7 +277,7 @@ def init_cflib() -> None:
 
 
 def send_packets(cf: Any, packets: Iterable[Packet]) -> None:
-    """Send packets as they are, through the lock and the driver of cflib's `Crazyflie`."""
+    """Send packets unchanged, through the lock and the driver of cflib's `Crazyflie`."""
     for packet in packets:
         cf.send_packet(_as_cflib(packet))
 
@@ -292,11 +300,11 @@ _CAUSES = {
     "Cannot find": "no Crazyradio is plugged in, or " + _PERMISSION,
     "Access denied": _PERMISSION,
 }
-"""What to say of a message of cflib's, by words in it: the first that fits."""
+"""Message for an error of cflib, by words in it; the first match is used."""
 
 
 def readable_cause(message: str) -> str:
-    """Return cflib's message without its traceback, or, where known, the cause and its remedy."""
+    """Return cflib's message without its traceback or, if known, the cause and its remedy."""
     for words, cause in _CAUSES.items():
         if words in message:
             return cause
@@ -319,16 +327,16 @@ def start_thread(name: str, call: Callable[[], object]) -> threading.Thread:
     return thread
 
 
-# --- One program at a time for each vehicle: a lock that this user's programs on this computer
-# share. cflib's connect would reset the log blocks of a vehicle that flies for another program, and
-# two streams of setpoints would pull it two ways.
+# --- One program per vehicle: a lock shared by this user's programs on this computer ---
+# cflib's connect would reset the log blocks of a vehicle that flies for another program, and two
+# streams of setpoints would conflict.
 
 
 def lock_vehicle(uri: str) -> contextlib.ExitStack:
     """Lock the vehicle at `uri` for this process until the result is closed.
 
-    Nothing is locked where no lock can be kept (no folder to write to, Windows).
-    Raises ConnectionFailed if another program has the lock.
+    Nothing is locked if no lock can be created (no writable folder, or Windows). Raises
+    ConnectionFailed if another program holds the lock.
     """
     path = user_folder("runtime") / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
     with contextlib.ExitStack() as claim:

@@ -1,9 +1,9 @@
-"""CRTP packets, and a command as those that the vehicle receives: the one place that encodes.
+"""CRTP packets, and the encoding of commands and positions as packets; no other module encodes
+them.
 
-`CflibLink` sends these packets, `MockLink` hands the same bytes to the simulated vehicle.
-Layouts are those of cflib 0.1.34 (`commander`, `high_level_commander`, `supervisor`) for
-protocol 12 and later; degrees leave here, radians stay behind (docs/firmware.md, "Link" and
-"Signs and units").
+`CflibLink` sends these packets, and `MockLink` passes the same bytes to the simulated vehicle. The
+layouts are those of cflib 0.1.34 (`commander`, `high_level_commander`, `supervisor`) for protocol
+12 and later. Radians become degrees here (docs/firmware.md, "Link" and "Signs and units").
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from perchctl.vehicle import (
 )
 
 MAX_DATA = 30
-"""Bytes of a packet behind its header."""
+"""Bytes of a packet after its header."""
 
 
 class Port(IntEnum):
-    """CRTP's ports, by their numbers on the air."""
+    """CRTP's ports with their numbers."""
 
     PARAM = 2
     COMMANDER = 3
@@ -53,7 +53,7 @@ class Packet(NamedTuple):
     data: bytes
 
     def encode(self) -> bytes:
-        """The packet's bytes on the air."""
+        """Return the packet's bytes as transmitted."""
         return bytes((self.port << 4 | 0x0C | self.channel,)) + self.data
 
     @staticmethod
@@ -65,14 +65,14 @@ class Packet(NamedTuple):
 
 
 LAND_TIMES = 3
-# Port 7: the channels, then the setpoints' types.
+# Port 7: channels, then types of setpoints.
 _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
 _NOTIFY_SETPOINT_STOP = 0
 # Port 8.
 _LAND_2 = 8
 _ALL_GROUPS = 0
-# Port 6: the channels, then the generic one's types.
+# Port 6: channels, then types of the generic one.
 _EXTERNAL_POSITION, _LOCALISATION = 0, 1
 _EXTERNAL_POSE = 8
 # Port 9, channel 1.
@@ -81,10 +81,10 @@ _ARM, _EMERGENCY_STOP = 1, 3
 
 
 def encode(message: Command | ExternalPosition) -> tuple[Packet, ...]:
-    """The packets of a command or of an external position, in the order in which they are
-    sent; none for `Idle`.
+    """Return the packets of a command or an external position in the order of sending; none for
+    `Idle`.
 
-    Raises InvalidValue for a number that its field cannot hold.
+    Raises InvalidValue for a number that does not fit into its field.
     """
     try:
         return _packets(message)
@@ -102,11 +102,11 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
         case RawThrust(thrust, roll_rad, pitch_rad):
             return (_raw(thrust, roll_rad, pitch_rad),)
         case Land(height, duration):
-            # Without a yaw of its own, which it would turn to on the way: cflib's `yaw=None`.
+            # Without a yaw, to which the vehicle would rotate on the way: cflib's `yaw=None`.
             data = struct.pack("<BBff?f", _LAND_2, _ALL_GROUPS, height, 0.0, True, duration)
-            # The order first, and three times: the notify alone cuts the motors at once
-            # (docs/firmware.md, "Notify alone"), so the order must not be what is lost. With
-            # the notify lost, the setpoint watchdog leaves 2 s in which all is repeated.
+            # The order comes first, and three times: the notify message alone cuts the motors at
+            # once (docs/firmware.md, "Notify alone"), so the order must not get lost. If the notify
+            # message is lost, the setpoint watchdog leaves 2 s in which everything is repeated.
             return (Packet(Port.HIGH_LEVEL, 0, data),) * LAND_TIMES + (_NOTIFY,)
         case StopMotors():
             stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
@@ -125,7 +125,7 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
 
 
 def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
-    """A raw setpoint without yaw rate; its pitch is negated on its way out."""
+    """Return a raw setpoint without yaw rate; the pitch is negated."""
     roll_deg, pitch_deg = math.degrees(roll_rad), math.degrees(pitch_rad)
     return Packet(Port.COMMANDER, 0, struct.pack("<fffH", roll_deg, -pitch_deg, 0.0, thrust))
 
@@ -133,8 +133,8 @@ def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
 _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPOINT_STOP, 0))
 
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
-"""One zero-thrust packet since boot, on the ground, then the priority back: without the
-first a raw thrust stays 0, without the second the vehicle's own landing is not flown
-(docs/firmware.md, "Raw thrust"). Nothing tells whether it has arrived, and the first raw thrust
-in the air would be a cut: it is sent `UNLOCK_TIMES`."""
+"""One zero-thrust packet after boot, on the ground, then the message that returns the priority.
+Without the first, raw thrust stays 0; without the second, the firmware does not execute its own
+landing (docs/firmware.md, "Raw thrust"). Their arrival is not confirmed, and a first raw thrust in
+the air would cut the motors, so they are sent `UNLOCK_TIMES`."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02

@@ -1,9 +1,9 @@
-"""The estimator of a vehicle whose position is measured from outside: its parameters, its start,
-and the agreement of estimate and measurement.
+"""Set up the estimator of a vehicle with an external position: parameters, start, and agreement of
+estimate and measurement.
 
-On the ground only. The filter is set to the capture's pose while positions arrive already: it
-would drift without. No position gives its heading, and a wrong one sends the vehicle away
-(docs/positioning.md).
+On the ground only. The filter is reset to the capture's pose while positions already arrive;
+otherwise it would drift. Positions do not determine the heading, and a wrong heading makes the
+vehicle fly away (docs/positioning.md).
 """
 
 from __future__ import annotations
@@ -34,21 +34,23 @@ RESET_PARAMETER = "kalman.resetEstimation"
 RESETS = 3
 RESET_PULSE_S = 0.1
 AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
-"""After one reset; the whole is bounded by `RESETS` of them."""
+"""Time for agreement after one reset, and the time that the agreement must last, s; the number of
+resets is bounded by `RESETS`."""
 RESET_AGREE_M = 0.05
-"""Most that estimate and capture may be apart after a reset: ten times what a capture is trusted
-for."""
+"""Largest distance between estimate and capture after a reset, m: ten times the capture's assumed
+error."""
 RESET_AGREE_RAD = math.radians(5.0)
-"""The same for the heading: what half a metre of climb can bear."""
+"""Largest difference of the heading after a reset, rad: tolerable for half a metre of climb."""
 RESET_STILL_M = 0.05
-"""From the reset until they agree: a vehicle that moves farther is being carried."""
+"""Largest motion from the reset until the agreement, m: a vehicle that moves further is being
+carried."""
 ESTIMATE_POLL_S = 0.02
-"""Time between two looks at estimate and capture."""
+"""Time between two comparisons of estimate and capture, s."""
 
 
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
-    """The firmware's parameters for external positions, to be set after the user's own;
-    none with decks."""
+    """Return the firmware's parameters for external positions, to be set after the user's own; none
+    with decks."""
     if config.by == "deck":
         return {}
     return {
@@ -59,7 +61,7 @@ def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
 
 
 def estimator_start_parameters(start: VehiclePose) -> dict[str, float]:
-    """The `kalman.initial*` parameters that make a reset start the estimator at `start`."""
+    """Return the `kalman.initial*` parameters that make a reset start the estimator at `start`."""
     x, y, z = (float(part) for part in start.position_m)
     values = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(start.R)}
     return {f"kalman.initial{name}": value for name, value in values.items()}
@@ -76,8 +78,8 @@ def settle_estimator(
 ) -> None:
     """Reset the estimator until it agrees with the feed, on the ground. Bounded.
 
-    `newest` gives the vehicle's newest telemetry, `wait` lets seconds pass. Raises ConnectionFailed
-    for a vehicle that may fly, NotFound, InvalidValue, TimedOut.
+    `newest` returns the vehicle's newest telemetry, and `wait` waits for some seconds. Raises
+    ConnectionFailed for a vehicle that may be flying, NotFound, InvalidValue and TimedOut.
     """
     end_s = clock() + config.connect_timeout_s
     while (status := feed.status(clock())).problem is not None or not status.sent:
@@ -93,10 +95,11 @@ def settle_estimator(
                 f"the vehicle at {uri} may be flying: its estimate is set on the ground only"
             )
         start = feed.sent_pose()
-        assert start is not None  # one was sent
+        assert start is not None  # the loop above has waited for one
         x, y, z = start.position_m
         set_parameters(cf, uri, estimator_start_parameters(start))
-        # Whether it was heard shows in the estimate: the firmware may clear it by itself.
+        # The estimate shows whether the reset was received: the firmware may clear the parameter by
+        # itself.
         for value in (1, 0):
             set_parameters(cf, uri, {RESET_PARAMETER: value}, read_back=False)
             wait(RESET_PULSE_S * value)
@@ -118,8 +121,8 @@ def _agree(
     clock: Callable[[], float],
     wait: Callable[[float], None],
 ) -> bool:
-    """True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S`, and the
-    vehicle has stood at `start`."""
+    """Return True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S` while the
+    vehicle stood at `start`."""
     end_s = clock() + AGREE_WITHIN_S
     since_s: float | None = None
     while (now_s := clock()) < end_s:
@@ -141,8 +144,8 @@ def _agree(
 
 
 class StandingFeed:
-    """Feed of a vehicle that stands level at the world's origin, its front along x; its place
-    defines the world. `wait` sends that place, `rate_hz` times a second."""
+    """Feed for a vehicle that stands level at the world's origin, facing along x; its position
+    defines the world. `wait` sends that position `rate_hz` times a second."""
 
     def __init__(
         self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]
@@ -152,7 +155,7 @@ class StandingFeed:
         self._clock, self._count = clock, 0
 
     def wait(self, duration_s: float) -> None:
-        """Send the place until `duration_s` has passed."""
+        """Send the position until `duration_s` has passed."""
         end_s = self._clock() + duration_s
         while (now_s := self._clock()) < end_s:
             if now_s >= self._due_s:

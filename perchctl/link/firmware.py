@@ -1,4 +1,4 @@
-"""Log variables and parameters of a connected vehicle, by name: verified, set and read, bounded."""
+"""Check, set and read a connected vehicle's log variables and parameters by name, within bounds."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from perchctl.link.telemetry import NEEDED
 from perchctl.vehicle import AIRFRAMES
 
 NEEDED_PROTOCOL = 12
-"""From firmware 2026.08 on: the supervisor's own port (docs/firmware.md, "Link")."""
+"""Protocol version from firmware 2026.08 on, with the supervisor's own port (docs/firmware.md,
+"Link")."""
 PARAMETER_TIMEOUT_S = 2.0
 ASKED_TIMES = 10
 _VERSION_CHANNEL, _DEVICE_TYPE = 1, b"\x02"
 
 
 def check_firmware(cf: Any, uri: str) -> None:
-    """Raises ConnectionFailed for an old protocol, NotFound for a missing log variable."""
+    """Raise ConnectionFailed for an old protocol, NotFound for a missing log variable."""
     version, remedy = cf.platform.get_protocol_version(), "update the firmware to 2026.08 or later"
     if version < NEEDED_PROTOCOL:
         raise ConnectionFailed(
@@ -34,9 +35,9 @@ def check_firmware(cf: Any, uri: str) -> None:
 
 
 def read_device_type(cf: Any) -> str | None:
-    """The kind of vehicle, as its firmware names it; None without an answer. Bounded.
+    """Return the kind of vehicle as named by its firmware; None without an answer. Bounded.
 
-    cflib 0.1.34 never asks for it.
+    cflib 0.1.34 never requests it.
     """
     answers: queue.SimpleQueue[str] = queue.SimpleQueue()
 
@@ -57,7 +58,7 @@ def read_device_type(cf: Any) -> str | None:
 
 
 def check_airframe(cf: Any, uri: str) -> None:
-    """Raises ConnectionFailed for a kind of vehicle whose thrust or battery perchctl does not
+    """Raise ConnectionFailed for a kind of vehicle whose thrust or battery perchctl does not
     know."""
     device_type = read_device_type(cf)
     if device_type in AIRFRAMES:
@@ -70,7 +71,7 @@ def check_airframe(cf: Any, uri: str) -> None:
 
 
 def missing_variables(cf: Any) -> list[str]:
-    """Names of the needed log variables that the firmware lacks."""
+    """Return the names of the needed log variables that the firmware lacks."""
     table = cf.log.toc
     return [name for name in NEEDED if table.get_element_by_complete_name(name) is None]
 
@@ -78,10 +79,10 @@ def missing_variables(cf: Any) -> list[str]:
 def set_parameters(
     cf: Any, uri: str, parameters: Mapping[str, float], *, read_back: bool = True
 ) -> None:
-    """Set each parameter, read it back from the vehicle where `read_back` is set, and compare.
+    """Set each parameter and, with `read_back`, read it back from the vehicle and compare.
 
     Raises NotFound for an unknown name, InvalidValue for a value that the vehicle does not keep,
-    TimedOut without an answer.
+    and TimedOut without an answer.
     """
     for name, wanted in parameters.items():
         if cf.param.toc.get_element_by_complete_name(name) is None:
@@ -122,7 +123,7 @@ def _read_back(parameters: Any, name: str) -> str | None:
 
 
 def read_parameters(cf: Any) -> dict[str, float]:
-    """All parameters by name, as read when the link was opened."""
+    """Return all parameters by name, as read when the link was opened."""
     return {
         f"{group}.{name}": float(value)
         for group, values in cf.param.values.items()
@@ -131,6 +132,6 @@ def read_parameters(cf: Any) -> dict[str, float]:
 
 
 def detected_decks(parameters: Mapping[str, float]) -> tuple[str, ...]:
-    """The decks that were found at boot, by the firmware's names, sorted."""
+    """Return the decks found at boot, by the firmware's names, sorted."""
     names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
     return tuple(sorted(names))

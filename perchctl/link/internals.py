@@ -1,9 +1,8 @@
-"""The parts of cflib that perchctl reads or replaces although cflib does not promise them.
+"""Undocumented parts of cflib that perchctl reads or replaces.
 
-They are all here: the list (`INTERNALS`), the check that this cflib has each of them
-(`check_internals`), and the functions through which the rest of the package uses them. A release of
-cflib that renames one would otherwise change what happens when a radio fails, which nobody notices
-before it does.
+This module contains all of them: the list (`INTERNALS`), the check that this cflib has each of them
+(`check_internals`), and the functions through which the rest of the package uses them. Without the
+check, a cflib release that renames one would silently change the behaviour after a radio failure.
 """
 
 from __future__ import annotations
@@ -21,7 +20,8 @@ from perchctl.errors import unfit_cflib
 
 @dataclass(frozen=True)
 class Internal:
-    """A part of cflib: `name` of what `owner` returns, and how perchctl uses it."""
+    """A part of cflib: the attribute `name` of the object that `owner` returns, and how perchctl
+    uses it."""
 
     name: str
     owner: Callable[[], Any]
@@ -65,7 +65,7 @@ def _radio_driver() -> Any:
 def _radio_thread() -> Any:
     from cflib.crtp import radiodriver
 
-    return radiodriver._RadioDriverThread(*[None] * 7)  # it is not started
+    return radiodriver._RadioDriverThread(*[None] * 7)  # the thread is not started
 
 
 def _radio_manager() -> Any:
@@ -81,7 +81,7 @@ def _radio_module() -> Any:
 
 
 class _Named:
-    """Has the names that a function looks up, as attributes."""
+    """An object whose attributes are the names that a function looks up."""
 
     def __init__(self, function: Any) -> None:
         vars(self).update(dict.fromkeys(function.__code__.co_names))
@@ -116,13 +116,12 @@ INTERNALS = (
 
 
 def check_internals() -> None:
-    """Raises UsageError, which names the part and cflib's version, unless cflib has all
-    `INTERNALS`."""
+    """Raise UsageError, with the part and cflib's version, unless cflib has all `INTERNALS`."""
     for internal in INTERNALS:
         try:
             found = hasattr(internal.owner(), internal.name)
         except (ImportError, AttributeError, TypeError):
-            found = False  # its owner is not there, or is made in another way
+            found = False  # its owner does not exist, or has a different constructor
         if not found:
             version = "of an unknown version"
             with contextlib.suppress(metadata.PackageNotFoundError):
@@ -130,69 +129,70 @@ def check_internals() -> None:
             raise unfit_cflib(internal.name, version)
 
 
-# --- Their uses ---
+# --- Use of the internals ---
 
 
 def replace_error_callback(cf: Any, on_error: Callable[[str], None]) -> None:
-    """Let a driver report its end to `on_error` instead of to cflib's own handler.
+    """Make drivers report their end to `on_error` instead of cflib's own handler.
 
     A driver reports its end from inside `send_packet`, where the caller holds cflib's lock, or from
-    its own thread. cflib's handler closes the link there, and joins the thread of its pings, which
-    waits for that lock: then nothing can be sent ever again.
+    its own thread. cflib's handler closes the link there and joins the thread of its pings, which
+    waits for that lock: then nothing can ever be sent again.
     """
     cf._link_error_cb = on_error
 
 
 def stop_pings(cf: Any) -> None:
-    """Keep cflib from its pings; the radio's own null packets keep the link."""
+    """Disable cflib's pings; the radio's own null packets keep the link alive."""
     cf.link_statistics.latency.start = lambda: None
 
 
 def send_lock(cf: Any) -> Any:
-    """The lock that cflib's `send_packet` holds during the driver's call."""
+    """Return the lock that cflib's `send_packet` holds during the driver's call."""
     return cf._send_lock
 
 
 def renew_send_lock(cf: Any) -> None:
-    """Replace the lock: whoever hung in the old driver may hold the old one for ever."""
+    """Replace the lock: a call that blocked in the old driver may hold the old one forever."""
     cf._send_lock = threading.Lock()
 
 
 def has_room(driver: Any) -> bool:
-    """True if the driver takes a packet without waiting. Only a radio's has a queue, of one."""
+    """True if the driver accepts a packet without waiting. Only a radio has a queue, of length
+    one."""
     queue = getattr(driver, "out_queue", None)
     return queue is None or not queue.full()
 
 
 def has_safelink(driver: Any) -> bool:
-    """True if the driver need not send again: agreed on safelink, or none is needed."""
+    """True if packets need not be sent again: safelink is negotiated, or not needed."""
     return not getattr(driver, "needs_resending", True)
 
 
 def driver_thread(driver: Any) -> threading.Thread | None:
-    """The driver's thread; None without a driver."""
+    """Return the driver's thread; None without a driver."""
     thread: threading.Thread | None = getattr(driver, "_thread", None)
     return thread
 
 
 def retries_left(thread: threading.Thread | None) -> int | None:
-    """How many more lost packets a radio's thread takes, which counts every one down; None for
-    other drivers."""
+    """Return how many more lost packets a radio's thread tolerates; it counts down by each. None
+    for other drivers."""
     left: int | None = getattr(thread, "_retry_before_disconnect", None)
     return left
 
 
 def forget_dead_dongle(uri: str) -> None:
-    """Remove a dongle's thread that has ended; cflib would keep it for good.
+    """Remove a dongle's thread that has ended; cflib would keep it forever.
 
-    Looked at and removed under cflib's own lock: a second link over the same dongle may have opened
-    it anew meanwhile.
+    The check and the removal hold cflib's own lock because a second link over the same dongle may
+    have reopened it meanwhile.
     """
     from cflib.crtp.radiodriver import RadioDriver, RadioManager
 
     try:
         number = RadioDriver.parse_uri(uri)[0]
-    except Exception:  # no radio's URI, or a dongle by a serial number that is not plugged in
+    except Exception:  # not a radio's URI, or the serial number of an unplugged dongle
         return
     with RadioManager._lock:
         radios = RadioManager._radios
@@ -202,14 +202,14 @@ def forget_dead_dongle(uri: str) -> None:
 
 
 def keep_retrying(lost_packets: int) -> None:
-    """Let a radio lose so many packets in a row before it gives up."""
+    """Set how many successive packets a radio may lose before it gives up."""
     from cflib.crtp import radiodriver
 
     radiodriver.set_retries_before_disconnect(lost_packets)
 
 
 def log_prints(logger: logging.Logger) -> None:
-    """Log what cflib's radio driver would print."""
+    """Log the output that cflib's radio driver would print."""
     from cflib.crtp import radiodriver
 
     vars(radiodriver)["print"] = lambda *words: logger.info("%s", words)

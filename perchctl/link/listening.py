@@ -1,7 +1,7 @@
-"""Links that read a vehicle and command nothing, and the search for vehicles that answer.
+"""Links that read a vehicle without commanding it, and the search for vehicles that answer.
 
-`AttitudeLink` reads how a vehicle is moved by hand, `ProbeLink` what it holds and how good the
-radio is. Nothing that is sent here flies, arms or turns a motor.
+`AttitudeLink` reads how a vehicle is moved by hand. `ProbeLink` reads its configuration and the
+quality of the radio. Nothing that is sent here flies, arms or spins a motor.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from perchctl.vehicle import FLYING, is_armed_by_request
 
 
 class ReadOnlyLink(CflibLink):
-    """A `CflibLink` that sets no parameter, arms nothing, and commands nothing, not even at its
-    end: the vehicle may fly for another program."""
+    """A `CflibLink` that sets no parameters, arms nothing, and sends no commands, not even as it
+    closes: the vehicle may be flying for another program."""
 
     def close(self) -> None:
         """Close at once, without the setpoint that cflib sends as it closes."""
         self._leave(farewell=False)
 
     def _may_say_farewell(self) -> bool:
-        return False  # neither when connecting fails half-way
+        return False  # also if connecting fails half-way
 
     def _prepare(self, connection: Connection) -> None:
-        """Nothing, unless a subclass listens to something."""
+        """Do nothing; subclasses start what they listen to."""
 
 
-# --- How a vehicle is moved by hand: attitude and turn rates of one moment, in one packet ---
+# --- Motion by hand: attitude and rotation rates of the same time, in one packet ---
 
 
 MOTION_PERIOD_S = 0.01
@@ -72,12 +72,13 @@ MOTION_BLOCK = dict.fromkeys(
     ),
     "float",
 ) | {"supervisor.info": "uint16_t"}
-"""All 26 bytes that a log block holds."""
+"""Uses all 26 bytes of a log block."""
 MOST_ATTITUDE_SAMPLES = 20_000
 
 
 class AttitudeLink(ReadOnlyLink):
-    """A `ReadOnlyLink` that collects attitude samples, 100 a second. Errors as `CflibLink`."""
+    """A `ReadOnlyLink` that collects 100 attitude samples per second. Raises errors as `CflibLink`
+    does."""
 
     def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
         super().__init__(uri, config, clock)
@@ -88,12 +89,12 @@ class AttitudeLink(ReadOnlyLink):
 
     @property
     def motors_running(self) -> bool:
-        """True while the newest packet reports turning motors, until 2 s after they stop, or a
-        vehicle that is armed and does not arm itself, whose propellers turn all the time."""
+        """True if the newest packet reports running motors, which it does until 2 s after they
+        stop, or an armed vehicle that does not arm itself, whose propellers spin all the time."""
         return self._motors_run
 
     def samples(self) -> list[AttitudeSample]:
-        """The samples that arrived since the last call, oldest first."""
+        """Return the samples that arrived since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def _prepare(self, connection: Connection) -> None:
@@ -104,8 +105,8 @@ class AttitudeLink(ReadOnlyLink):
             raise TimedOut(f"{self._uri} is connected but sends no telemetry")
 
     def _on_motion(self, stamp: int, values: Mapping[str, float], _block: Any = None) -> None:
-        """Take a packet of `MOTION_BLOCK`, in cflib's thread: degrees, and the Crazyflie's nose-up
-        pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed."""
+        """Handle a packet of `MOTION_BLOCK`, in cflib's thread: degrees, and the Crazyflie's
+        nose-up pitch (docs/firmware.md, "Signs and units"); its gyroscope is right-handed."""
         now_s = self._blocks.last_arrival_s = self._clock()
         t_s = self._timebase.to_loop_s(stamp, now_s)
         bits = int(values["supervisor.info"])
@@ -123,20 +124,21 @@ class AttitudeLink(ReadOnlyLink):
             )
 
 
-# --- What a vehicle holds, and how good the radio is ---
+# --- Configuration of a vehicle, and quality of the radio ---
 
 
 LAST_ECHO_WAIT_S = 0.5
 ECHO_PERIOD_S = 0.02
-_ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
-_ECHO_MARK = 1  # cflib's own pings begin with 0
+# same length as cflib's own echo, since cflib unpacks every echo as its own
+_ECHO = struct.Struct("<BQ")
+_ECHO_MARK = 1  # cflib's own pings start with 0
 
 
 class ProbeLink(ReadOnlyLink):
-    """A `ReadOnlyLink` that accepts any firmware, since it is there to find what is wrong.
+    """A `ReadOnlyLink` that accepts any firmware, since its purpose is to find faults.
 
-    `quality`: the radio link's, %; 100 if no packet had to be sent again; None without a radio.
-    `missing` names the log variables that perchctl needs and the firmware lacks.
+    `quality` is that of the radio link, %: 100 if no packet had to be sent again, None without a
+    radio. `missing` names the log variables that perchctl needs and the firmware lacks.
     """
 
     NEEDED_PROTOCOL = NEEDED_PROTOCOL
@@ -151,7 +153,7 @@ class ProbeLink(ReadOnlyLink):
         self.missing = tuple(missing_variables(connection.cf))
         connection.cf.link_statistics.link_quality_updated.add_callback(self._on_quality)
         if not self.missing:
-            with contextlib.suppress(NotFound, TimedOut):  # then `telemetry` stays empty
+            with contextlib.suppress(NotFound, TimedOut):  # `telemetry` then stays empty
                 self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
 
     @property
@@ -160,19 +162,19 @@ class ProbeLink(ReadOnlyLink):
         return self.connection.cf
 
     def protocol_version(self) -> int:
-        """The protocol's version; -1 for a vehicle that is too old to have one."""
+        """Return the protocol version; -1 for a vehicle that is too old to have one."""
         return int(self._cf.platform.get_protocol_version())
 
     def device_type(self) -> str | None:
-        """The kind of vehicle, as its firmware names it; None without an answer."""
+        """Return the kind of vehicle as named by its firmware; None without an answer."""
         return read_device_type(self._cf)
 
     def parameters(self) -> dict[str, float]:
-        """All parameters by name, as read when the link was opened."""
+        """Return all parameters by name, as read when the link was opened."""
         return read_parameters(self._cf)
 
     def position_age_s(self) -> float:
-        """The age of the newest sample's position; infinite without a sample."""
+        """Return the age of the newest sample's position, s; infinite without a sample."""
         newest = self._blocks.newest
         return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
 
@@ -181,8 +183,8 @@ class ProbeLink(ReadOnlyLink):
         return "it was closed" if self.connection is None else self.connection.lost
 
     def round_trips_s(self, duration_s: float) -> list[float]:
-        """Send echo packets for `duration_s`, and wait `LAST_ECHO_WAIT_S` for the last. Returns the
-        round-trip time of each packet, s; infinite for a lost packet."""
+        """Send echo packets for `duration_s`, and wait `LAST_ECHO_WAIT_S` for the last one. Return
+        the round-trip time of each packet, s; infinite for a lost packet."""
         sent_s: list[float] = []
         back_s: dict[int, float] = {}
         all_back = threading.Event()
@@ -211,20 +213,20 @@ class ProbeLink(ReadOnlyLink):
         self.quality = float(percent)
 
 
-# --- Which vehicles answer: channels, rates and addresses of the radio, USB, and UDP ---
+# --- Search for vehicles: channels, rates and addresses of the radio, USB, and UDP ---
 
 
 SCAN_TIMEOUT_S = 20.0
 
 
 def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
-    """Ask which vehicles answer now, at a radio's usual address and at that of `uri`; sends null
-    packets only. Returns their URIs, and why no radio was asked, with advice in further lines; the
-    empty string if a radio was asked.
+    """Search for vehicles that answer now, at a radio's usual address and at that of `uri`; sends
+    only null packets. Return their URIs, and why no radio was searched, with advice in further
+    lines; an empty string if a radio was searched.
 
-    A driver may hang: after `SCAN_TIMEOUT_S` the URIs found so far are returned.
+    A driver may block: after `SCAN_TIMEOUT_S`, the URIs found so far are returned.
     """
-    addresses: list[int | None] = [None]  # the usual one
+    addresses: list[int | None] = [None]  # the usual address
     parts = uri.partition("?")[0].split("/")
     if uri.startswith("radio://") and len(parts) > 5 and parts[5].upper() != USUAL_ADDRESS:
         addresses.append(int(parts[5], 16))
@@ -236,7 +238,7 @@ def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:
     def run() -> None:
         from cflib import crtp
 
-        with contextlib.suppress(Exception):  # whatever the driver raises
+        with contextlib.suppress(Exception):  # any error of the driver
             why[0] = _radio_problem()
         for driver in crtp.CLASSES:
             for address in addresses:

@@ -1,4 +1,5 @@
-"""The lockstep sibling of the cflib link: same protocol, same packets, no wall clock."""
+"""The simulated counterpart of the cflib link, in lockstep: same protocol, same packets, no wall
+clock."""
 
 from __future__ import annotations
 
@@ -51,7 +52,7 @@ class Radio:
         return self._bursts is None or not self._bursts.is_lost(now_s)
 
     def downlink_delay_s(self, block: str, now_s: float) -> float | None:
-        """The seconds after which a log block's packet arrives; None when it is lost."""
+        """Return the seconds after which a log block's packet arrives; None if it is lost."""
         lost = self._bursts is not None and self._bursts.is_lost(now_s)
         return None if lost else TELEMETRY_DELAY_S
 
@@ -59,14 +60,14 @@ class Radio:
 class MockLink:
     """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
 
-    Commands reach `vehicle`, a `perchctl.sim.SimulatedVehicle`, as bytes, through the simulated
-    link's decoder; its telemetry comes in log blocks through the same assembler as by radio.
+    Commands reach `vehicle`, a `perchctl.sim.SimulatedVehicle`, as bytes through the simulated
+    link's decoder. Its telemetry arrives in log blocks through the same assembler as by radio.
     """
 
     FAST_BLOCKS = FAST_BLOCKS
     """The log blocks without which there is no telemetry."""
     BLOCKS_BACK_AFTER_S = BLOCKS_DELETED_AFTER_S + RESUME_PERIOD_S
-    """Until the real link has started the blocks again that a vehicle has forgotten."""
+    """Time until the real link has restarted log blocks that a vehicle has deleted, s."""
 
     def __init__(
         self,
@@ -88,7 +89,7 @@ class MockLink:
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
-        self._was_armed = False  # by an order of this session
+        self._was_armed = False  # armed by an order of this session
         self._watched_s = -math.inf
         self._call: Callable[[float], object] = lambda now_s: None
         self._call_due_s = self._call_period_s = math.inf
@@ -99,7 +100,7 @@ class MockLink:
         return float(self.vehicle.t_s)
 
     def advance_to(self, t_s: float) -> None:
-        """Step the vehicle until `t_s`, sending its telemetry on the way."""
+        """Step the vehicle until `t_s`, and send its telemetry on the way."""
         while (due_s := min(self._call_due_s, *self._due_s.values())) <= t_s:
             self.vehicle.advance_to(due_s)
             for name, block_due_s in self._due_s.items():
@@ -113,7 +114,7 @@ class MockLink:
         self.vehicle.advance_to(t_s)
 
     def call_every(self, period_s: float, call: Callable[[float], object]) -> None:
-        """Call `call` with the time every `period_s` from now on, in place of a thread."""
+        """Call `call` with the time every `period_s` from now on; replaces a thread."""
         self._call, self._call_period_s, self._call_due_s = call, period_s, self.now_s
 
     def connect(self) -> None:
@@ -146,7 +147,7 @@ class MockLink:
             self._on_sent(SentCommand(self.now_s, "watchdog", command))
 
     def _collect(self) -> Telemetry | None:
-        """Take in what has arrived by now; return the newest sample."""
+        """Process the packets that have arrived by now; return the newest sample."""
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
             _, _, block, stamp_s, values, start = heapq.heappop(self._under_way)
             sample = self._assembler.accept(block, values, stamp_s, start)
@@ -164,7 +165,7 @@ class MockLink:
         return True
 
     def settle_estimator(self, config: PositioningConfig, start: VehiclePose) -> None:
-        """Set the estimator to positions from outside, and start it at `start`."""
+        """Configure the estimator for external positions, and start it at `start`."""
         firmware = self.vehicle.firmware
         parameters = estimator_parameters(config) | estimator_start_parameters(start)
         for name, value in (parameters | {RESET_PARAMETER: 1}).items():
@@ -175,7 +176,8 @@ class MockLink:
         return None
 
     def close(self) -> None:
-        """Wait, bounded, until nothing flies any more, and disarm it, as the real link does."""
+        """Wait, bounded, until the vehicle no longer flies, and disarm it, as the real link
+        does."""
         end_s = self.now_s + 6.0
         while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:
             self.advance_to(self.now_s + 0.1)

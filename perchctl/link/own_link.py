@@ -1,4 +1,4 @@
-"""Your own link to a vehicle, in threads that keep its errors and hangs away from the flight."""
+"""Run your own link to a vehicle in threads that isolate its errors and hangs from the flight."""
 
 from __future__ import annotations
 
@@ -25,36 +25,37 @@ from perchctl.vehicle import (
 
 READ_PERIOD_S = 0.005
 SAMPLE_AHEAD_S = 0.1
-"""A sample may be so much ahead of the loop's clock; else it is of another clock."""
+"""Largest time by which a sample may be ahead of the loop's clock, s; otherwise it uses another
+clock."""
 
 
 class GuardedLink:
     """`perchctl.link.protocol.Link` around your own link.
 
-    A reader thread asks it for telemetry and problems, and the `Sender`'s threads hand it commands
-    and ask the watchdog, so nothing waits for a call of it that hangs. An error that it raises, an
-    invalid sample, or a call longer than `LIBRARY_HANG_S` counts as a lost link, until it works
-    again; errors of `send` do once they last for `LIBRARY_HANG_S`.
+    A reader thread calls it for telemetry and problems, and the threads of the `Sender` pass it
+    commands and call the watchdog, so that nothing waits for a call that hangs. An exception, an
+    invalid sample, or a call longer than `LIBRARY_HANG_S` counts as a lost link until it works
+    again; exceptions of `send` count once they last for `LIBRARY_HANG_S`.
     """
 
     def __init__(self, inner: VehicleLink, clock: Callable[[], float]) -> None:
         self._inner, self._clock, self.decks = inner, clock, inner.decks
         self._lock = threading.Lock()
-        self._waiting: list[Telemetry] = []  # that the loop has not taken yet
+        self._waiting: list[Telemetry] = []  # samples that the loop has not taken yet
         self._newest: Telemetry | None = None
-        self._trouble: str | None = None  # the link's own word, or its error, of the last round
+        self._trouble: str | None = None  # the link's own problem or exception in the last round
         self._answered_s: float | None = None  # end of the reader's last round
-        self._was_armed = False  # by an order of this session
+        self._was_armed = False  # armed by an order of this session
         self._first_sample, self._closing = threading.Event(), threading.Event()
         self._guard: Guard | None = None
         self._on_sent: SentCallback = ignore_sent
         self._sender = Sender(self._hand_over, self._ask, clock, lambda sent: self._on_sent(sent))
 
     def connect(self) -> None:
-        """Connect, and see that the vehicle is not armed yet.
+        """Connect, and check that the vehicle is not armed yet.
 
-        Raises TimedOut without telemetry, by which alone that can be known, and ConnectionFailed if
-        it is armed: its propellers would turn before the operator has said yes.
+        Raises TimedOut without telemetry, which the check needs, and ConnectionFailed if the
+        vehicle is armed: its propellers would spin before the operator has confirmed the flight.
         """
         self._inner.connect()
         self._answered_s = self._clock()
@@ -88,14 +89,14 @@ class GuardedLink:
         return self._sender.trouble() or hangs or self._trouble
 
     def new_notes(self) -> list[str]:
-        """Sentences on what went wrong and did not matter, since the last call."""
+        """Return sentences about harmless failures since the last call."""
         return self._sender.new_notes()
 
     def set_guard(self, guard: Guard, on_sent: SentCallback = ignore_sent) -> None:
         self._guard, self._on_sent = guard, on_sent
 
     def close(self) -> None:
-        """Wait, bounded, until nothing flies, disarm it, and close the inner link."""
+        """Wait, bounded, until the vehicle no longer flies, disarm it, and close the inner link."""
         self._sender.drain(1.0)
         end_s = time.monotonic() + (0.0 if self._answered_s is None else LANDING_WAIT_S)
         while may_be_flying(self._newest, self._clock()) and time.monotonic() < end_s:
@@ -109,7 +110,7 @@ class GuardedLink:
         )
         self._closing.set()
         self._sender.stop()
-        with suppress(Exception):  # the flight is over, and its report counts
+        with suppress(Exception):  # the flight is over, and its report matters more
             self._inner.close()
         if self._was_armed and not disarmed:
             warn_of_armed("the vehicle of your own link")
@@ -118,7 +119,7 @@ class GuardedLink:
         try:
             self._inner.send(command)
         except BaseException as error:
-            # The sender counts it and tries again; SystemExit would end its thread.
+            # The sender counts the error and retries; SystemExit would end its thread.
             raise RuntimeError(f"send() raised {error_at(error)}") from error
 
     def _ask(self) -> Command | None:
@@ -127,7 +128,7 @@ class GuardedLink:
         return None if self._guard is None else self._guard(self._clock(), newest, waiting)
 
     def _read(self) -> None:
-        """Ask until the link is closed, after an error too: a landing needs the telemetry."""
+        """Read until the link is closed, even after errors, since a landing needs the telemetry."""
         while not self._closing.wait(READ_PERIOD_S):
             try:
                 samples = [self._checked(sample) for sample in self._inner.telemetry()]

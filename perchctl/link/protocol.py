@@ -1,4 +1,4 @@
-"""The link's protocol: what a flight needs of a vehicle's link."""
+"""The interface between a flight and a vehicle's link."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
 LANDING_WAIT_S = 6.0
-"""How long a link that is closed waits for a vehicle that still flies."""
+"""Time for which a closing link waits for a vehicle that still flies, s."""
 SentCallback = Callable[[SentCommand], None]
-"""Called with what a link sends in the loop's place; neither waits nor raises."""
+"""Called with each command that a link sends in the loop's place; neither waits nor raises."""
 
 
 def ignore_sent(sent: SentCommand) -> None:
-    """A `SentCallback` that does nothing with what was sent."""
+    """Ignore the command; a `SentCallback`."""
     return
 
 
 Guard = Callable[[float, Telemetry | None, Sequence[Telemetry]], Command | None]
-"""Returns what the link has to send now in the loop's place, None almost always; it gets the time,
-the newest telemetry, and what the loop has not taken in yet, oldest first. Called about every
-50 ms, in a thread of the link's own where it has one, but not while a command waits that cannot go
-out."""
+"""Returns the command that the link must send in the loop's place, nearly always None. Its
+arguments are the time, the newest telemetry, and the samples that the loop has not taken yet,
+oldest first. It is called about every 50 ms, in a thread of the link if it has one, but not while a
+command is waiting to be sent."""
 
 
 class Link(Protocol):
-    """A vehicle: simulated in lockstep, or behind cflib.
+    """A vehicle: simulated in lockstep, or connected by cflib.
 
-    All methods but `send_external` are called from the flight loop's thread. Errors are
-    `perchctl.errors.ConnectionFailed`, `NotFound` or `TimedOut`.
+    All methods but `send_external` are called from the flight loop's thread. They raise
+    ConnectionFailed, NotFound or TimedOut of `perchctl.errors`.
     """
 
     def connect(self) -> None:
-        """Connect, check the firmware, set parameters, unlock the thrust. Bounded. Arms nothing:
-        a vehicle that does not arm itself is sent `Arm` once it is to take off."""
+        """Connect, check the firmware, set parameters and unlock the thrust. Bounded. Arms nothing:
+        a vehicle that does not arm itself receives `Arm` just before take-off."""
 
     def decks(self) -> tuple[str, ...]:
-        """The decks that the connected vehicle found at boot, by the firmware's names."""
+        """Return the decks that the connected vehicle found at boot, by the firmware's names."""
 
     def telemetry(self) -> list[Telemetry]:
-        """The samples that arrived since the last call, oldest first."""
+        """Return the samples that arrived since the last call, oldest first."""
 
     def send(self, command: Command) -> None:
-        """Hand one command to the vehicle. Never blocks for long."""
+        """Send one command to the vehicle. Never blocks for long."""
 
     def send_external(self, place: ExternalPosition) -> bool:
-        """Hand an external position to the vehicle, at once or not at all: never queued, raises
-        nothing. Returns True if it went out. Called from the thread of the position feed."""
+        """Send an external position to the vehicle, at once or not at all: never queued, raises
+        nothing. Returns True if it was sent. Called from the thread of the position feed."""
 
     def problem(self, now_s: float) -> str | None:
         """Return None while the link works, otherwise one sentence with the cause."""
@@ -60,61 +60,65 @@ class Link(Protocol):
         """Call `guard` regularly from now on, until the link is closed.
 
         `on_sent` is called with each command that the link has sent in the loop's place: the
-        guard's, an order repeated after the link was lost, and the farewell; from the link's own
-        thread if it has one.
+        guard's, an order repeated after a lost link, and the farewell. It is called from the link's
+        own thread if it has one.
         """
 
     def close(self) -> None:
-        """Close the link, after a bounded wait until the vehicle no longer flies. A vehicle on
-        the ground that does not arm itself is disarmed, whatever has ended the session."""
+        """Close the link, after a bounded wait until the vehicle no longer flies. A vehicle on the
+        ground that does not arm itself is disarmed, whatever ended the session."""
 
 
 class VehicleLink(Protocol):
-    """Your own link. Its class is called with the loop's clock, which returns seconds, and the
-    profile's section `link`.
+    """Your own link. Its class is called with the loop's clock, a function that returns seconds,
+    and the profile's section `link`.
 
-    `telemetry` and `problem` are called in one thread, 200 times a second, `send` in another one
-    (after a hang in a new one). An error of the first two, errors of `send` for 0.5 s, or a call
-    longer than 0.5 s, count as a lost link: perchctl goes on sending, and lands the vehicle.
+    `telemetry` and `problem` are called in one thread, 200 times a second, and `send` in another
+    one (after a hang, in a new one). An exception of the first two, exceptions of `send` for 0.5 s,
+    or a call longer than 0.5 s count as a lost link: perchctl continues to send, and lands the
+    vehicle.
     """
 
     def connect(self) -> None:
         """Connect to a vehicle on the ground, and prepare it for a flight; bounded in time. Must
-        not turn a motor, and so not arm: nobody has been asked yet, and perchctl refuses a vehicle
-        that is armed without `AUTO_ARM`, or gives no telemetry within 3 s. Raises one of
-        `perchctl.errors`, such as ConnectionFailed."""
+        not spin a motor and therefore must not arm, since nobody has confirmed the flight yet.
+        perchctl refuses a vehicle that is armed without `AUTO_ARM`, or that sends no telemetry
+        within 3 s. Raises one of `perchctl.errors`, such as ConnectionFailed."""
 
     def decks(self) -> tuple[str, ...]:
-        """Decks that measure the vehicle's position, by the firmware's names (bcFlow2, ...)."""
+        """Return the decks that measure the vehicle's position, by the firmware's names (bcFlow2,
+        ...)."""
 
     def telemetry(self) -> list[Telemetry]:
-        """The samples (`perchctl.vehicle.Telemetry`: SI, right-handed, `t_s` on the loop's clock)
-        that arrived since the last call, oldest first; at best 100 a second.
+        """Return the samples (`perchctl.vehicle.Telemetry`: SI, right-handed, `t_s` on the loop's
+        clock) that arrived since the last call, oldest first; ideally 100 per second.
 
-        Take-off also asks for `battery_v`, `velocity_variance_m2ps2` and `height_variance_m2` (with
-        a Lighthouse or Loco deck `position_variance_m2`): a profile names what is never reported
-        in `link.unreported`."""
+        Take-off also requires `battery_v`, `velocity_variance_m2ps2` and `height_variance_m2` (with
+        a Lighthouse or Loco deck, `position_variance_m2`); a profile lists values that are never
+        reported in `link.unreported`.
+        """
 
     def send(self, command: Command) -> None:
-        """Hand one command of `perchctl.vehicle` to the vehicle, about 50 times a second.
-        Without a next one it must level out by itself after 0.5 s, and stop after 2 s.
+        """Send one command of `perchctl.vehicle` to the vehicle, about 50 times a second. Without a
+        next command, the vehicle must level out by itself after 0.5 s, and stop after 2 s.
 
         `Arm(True)` comes just before take-off, if the telemetry's bits are `CAN_ARM` without
         `AUTO_ARM` and `CAN_FLY`; `Arm(False)` after a session, on the ground, if they are `ARMED`
-        without `AUTO_ARM`."""
+        without `AUTO_ARM`.
+        """
 
     def problem(self, now_s: float) -> str | None:
-        """None while the link works, otherwise one sentence with the cause."""
+        """Return None while the link works, otherwise one sentence with the cause."""
 
     def close(self) -> None:
-        """Disconnect; called when nothing flies any more, at the latest after 6 s."""
+        """Disconnect; called when the vehicle no longer flies, at the latest after 6 s."""
 
 
 # --- The forms of a vehicle's URI ---
 
 
 USUAL_ADDRESS = "E7E7E7E7E7"
-_USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio's URI that names none
+_USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio URI without them
 _CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
 FORMS = {
     "sim": "",
@@ -143,12 +147,12 @@ log in again, and plug the radio or the vehicle in again."""
 
 
 def is_own_uri(uri: str) -> bool:
-    """True for your own link, ``my_module:MyLink``; a scheme such as ``radio`` is no module."""
+    """True for your own link, ``my_module:MyLink``; a scheme such as ``radio`` is not a module."""
     return has_extension_form(uri, FORMS)
 
 
 def check_uri(uri: str) -> str:
-    """Return the URI's scheme. Raises InvalidValue unless the URI is one of a vehicle."""
+    """Return the URI's scheme. Raises InvalidValue if the URI does not identify a vehicle."""
     scheme, _, rest = uri.partition("://")
     fits = "://" in uri and scheme in FORMS and re.fullmatch(FORMS[scheme], rest)
     if not fits or (scheme == "udp" and int(rest.rpartition(":")[2]) > 65535):
@@ -157,7 +161,7 @@ def check_uri(uri: str) -> str:
 
 
 def vehicle_uri(uri: str) -> str:
-    """Return one text for all URIs of a vehicle: without dongle, letter case and options."""
+    """Return the same text for all URIs of a vehicle: without dongle, letter case and options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
     if scheme == "radio":

@@ -1,13 +1,13 @@
-"""Hands commands to a library that may block, fail or hang, so that the flight loop never does.
+"""Pass commands to a library that may block, fail or hang, so that the flight loop never does.
 
-Two threads. The first hands the commands over, in pieces (a landing is four packets), and may
-hang in the library with one. The second never touches the library: it asks the `guard` what has
-to be sent while the loop hangs, and gives the work to a new first thread where the old one hangs.
-No error ends a thread.
+There are two threads. The first passes the commands on, in pieces (a landing is four packets), and
+may hang in the library with one. The second never calls the library: it asks the `guard` for a
+command to send while the loop hangs, and replaces a hanging first thread by a new one. No error
+ends a thread.
 
-Setpoints coalesce (only the newest counts), and one that has waited too long is dropped, as is an
-arming request. Orders keep their place until the library has taken them, however long that takes;
-an emergency stop takes everybody's place.
+Setpoints coalesce (only the newest counts). A setpoint that has waited too long is dropped, and so
+is an arming request. Orders keep their place until the library has accepted them, however long that
+takes; an emergency stop replaces all waiting commands.
 """
 
 from __future__ import annotations
@@ -27,25 +27,27 @@ from perchctl.vehicle import Arm, Command, EmergencyStop, PositionSetpoint, RawT
 
 _STREAMED = (PositionSetpoint, RawThrust)
 _EXPIRING = (*_STREAMED, Arm)
-"""What is for its own moment only: dropped when it is stale, and never repeated on its own. An
-arming request that comes late would turn the propellers after the session has ended."""
+"""Commands that are valid only for a short time: dropped when stale, and never repeated
+automatically. A late arming request would spin the propellers after the session has ended."""
 STALE_COMMAND_S = 0.25
-"""What expires and has waited longer, behind a command that hung, is for another moment."""
+"""Waiting time after which such a command is stale, s, for example behind a command that hung."""
 GUARD_PERIOD_S = 0.05
 LIBRARY_HANG_S = 0.5
-"""For so long the library may hold one piece, or fail (docs/firmware.md, "Silence")."""
+"""Longest time for which the library may hold one piece, or fail, s (docs/firmware.md,
+"Silence")."""
 SEND_RETRY_S = 0.002
-"""Until a piece that found no room is offered again: about what one packet takes by radio."""
+"""Time until a piece that found no room is offered again, s: about the duration of one packet by
+radio."""
 NOTED_EVERY_S = 1.0
-"""Errors are noted so often at most."""
+"""Shortest time between notes about errors, s."""
 
 
 @dataclass(eq=False)
 class _Waiting:
-    """A command from `put` until the library has all of it.
+    """A command from `put` until the library has accepted all of it.
 
-    `rest` is None until the first attempt, then the pieces that are still to be handed over;
-    `begun` once one has been.
+    `rest` is None until the first attempt, then the pieces that are still to be passed on; `begun`
+    is True once one has been.
     """
 
     put_s: float
@@ -56,18 +58,18 @@ class _Waiting:
 
 
 class Sender:
-    """Hands commands to a library, from its creation to `stop`.
+    """Pass commands to a library, from its creation to `stop`.
 
-    `hand_over` gives one piece to the library; after False, for want of room, the piece is offered
-    again. `guard` returns the command to send in the loop's place, mostly None. `on_sent` is called
-    with each such command, once the library has it.
+    `hand_over` passes one piece to the library; it returns False if there is no room, and the piece
+    is then offered again. `guard` returns the command to send in the loop's place, usually None.
+    `on_sent` is called with each such command once the library has accepted it.
 
-    `pieces` splits a command. `tend` looks after the link, and must not block: the guard's thread
-    calls it after the guard, with `stuck_s` and with True if the library has held one piece, or
-    raised errors, for longer than `LIBRARY_HANG_S`. `spare` is called by the first thread when
-    no command waits; it may hand over something of its own, and returns True if it did.
+    `pieces` splits a command. `tend` maintains the link, and must not block: the guard's thread
+    calls it after the guard, with `stuck_s`, and with True if the library has held one piece, or
+    raised errors, for longer than `LIBRARY_HANG_S`. `spare` is called by the first thread when no
+    command waits; it may pass on a packet of its own and then returns True.
 
-    `errors` counts the attempts to send that failed.
+    `errors` counts the failed attempts to send.
     """
 
     def __init__(
@@ -90,27 +92,28 @@ class Sender:
         self._spare = spare
         self._queue: deque[_Waiting] = deque()
         self._ready = threading.Condition()
-        self._stopped = threading.Event()  # apart, so that a command does not wake the guard
-        self._waiting_since_s: float | None = None  # for the library to take the next piece
-        self._called_s: float | None = None  # when the library was called, until it returns
-        self._held_since_s: float | None = None  # the call that was too long at the last look
-        self._raised = False  # by the library, at the last attempt
+        self._stopped = threading.Event()  # separate, so that a command does not wake the guard
+        # since when the next piece has been waiting for the library
+        self._waiting_since_s: float | None = None
+        self._called_s: float | None = None  # start of the present call of the library
+        self._held_since_s: float | None = None  # the call that was too long at the last check
+        self._raised = False  # the library raised an error at the last attempt
         self._last: tuple[float, Command] | None = None
         self._running = True
         self.errors, self._error = 0, ""
-        self._failing_since_s: float | None = None  # the first error since the last success
-        self._keeper_error: str | None = None  # of the second thread's last round
-        self._noted, self._noted_s = 0, -math.inf  # of the errors
+        self._failing_since_s: float | None = None  # first error since the last success
+        self._keeper_error: str | None = None  # error of the second thread's last round
+        self._noted, self._noted_s = 0, -math.inf  # state of the notes about errors
         with self._ready:
             self._start_worker()
         self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
         self._keeper.start()
 
     def put(self, command: Command, by: str | None = None) -> None:
-        """Queue a command; `by`: who sends it in the loop's place, None for the loop."""
+        """Queue a command; `by` names the sender in the loop's place, None for the loop."""
         with self._ready:
             if isinstance(command, EmergencyStop):
-                self._queue.clear()  # nothing that was ordered before it matters any more
+                self._queue.clear()  # earlier orders are obsolete
             elif self._queue and self._is_replaced(self._queue[-1], command):
                 self._queue.pop()
             self._queue.append(_Waiting(self._clock(), command, by))
@@ -119,7 +122,8 @@ class Sender:
             self._ready.notify_all()
 
     def repeat_order(self, since_s: float) -> None:
-        """Queue the newest order again if it was handed over since `since_s`: it may be lost."""
+        """Queue the newest order again if it was passed on since `since_s`, since it may be
+        lost."""
         with self._ready:
             if self._last is None:
                 return
@@ -129,12 +133,12 @@ class Sender:
             self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """The seconds for which no waiting command was taken; 0 if no command waits."""
+        """Return the seconds for which no waiting command was accepted; 0 if none waits."""
         since_s = self._waiting_since_s
         return 0.0 if since_s is None else self._clock() - since_s
 
     def trouble(self) -> str | None:
-        """A sentence on why no command goes out, else None."""
+        """Return a sentence on why no command is sent, else None."""
         if self._keeper_error is not None:
             return self._keeper_error
         since_s = self._failing_since_s
@@ -148,7 +152,8 @@ class Sender:
         return None
 
     def new_notes(self) -> list[str]:
-        """A sentence with the number of errors if there are new ones, at most once a second."""
+        """Return a sentence with the number of errors if there are new ones, at most once a
+        second."""
         now_s, errors = self._clock(), self.errors
         if errors == self._noted or now_s - self._noted_s < NOTED_EVERY_S:
             return []
@@ -157,7 +162,7 @@ class Sender:
         return [f"sending a command has failed {times} so far, and was tried again: {self._error}"]
 
     def drain(self, timeout_s: float) -> bool:
-        """Wait until all commands are handed over; return False after `timeout_s`."""
+        """Wait until all commands are passed on; return False after `timeout_s`."""
         end_s = time.monotonic() + timeout_s
         with self._ready:
             while self._queue:
@@ -175,11 +180,11 @@ class Sender:
         for thread in (self._worker, self._keeper):
             thread.join(timeout=1.0)
 
-    # --- the first thread ---
+    # --- first thread ---
 
     def _start_worker(self) -> None:
         worker = threading.Thread(target=self._work, name="perchctl-sender", daemon=True)
-        worker.start()  # an error leaves the old one, and the next look tries again
+        worker.start()  # if it fails, the old thread stays, and the next check tries again
         self._called_s, self._worker = None, worker
 
     def _work(self) -> None:
@@ -199,7 +204,7 @@ class Sender:
                 elif not self._spare():
                     pause_s = GUARD_PERIOD_S
                 self._raised = False
-            except BaseException as error:  # the library's, whatever it is: this thread goes on
+            except BaseException as error:  # any error of the library; this thread continues
                 self._note_error(error)
                 if waiting is not None and self._failing_since_s is None:
                     self._failing_since_s = self._clock()
@@ -209,18 +214,18 @@ class Sender:
                     return
                 self._called_s = None
                 if waiting is None and self._queue:
-                    pause_s = 0.0  # something came meanwhile
+                    pause_s = 0.0  # a command arrived meanwhile
 
     def _note_error(self, error: BaseException) -> None:
         self.errors += 1
         self._error = (str(error).strip() or type(error).__name__).splitlines()[0]
 
     def _is_mine(self) -> bool:
-        """True while the work is this thread's: not once it was found hanging."""
+        """True while this thread is the present worker: False once it was found hanging."""
         return self._running and self._worker is threading.current_thread()
 
     def _next(self) -> _Waiting | None:
-        """The first command; it stays queued until the library has all of it."""
+        """Return the first command; it stays queued until the library has accepted all of it."""
         while self._queue:
             first = self._queue[0]
             stale = self._clock() - first.put_s > STALE_COMMAND_S
@@ -231,20 +236,21 @@ class Sender:
         return None
 
     def _send(self, waiting: _Waiting) -> float:
-        """Hand the next piece over, if there is room. Returns the seconds to pause for."""
+        """Pass on the next piece if there is room. Return the seconds to pause."""
         at_s = self._clock()
         if waiting.rest is None:
             try:
                 waiting.rest = deque(self._pieces(waiting.command))
             except Exception:
-                self._remove(waiting)  # it will never be better: lost, and a trouble at once
+                # a retry cannot succeed: drop the command, and report trouble at once
+                self._remove(waiting)
                 self._failing_since_s = -math.inf
                 raise
         if waiting.rest and self._hand_over(waiting.rest[0]) is False:
             return SEND_RETRY_S
         with self._ready:
             if not self._is_mine():
-                return 0.0  # the next thread has begun with the same piece
+                return 0.0  # the next thread has started with the same piece
             self._called_s = self._failing_since_s = None
             if waiting.rest:
                 waiting.rest.popleft()
@@ -255,13 +261,14 @@ class Sender:
             self._last = at_s, waiting.command
             self._remove(waiting)
         if waiting.by is not None:
-            with suppress(Exception):  # whatever looks on: the next one goes out all the same
+            # any error of an observer; the next command is sent all the same
+            with suppress(Exception):
                 self._on_sent(SentCommand(at_s, waiting.by, waiting.command))
         return 0.0
 
     def _remove(self, waiting: _Waiting) -> None:
         with self._ready:
-            with suppress(ValueError):  # an emergency stop has taken its place
+            with suppress(ValueError):  # an emergency stop has replaced it
                 self._queue.remove(waiting)
             if not self._queue:
                 self._done()
@@ -271,13 +278,13 @@ class Sender:
         self._ready.notify_all()
 
     def _is_replaced(self, last: _Waiting, command: Command) -> bool:
-        """True for a setpoint, which anything replaces, and for an order of which nothing has gone
-        out, which its like replaces."""
+        """True for a setpoint, which any command replaces, and for an order of which no piece was
+        sent, which an order of the same type replaces."""
         if isinstance(last.command, _STREAMED):
             return True
         return not last.begun and type(last.command) is type(command)
 
-    # --- the second thread ---
+    # --- second thread ---
 
     def _keep(self) -> None:
         while not self._stopped.wait(GUARD_PERIOD_S):
@@ -285,14 +292,15 @@ class Sender:
             for part in (self._look_after_worker, self._run_guard):
                 try:
                     part()
-                except BaseException as error:  # this thread goes on, whatever it is
+                except BaseException as error:  # any error; this thread continues
                     failed = f"the link is not looked after: {error}"
             self._keeper_error = failed
 
     def _look_after_worker(self) -> None:
         called_s, stuck_s = self._called_s, self.stuck_s()
         too_long = called_s is not None and self._clock() - called_s > LIBRARY_HANG_S
-        # At two looks: after a suspension of the computer the first finds every call too long.
+        # Requires two checks, since after a suspension of the computer the first one finds every
+        # call too long.
         hangs = too_long and called_s == self._held_since_s
         self._held_since_s = called_s if too_long else None
         try:

@@ -1,7 +1,7 @@
-"""Telemetry by cflib's log blocks: their variables, and the samples that their packets make.
+"""Telemetry from cflib's log blocks: their variables, and the assembly of packets to samples.
 
-Here, and only here, degrees become radians and the Crazyflie's nose-up pitch
-becomes the right-handed nose-down one (docs/firmware.md, "Signs and units").
+Only this module converts degrees to radians, and the Crazyflie's nose-up pitch to the right-handed
+nose-down pitch (docs/firmware.md, "Signs and units").
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from perchctl.link.crtp import Packet, Port
 from perchctl.vehicle import Telemetry
 
 STATE_BLOCK = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx", "vy", "vz")}
-"""24 of the 26 bytes that a log block holds."""
+"""Uses 24 of the 26 bytes of a log block."""
 
 ATTITUDE_BLOCK: dict[str, str] = {
     "stateEstimate.roll": "float",
@@ -30,16 +30,16 @@ ATTITUDE_BLOCK: dict[str, str] = {
     "stabilizer.thrust": "float",
     "supervisor.info": "uint16_t",
 }
-"""All 26 bytes: half floats resolve a force of 0.1 g to 0.1 mg."""
+"""Uses all 26 bytes: half floats resolve a force of 0.1 g to 0.1 mg."""
 
 BATTERY_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
-"""Without it the battery is unknown, which the flight copes with (fault 7)."""
+"""Without this block, the battery is unknown, which the flight tolerates (fault 7)."""
 
 POSITION_VARIANCES = tuple(f"kalman.var{axis}" for axis in "XYZ")
 VELOCITY_VARIANCES = tuple(f"kalman.varP{axis}" for axis in "XYZ")
-"""`P` is the filter's letter for the velocity, in body axes (docs/firmware.md, "Variances")."""
+"""The filter's letter for the velocity in body axes is `P` (docs/firmware.md, "Variances")."""
 VARIANCE_BLOCK = dict.fromkeys((*POSITION_VARIANCES, *VELOCITY_VARIANCES), "float")
-"""24 bytes; only where the firmware has the Kalman estimator."""
+"""Uses 24 bytes; only if the firmware has the Kalman estimator."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
@@ -54,7 +54,7 @@ def telemetry_from_log(
     variance_behind_s: float = 0.0,
 ) -> Telemetry:
     """Return telemetry from log variables by name; the other arguments as in `Telemetry`. Raises
-    KeyError when a needed value is missing."""
+    KeyError if a needed value is missing."""
     x_m, y_m, z_m, vx_mps, vy_mps, vz_mps = (values[name] for name in STATE_BLOCK)
     return Telemetry(
         t_s=t_s,
@@ -82,31 +82,32 @@ def telemetry_from_log(
 
 
 def _largest(values: Mapping[str, float], names: Sequence[str]) -> float | None:
-    """The largest of these variances, NaN if one is; None where one is missing, or zero: a filter
-    that runs keeps each at 1e-6 at least, one that never ran has zeros (source)."""
+    """Return the largest of these variances, NaN if one is. Return None if one is missing or zero:
+    a running filter keeps each at 1e-6 at least, and one that never ran has zeros (source)."""
     found = [values.get(name, 0.0) for name in names]
     if any(variance == 0.0 for variance in found):
         return None
     return math.nan if any(map(math.isnan, found)) else max(found)
 
 
-# --- The vehicle's milliseconds on the loop's clock ---
+# --- Conversion of the vehicle's milliseconds to the loop's clock ---
 
 
 WRAP_MS = 1 << 24
-"""Log time stamps have three bytes (docs/firmware.md, "Link")."""
+"""Period of the log time stamps, which have three bytes (docs/firmware.md, "Link")."""
 CLOCK_SKEW = 1e-4
-"""How fast the two clocks may run apart: far above a crystal's, far below a fault's."""
+"""Largest difference in rate of the two clocks: far above a crystal's, far below a fault's."""
 REBOOTED_MS = 1000
-"""Stamps that fall back by more are those of another start; packets overtake by far less."""
+"""Backward step of the stamps above which the vehicle has restarted, ms; reordered packets step
+back by far less."""
 
 
 class Timebase:
-    """Maps log time stamps to the loop's clock by the fastest delivery seen so far.
+    """Map log time stamps to the loop's clock, using the fastest delivery seen so far.
 
-    The smallest difference between arrival and stamp belongs to the packet that waited least;
-    it may grow slowly, so that a drifting clock is followed. A vehicle that has started again is
-    followed from its first stamp on; `start` counts how often it has.
+    The smallest difference between arrival and stamp belongs to the packet that waited least. The
+    difference may grow slowly, to follow a drifting clock. After a restart of the vehicle, the
+    mapping restarts at its first stamp; `start` counts the restarts.
     """
 
     def __init__(self) -> None:
@@ -117,7 +118,8 @@ class Timebase:
         self._last_arrival_s = 0.0
 
     def to_loop_s(self, stamp_ms: int, arrival_s: float) -> float:
-        """The loop's time of a log packet with stamp `stamp_ms` that came at `arrival_s`."""
+        """Return the loop's time of a log packet with the stamp `stamp_ms` that arrived at
+        `arrival_s`."""
         if self._last_ms is None:
             self._unwrapped_ms = stamp_ms
         else:
@@ -138,7 +140,7 @@ class Timebase:
         return self._unwrapped_ms / 1000.0 + self._offset_s
 
 
-# --- From the packets of the log blocks to samples: for the radio's and for the simulated ones --
+# --- Assembly of samples from log packets, for the radio and the simulation ---
 
 
 BLOCKS: dict[str, dict[str, str]] = {
@@ -147,33 +149,35 @@ BLOCKS: dict[str, dict[str, str]] = {
     "state": STATE_BLOCK,
     "attitude": ATTITUDE_BLOCK,
 }
-"""In the order in which those of one time are sent, what completes a sample last."""
+"""In the order in which blocks of the same time are sent; the one that completes a sample is
+last."""
 FAST_BLOCKS = ("state", "attitude")
-"""A sample needs these; the others come ten times a second, where the firmware has them."""
+"""A sample requires these blocks; the others arrive ten times a second if the firmware has them."""
 SLOW_PERIOD_S = 0.1
 MOST_CARRIED_S = 0.05
 
 
 class SampleAssembler:
-    """Makes telemetry samples of the newest values of all log blocks.
+    """Assemble telemetry samples from the newest values of all log blocks.
 
-    Only the attitude's block completes a sample; the other values are the last that came. By how
-    much each other block is older is written into the sample (`Telemetry.behind_s` and the like),
-    since frozen numbers look like a vehicle at rest.
+    Only the attitude block completes a sample; the other values are the last ones that arrived. The
+    sample contains how much older each other block is (`Telemetry.behind_s` and similar fields),
+    since frozen values look like a vehicle at rest.
     """
 
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
-        self._came_s: dict[str, float] = {}  # of each block since the newest start
+        self._came_s: dict[str, float] = {}  # time of each block since the newest restart
         self._start = 0
 
     def accept(
         self, block: str, values: Mapping[str, float], t_s: float, start: int = 0
     ) -> Telemetry | None:
-        """Take one packet of a block and return the sample that it completes, if any.
+        """Process one packet of a block, and return the sample that it completes, if any.
 
         `t_s` is the packet's stamp on the loop's clock, `start` as in `Timebase`; values from
-        before the newest start are dropped."""
+        before the newest restart are dropped.
+        """
         if start < self._start:
             return None
         if start > self._start:
@@ -194,7 +198,7 @@ class SampleAssembler:
 
 
 def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
-    """The values with the position carried on to the attitude block's time."""
+    """Return the values with the position extrapolated to the time of the attitude block."""
     carried = dict(values)
     step_s = max(-MOST_CARRIED_S, min(MOST_CARRIED_S, ahead_s))
     for axis in "xyz":
@@ -202,17 +206,20 @@ def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
     return carried
 
 
-# --- cflib's log blocks: started, collected by cflib's thread, and started again after a silence
-# in which the vehicle has forgotten them.
+# --- cflib's log blocks ---
+# They are started, collected by cflib's thread, and restarted after a silence in which the vehicle
+# has deleted them.
 
 
 FIRST_SAMPLE_TIMEOUT_S = 3.0
 AWAIT_SLOW_S = 1.0
-"""The first sample waits that long for the slow blocks."""
+"""Time for which the first sample waits for the slow blocks, s."""
 BLOCKS_DELETED_AFTER_S = 1.0
-"""Without radio for so long a vehicle deletes them (docs/firmware.md, "Radio silence")."""
+"""Time without radio after which a vehicle deletes its log blocks, s (docs/firmware.md, "Radio
+silence")."""
 RESUME_PERIOD_S = 0.25
-"""Longer than the slowest block's period: one that was started shows by then."""
+"""Time between attempts to restart blocks, s; longer than the slowest block's period, so that a
+restarted block shows."""
 MOST_TELEMETRY_SAMPLES = 2000
 _SETTINGS, _CREATE, _START = 1, 6, 3  # channel of the log port, and commands
 _PREFIX = "perch_"
@@ -221,7 +228,8 @@ _PREFIX = "perch_"
 class LogBlocks:
     """cflib's log blocks as samples on the loop's clock.
 
-    `newest` is the last sample, None before the first; `last_arrival_s` is when data last came.
+    `newest` is the last sample, None before the first; `last_arrival_s` is the time of the last
+    arrival of data.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -232,17 +240,17 @@ class LogBlocks:
         self._first_sample = threading.Event()
         self._awaited: set[str] = set()  # slow blocks without data so far
         self._started_s = 0.0
-        self._starting: dict[str, list[Packet]] = {}  # what starts each block
-        self._arrived_s: dict[str, float] = {}  # of each block
-        self._resuming: deque[Packet] = deque()  # what has still to go out
+        self._starting: dict[str, list[Packet]] = {}  # packets that start each block
+        self._arrived_s: dict[str, float] = {}  # last arrival of each block
+        self._resuming: deque[Packet] = deque()  # packets still to be sent
         self._resumed_s = 0.0
         self.last_arrival_s = 0.0
         self.newest: Telemetry | None = None
 
     def start(self, log: Any, uri: str, period_s: float) -> None:
-        """Start the blocks in cflib's `log` and wait for the first sample.
+        """Start the blocks in cflib's `log`, and wait for the first sample.
 
-        Raises NotFound for a refused block, TimedOut.
+        Raises NotFound for a refused block, and TimedOut.
         """
         self._started_s = self._clock()
         for name, variables in BLOCKS.items():
@@ -258,19 +266,19 @@ class LogBlocks:
             raise TimedOut(f"{uri} is connected but sends no telemetry")
 
     def take_samples(self) -> list[Telemetry]:
-        """The samples that arrived since the last call, oldest first."""
+        """Return the samples that arrived since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     @property
     def waiting_samples(self) -> list[Telemetry]:
-        """Samples that the next `take_samples` returns; may be read from any thread."""
+        """Samples that the next `take_samples` will return; may be read from any thread."""
         return list(self._samples.copy())
 
     def resume(self, send: Callable[[Packet], bool]) -> bool:
-        """Send one packet of those that restart silent blocks; return True if it went out.
+        """Send one of the packets that restart silent blocks; return True if it was sent.
 
-        To be called from one thread whenever there is room. `send` must not wait. A vehicle that
-        still has a block says so, and starts it again all the same.
+        Must be called from one thread whenever there is room. `send` must not wait. A vehicle that
+        still has a block reports it, and restarts the block anyway.
         """
         now_s = self._clock()
         if not self._resuming and now_s - self._resumed_s > RESUME_PERIOD_S:
@@ -284,7 +292,7 @@ class LogBlocks:
         return True
 
     def _on_data(self, stamp: int, data: dict[str, float], block: Any) -> None:
-        """Take a packet, in cflib's thread."""
+        """Process a packet, in cflib's thread."""
         now_s = self._clock()
         self.last_arrival_s = now_s
         name = block.name.removeprefix(_PREFIX)
@@ -293,7 +301,7 @@ class LogBlocks:
         sent_s = self._timebase.to_loop_s(stamp, now_s)
         sample = self._assembler.accept(name, data, sent_s, self._timebase.start)
         if sample is None or (self._awaited and now_s < self._started_s + AWAIT_SLOW_S):
-            return  # the first sample is to contain the battery too
+            return  # the first sample should contain the battery, too
         self.newest = sample
         self._samples.append(sample)
         self._first_sample.set()
@@ -309,9 +317,9 @@ def start_block(
 ) -> Any:
     """Start a block in cflib's `log` and return it.
 
-    `variables`: their types by name, None for the firmware's own. `period_s` is rounded to 10 ms.
-    `on_data` gets the stamp in ms, the values by name and the block. Raises NotFound for a refused
-    block.
+    `variables` maps names to types, None for the firmware's own type. `period_s` is rounded to 10
+    ms. `on_data` is called with the stamp in ms, the values by name and the block. Raises NotFound
+    for a refused block.
     """
     from cflib.crazyflie.log import LogConfig
 
@@ -329,8 +337,8 @@ def start_block(
 
 
 def _starting(log: Any, block: Any) -> list[Packet]:
-    """The packets by which cflib has a new block created and started (docs/firmware.md, "Log
-    blocks"): one each, since none of perchctl's has more than nine variables."""
+    """Return the packets with which cflib creates and starts a new block (docs/firmware.md, "Log
+    blocks"): one of each, since none of perchctl's blocks has more than nine variables."""
     variables = b"".join(
         struct.pack(
             "<BH", variable.get_storage_and_fetch_byte(), log.toc.get_element_id(variable.name)
