@@ -147,12 +147,12 @@ class Detection:
     corners_px: Array
     sigma_px: float
     refined: bool
-    shift_sigma_px: float = 0.0  # common shift of all edges in the picture, outwards
+    shift_sigma_px: float = 0.0  # standard deviation of the common outward shift of all edges
     # (4, 2): one standard deviation of a shift common to all corners
     common_px: Array | None = None
     cov_px2: Array | None = None
-    row_sigma_px: float = 0.0  # horizontal jitter of rows, as in analogue video
-    lying_sigma_px: float = 0.0  # for sides along the rows if every second row is interpolated
+    row_sigma_px: float = 0.0  # standard deviation due to the jitter of rows in analogue video
+    lying_sigma_px: float = 0.0  # for sides along the rows, if every second one is interpolated
 
 
 @dataclass(frozen=True)

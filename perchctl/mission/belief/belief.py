@@ -92,7 +92,7 @@ class Belief:
 
     # --- motion, target and contact ---
     reckoning: DeadReckoning = field(default_factory=DeadReckoning)
-    last_target_m: Array | None = None  #: world position at the last frame that measured it
+    last_target_m: Array | None = None  #: target's world position in its last measured frame
     target_spread_m: float = 0.0  #: distance between the targets of successive frames
     #: vehicle's velocity from pictures alone
     target_motion: TargetMotion = field(default_factory=TargetMotion)

@@ -452,11 +452,11 @@ _CUT_STILL_PX, _CUT_SETTLED_PX = 0.02, 0.5
 _LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE = 8.0, 0.35  # grey levels; share of the median
 _LEAST_PLACES = 24
 _TUKEY, _LEAST_SCALE_PX = 3.5, 0.15
-_TAILS = 1.3  # share of a residual's square that robust weights remove
+_TAILS = 1.3  # compensates the reduction of squared residuals by robust weights
 _LINE_OFF_PX = 0.02  # error of a whole line, due to lens and light
 # standard deviations of a prediction
 _TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0
-_SHIFT_PX = 0.15  # growth of white over black
+_SHIFT_PX = 0.15  # standard deviation of the growth of white over black
 _PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT_PX]) ** -2.0
 
 

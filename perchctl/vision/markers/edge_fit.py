@@ -140,7 +140,7 @@ MIN_LINE_SIGMA_PX = 0.015
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIERS = 0.5
-_LINE_TAILS = 1.7  # share of a residual's square, and of the samples, that robust weights remove
+_LINE_TAILS = 1.7  # compensates the reduction of squared residuals and samples by the weights
 _BEND, _BEND_BLURS = 0.6, 2.0  # bend of an edge by the next one, a cell away, in units of blur
 _CURVED_REACH = 0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
 CLIPPED_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
@@ -537,7 +537,7 @@ _ALONG32 = ALONG.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
 _WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81
 _MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
-_PER_NEAR = 1.0 / 0.6  # standard deviation of the wide window
+_PER_NEAR = 1.0 / 0.6  # inverse standard deviation of the wide window, times its half length
 _TUKEY = 3.5 * 1.4826
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
 _STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)

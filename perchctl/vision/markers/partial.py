@@ -67,7 +67,7 @@ _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR = 0.9  # share of the window
 _MOST_PART_SIGMA = 0.02  # share of the side: less certain corners are no measurement
 _LEAST_SHIFT_SIGMA_PX = 0.01
-_TAILS = 1.3  # share of a residual's square that robust weights remove
+_TAILS = 1.3  # compensates the reduction of squared residuals by robust weights
 _MAX_STEP = 0.5
 _MOST_OFF_PX = 20.0  # from the start, three windows away: edges cannot move a fit further
 
