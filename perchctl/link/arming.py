@@ -24,6 +24,7 @@ DISARM_S = 2.0
 """Time for which the order is repeated, s. Larger: without a radio, the end of a session is
 delayed. Smaller: a radio that is silent for a moment is given up."""
 DISARM_PERIOD_S = 0.1
+"""Time between two orders to disarm, s."""
 ANSWERED_S = 0.1
 """Time after the order from which a sample shows its effect, s: the supervisor reacts within 40
 ms."""

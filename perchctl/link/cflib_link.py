@@ -57,7 +57,9 @@ from perchctl.vehicle import (
 )
 
 SILENCE_S = 1.5
+"""Time without telemetry that is a problem of the link, s."""
 DRAIN_S = 1.0
+"""Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5
 """Time before the vehicle was last heard, s, from which on packets count as lost with the link."""
 FAREWELL = RawThrust(0)

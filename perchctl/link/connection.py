@@ -20,12 +20,15 @@ from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_folder
 
 CONNECT_TRIES = 2
+"""Number of attempts to connect."""
 LINK_CLOSE_TIMEOUT_S = 3.0
+"""Longest wait for a driver to close, s."""
 RADIO_RETRIES = 100_000
 """Number of successive lost packets after which cflib gives a radio up: about 200 s, instead of 0.2
 s for cflib's own 100. Waiting recovers better: a radio that was given up must negotiate safelink
 again."""
 REOPEN_PAUSE_S = 0.05
+"""Time between two attempts to reopen a driver, s."""
 SAFELINK_S = 0.15
 """Time for a driver to negotiate safelink, s: its ten attempts take 20 to 50 ms."""
 DEAD_S = 0.5

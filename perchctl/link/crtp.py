@@ -65,6 +65,7 @@ class Packet(NamedTuple):
 
 
 LAND_TIMES = 3
+"""Number of times that a landing order is sent."""
 # Port 7: channels, then types of setpoints.
 _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
@@ -138,3 +139,4 @@ Without the first, raw thrust stays 0; without the second, the firmware does not
 landing (docs/firmware.md, "Raw thrust"). Their arrival is not confirmed, and a first raw thrust in
 the air would cut the motors, so they are sent `UNLOCK_TIMES`."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02
+"""Number of repetitions of `UNLOCK_THRUST`, and the time between them, s."""

@@ -32,7 +32,9 @@ ESTIMATOR = "stabilizer.estimator"
 KALMAN = 2
 RESET_PARAMETER = "kalman.resetEstimation"
 RESETS = 3
+"""Number of attempts to reset the estimator."""
 RESET_PULSE_S = 0.1
+"""Time for which the reset parameter is set, s."""
 AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
 """Time for agreement after one reset, and the time that the agreement must last, s; the number of
 resets is bounded by `RESETS`."""

@@ -18,7 +18,9 @@ NEEDED_PROTOCOL = 12
 """Protocol version from firmware 2026.08 on, with the supervisor's own port (docs/firmware.md,
 "Link")."""
 PARAMETER_TIMEOUT_S = 2.0
+"""Time for the answer to a parameter, s."""
 ASKED_TIMES = 10
+"""Number of requests for the kind of vehicle."""
 _VERSION_CHANNEL, _DEVICE_TYPE = 1, b"\x02"
 
 

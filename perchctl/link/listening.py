@@ -61,6 +61,7 @@ class ReadOnlyLink(CflibLink):
 
 
 MOTION_PERIOD_S = 0.01
+"""Period of `MOTION_BLOCK`, s."""
 MOTION_BLOCK = dict.fromkeys(
     (
         "stateEstimate.roll",
@@ -74,6 +75,7 @@ MOTION_BLOCK = dict.fromkeys(
 ) | {"supervisor.info": "uint16_t"}
 """Uses all 26 bytes of a log block."""
 MOST_ATTITUDE_SAMPLES = 20_000
+"""Largest number of samples that wait to be read; older ones are dropped."""
 
 
 class AttitudeLink(ReadOnlyLink):
@@ -128,7 +130,9 @@ class AttitudeLink(ReadOnlyLink):
 
 
 LAST_ECHO_WAIT_S = 0.5
+"""Time for the last echo to arrive, s."""
 ECHO_PERIOD_S = 0.02
+"""Time between echo packets, s."""
 # same length as cflib's own echo, since cflib unpacks every echo as its own
 _ECHO = struct.Struct("<BQ")
 _ECHO_MARK = 1  # cflib's own pings start with 0
@@ -217,6 +221,7 @@ class ProbeLink(ReadOnlyLink):
 
 
 SCAN_TIMEOUT_S = 20.0
+"""Longest search for vehicles, s."""
 
 
 def find_uris_and_problem(uri: str = "") -> tuple[list[str], str]:

@@ -38,8 +38,11 @@ from perchctl.profile import PositioningConfig
 from perchctl.vehicle import FLYING, Arm, Command, ExternalPosition, Telemetry
 
 TELEMETRY_DELAY_S = 0.01
+"""Simulated delay of a log packet, s."""
 SETTLE_S = 1.0
+"""Simulated time before the link is connected, s."""
 WATCH_PERIOD_S = 0.05
+"""Period of the guard, s."""
 
 
 class Radio:

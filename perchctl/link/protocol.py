@@ -118,6 +118,7 @@ class VehicleLink(Protocol):
 
 
 USUAL_ADDRESS = "E7E7E7E7E7"
+"""Default radio address of a Crazyflie."""
 _USUAL = ("2", "2M", USUAL_ADDRESS)  # channel, rate and address of a radio URI without them
 _CHANNEL, _RATE, _ADDRESS = "(12[0-5]|1[01][0-9]|0?[0-9]{1,2})", "(250K|1M|2M)", "[0-9A-Fa-f]{1,10}"
 FORMS = {
@@ -126,6 +127,7 @@ FORMS = {
     "usb": r"\d+",
     "udp": r"[^/:\s]+:0*[1-9]\d{0,4}",
 }
+"""Regular expressions of the URIs, by scheme."""
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
     "most ten hex digits), usb://0, udp://127.0.0.1:19850 (port 1 to 65535)"

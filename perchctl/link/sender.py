@@ -32,6 +32,7 @@ automatically. A late arming request would spin the propellers after the session
 STALE_COMMAND_S = 0.25
 """Waiting time after which such a command is stale, s, for example behind a command that hung."""
 GUARD_PERIOD_S = 0.05
+"""Period of the second thread, s."""
 LIBRARY_HANG_S = 0.5
 """Longest time for which the library may hold one piece, or fail, s (docs/firmware.md,
 "Silence")."""

@@ -42,6 +42,7 @@ VARIANCE_BLOCK = dict.fromkeys((*POSITION_VARIANCES, *VELOCITY_VARIANCES), "floa
 """Uses 24 bytes; only if the firmware has the Kalman estimator."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
+"""Log variables without which there is no telemetry."""
 
 
 def telemetry_from_log(
@@ -154,7 +155,9 @@ last."""
 FAST_BLOCKS = ("state", "attitude")
 """A sample requires these blocks; the others arrive ten times a second if the firmware has them."""
 SLOW_PERIOD_S = 0.1
+"""Period of the slow blocks, s."""
 MOST_CARRIED_S = 0.05
+"""Longest time for which a position is extrapolated, s."""
 
 
 class SampleAssembler:
@@ -212,6 +215,7 @@ def _carried(values: Mapping[str, float], ahead_s: float) -> dict[str, float]:
 
 
 FIRST_SAMPLE_TIMEOUT_S = 3.0
+"""Time for the first sample to arrive, s."""
 AWAIT_SLOW_S = 1.0
 """Time for which the first sample waits for the slow blocks, s."""
 BLOCKS_DELETED_AFTER_S = 1.0
@@ -221,6 +225,7 @@ RESUME_PERIOD_S = 0.25
 """Time between attempts to restart blocks, s; longer than the slowest block's period, so that a
 restarted block shows."""
 MOST_TELEMETRY_SAMPLES = 2000
+"""Largest number of samples that wait to be read; older ones are dropped."""
 _SETTINGS, _CREATE, _START = 1, 6, 3  # channel of the log port, and commands
 _PREFIX = "perch_"
 

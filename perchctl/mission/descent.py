@@ -69,6 +69,7 @@ from perchctl.values import replace
 from perchctl.vehicle import FLYING, HL_ACTIVE, Command, Idle, Land, RawThrust
 
 MANEUVER = Maneuver(descends=True)
+"""Maneuver of a descent, for all of its policies."""
 
 # --- by setpoints, and off the magnet ---
 PEEL_BELOW_M = 0.35

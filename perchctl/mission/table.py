@@ -47,8 +47,11 @@ PHASES: dict[Phase, PhaseDefinition] = {
         ABORTED,
     )
 }
+"""Definition of each phase."""
 EXITS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for row in phase.exits)
+"""The phases' own rows, in the order of `PHASES`."""
 TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXITS)
+"""The built-in table: safety rows first, then the exits of the phases."""
 CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.conditions)
 """The phases' own conditions; `update_belief` updates those of the belief."""
 

@@ -18,7 +18,9 @@ Vector = tuple[float, float, float]
 _time_s = attrgetter("t_s")
 
 KEEP_S = 2.0
+"""Time for which samples are kept, s."""
 SMEARED_S = 0.15
+"""Time over which a jump of the estimate may be spread, s."""
 FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 """Limits of a flight between two samples: 400 deg/s and 2 g. Smaller: a fast motion counts as a
 jump of the estimate."""

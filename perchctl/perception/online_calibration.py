@@ -21,6 +21,7 @@ from perchctl.values import replace
 from perchctl.vision import Attitude, CameraErrors, MarkerPose, PoseSetup
 
 SOLVE_EVERY_S = 1.0
+"""Time between solutions of the sums, s."""
 LIKELY_S = 0.02
 """Standard deviation of the delay below which the factors of the next pictures are computed at that
 delay, s."""
@@ -39,6 +40,7 @@ CHANGED_S = 0.05
 UNKNOWN_SIGMA_S = (USED_LATENCY_S[1] - USED_LATENCY_S[0]) / math.sqrt(12.0)
 """Standard deviation of a latency that may be anywhere within `USED_LATENCY_S`, s."""
 LONGEST_STEP_S = 0.1
+"""Longest time step of the slew-rate limit, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +145,7 @@ def apply_latency(
 
 
 X, Y, HEADING = range(3)
+"""Rows of a frame's measurement."""
 PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
 """Columns: the position (rad for the heading), and the possible causes of its motion."""
 _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
@@ -156,10 +159,13 @@ rest."""
 PICTURE_JITTER_S = 0.008
 """Jitter of single pictures' times, s."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
+"""Lower bounds of the rows' noise, standard deviations."""
 WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
 """Random walk of the estimate's position and attitude within one second, standard deviations."""
 MOST_GAP_S = 0.5
+"""Longest gap between frames, s; after a longer one, the level restarts."""
 GATE_SIGMAS = 5.0
+"""Standard deviations beyond which a change of the target's position is a jump."""
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
 """Factors for the gate beyond the noise: 200 ms, and 0.4 rad."""
 LEAST_RANGE_M = 0.15
@@ -170,6 +176,7 @@ STAMPS_S = 0.003
 LARGE_TURN = 0.03
 """Relative error of a large rotation, since the speeds assume the profile's mounting."""
 LEAST_FRAMES = 30
+"""Number of frames that a solution requires."""
 
 
 @dataclass(frozen=True, eq=False)

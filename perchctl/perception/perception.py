@@ -41,6 +41,7 @@ from perchctl.vision import (
 )
 
 MIRRORED_FRAMES = 5
+"""Number of successive frames that show a mirrored target."""
 
 
 @dataclass(eq=False)

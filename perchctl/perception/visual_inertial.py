@@ -38,6 +38,7 @@ AGREED_MEASURED = 2
 """The same number for a latency that the flight measures: a false correction is undone, and at ten
 pictures per second, a third judgement costs a tenth of a second."""
 STEP_S = 0.02
+"""Step of the delay hypotheses, s."""
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
 TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
 """The hypotheses: delays beyond the profile's without rotation, then rotations of the camera at the
@@ -58,6 +59,7 @@ error."""
 WANDERS_M, WANDERS_MORE = 0.005, 3.0
 ROUGH_M = 0.03  # a sum that moves by this much within a second yields the speed to 0.05 m/s
 ALIKE_S = 3 * STEP_S
+"""Largest difference between delays that agree, s."""
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,13 @@ from perchctl.positioning.feed import BodyPose, CaptureFrame, CaptureSource, Pos
 from perchctl.profile import PositioningConfig
 
 CAPTURE_SILENT_S = 0.3
+"""Time without a frame that is a problem, s."""
 LATE_S = 0.5
 """Time after a burst of late frames during which it explains why no frame is used, s."""
 KEPT = 64
 """Largest number of frames that wait to be read; older ones are dropped."""
 LONGEST_LINE = 300
+"""Bytes that are read of a line of the child's output."""
 UP_TIMEOUT_S = 15.0
 """Time for the child's Python to start, s: a busy computer is not a silent motion capture."""
 _END_TIMEOUT_S = 2.0
@@ -252,6 +254,7 @@ class MotionCapture:
 
 
 START_TIMEOUT_S = 30.0
+"""Time for which the child waits for its set-up, s."""
 MOST_HZ = 500.0
 """Largest frame rate, Hz. No system is faster; faster frames are not measurements and would keep
 the parent busy."""

@@ -22,6 +22,7 @@ from perchctl.places import user_folder
 from perchctl.profile import PositioningConfig
 
 VALID_S = 24 * 3600.0
+"""Time for which a comparison is valid, s."""
 CLOCK_ADJUSTMENT_S = 60.0
 """Largest adjustment of the computer's clock that is not an error, s."""
 AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"

@@ -68,7 +68,9 @@ FEED_HANG_S = 0.2
 """Time without a poll after which the feed counts as blocked, s. Polls come every 10 ms, or once
 per tick in a simulated flight."""
 RATE_OVER_S = 1.0
+"""Time over which the rate of sent positions is counted, s."""
 END_TIMEOUT_S = 1.0
+"""Longest wait for the end of the thread, s."""
 UNSEEN = "the target is not seen"
 STOPPED = "the positions contradict the accelerometer, and are not sent any more"
 BUSY = "the link is busy with something else, and a position does not wait"

@@ -35,12 +35,15 @@ GROUND_FRAMES = 15
 """Number of frames at rest whose median is the target's position: half a second of a 30 Hz
 camera."""
 OLDEST_S = 0.3
+"""Age at which a sighting is no longer sent, s."""
 GATE_M, GATE_MPS, GATE_SIGMAS = 0.10, 0.35, 5.0
 """Allowed distance between estimate and sighting, m, and its growth per second without a sighting,
 m/s: after 2 s without one, a vehicle is displaced by half a metre (docs/firmware.md, "Target as
 position")."""
 GATE_LONGEST_S = 4.0
+"""Longest time without a sighting for which the gate grows, s."""
 WORST_SIGMA_M = 0.05
+"""Largest standard deviation of a pose that is sent, m."""
 LEARN_NEAR_M = 0.3
 """Distance to the target below which the difference between estimate and sightings is learned with
 the time constant `LEARN_NEAR_S`, m."""

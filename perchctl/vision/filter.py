@@ -22,11 +22,13 @@ from perchctl.values import cached_property, replace
 from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
+"""Indices of the state."""
 MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
 TILTS, PRINT = slice(0, 2), slice(2, 4)  # columns of the constant errors
 
 MAX_TRACK_GAP_S = 1.0
+"""Longest gap between two frames of a track, s."""
 MAX_PREDICTION_S = 1.0
 """Longest prediction, s; after it, the target is assumed to stay at the predicted position."""
 

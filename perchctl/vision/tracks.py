@@ -139,10 +139,13 @@ def update_tracks(
 
 
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
+"""Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
+another target captures the lock."""
 RELOCK_S = 0.3
 """Time for which a camera alone must see only the rival, s. Larger: after lost frames, a recording
 has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
 FORGET_S = 10.0
+"""Time after which a lock in the world frame expires, s."""
 ESTABLISHED_FRAMES = 5
 """Number of frames below which a lock yields to a rival that was seen more often."""
 

@@ -17,6 +17,7 @@ from perchctl.values import cached_property
 MarkerName = Literal["large", "small"]
 PictureKind = Literal["whole", "woven", "top", "bottom"]
 MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
+"""The target's markers, the large one first."""
 
 
 class Stage(Enum):

@@ -18,6 +18,7 @@ from perchctl.values import replace
 from perchctl.vehicle import AUTO_ARM, FULL_THRUST, Telemetry, is_battery_reading
 
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Charges (0..1) at which `VOLTS` gives the resting voltage."""
 VOLTS = (3.0, 3.4, 3.64, 3.76, 3.82, 3.86, 3.885, 3.915, 3.955, 3.995, 4.04, 4.1, 4.2)
 """Resting voltage of a cell, V, at each charge in `SHARES` (0..1); slightly below the table in the
 firmware."""
@@ -99,6 +100,7 @@ class Drive:
 
 
 BRUSHED = Drive(full_a=4.4, low_power_v=3.2)
+"""Drive of the vehicles with brushed motors, which arm themselves."""
 BRUSHLESS = Drive(full_a=7.3, low_power_v=3.35)
 """The current of the brushless motors is not published. The value assumes the same current per
 newton as the brushed motors (0.80 N at full thrust, 0.48 N brushed). It is an upper bound because

@@ -340,19 +340,29 @@ def _is_saturated(b: Belief) -> bool:
 
 
 CONTACT = Condition("contact", _is_in_contact, rests_on=Rests.POSITION)
+"""Contact with the target, proven by position, acceleration and thrust."""
 MAGNET_HOLDS = Condition("magnet holds", _magnet_holds, rests_on=Rests.TELEMETRY)
+"""The magnet holds the vehicle: low thrust, and no slip."""
 SLIPPING = Condition("slipping", is_slipping)
+"""The vehicle falls away from the proven contact."""
 WEIGHT_HANGS = Condition("the whole weight hangs", _is_weight_hanging, rests_on=Rests.TELEMETRY)
+"""The whole weight hangs: the motors stand still, and nothing slips."""
 HANGING = Condition("hanging", _is_hanging, rests_on=Rests.POSITION)
+"""Something holds the vehicle up, off the floor."""
 DOWN = Condition("down", _is_down, rests_on=Rests.TELEMETRY)
+"""The motors are off."""
 ON_FLOOR = Condition("on the floor", _is_on_floor, rests_on=Rests.POSITION)
+"""The vehicle stands on the floor."""
 BLOCKED = Condition("blocked", _is_blocked)
+"""The vehicle presses against an obstacle below its setpoint."""
 CARRIED = Condition(
     "carried or pressed, by feel", _is_carried_by_feel, lasts=True, rests_on=Rests.TELEMETRY
 )
+"""Something supports or presses the vehicle, proven by accelerometer and thrust alone."""
 SATURATED_THRUST = Condition(
     "thrust at its limit", _is_saturated, lasts=True, rests_on=Rests.TELEMETRY
 )
+"""The thrust is at its limit, and the vehicle does not climb."""
 SUPPORT_CONDITIONS = (
     CONTACT,
     MAGNET_HOLDS,
@@ -365,6 +375,7 @@ SUPPORT_CONDITIONS = (
     CARRIED,
     SATURATED_THRUST,
 )
+"""All conditions of this module."""
 
 
 def counts(b: Belief, condition: Condition[Belief]) -> bool:

@@ -18,17 +18,21 @@ from perchctl.vehicle import Telemetry
 
 MOUNTING_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
 MOUNTING_LEAST_SIGHTS = 10
+"""Number of sightings that a judgement requires."""
 JUDGED_M, PROVEN_M = 0.12, 0.3
 """Motion of the axis, m, above which the mounting is judged and above which it is proven."""
 STANDS_STILL, MOVES_ALONG = 0.35, 0.6
 """Share of the vehicle's motion by which the target moves: below the first it stands still, above
 the second it moves along. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
 LEAST_SPREAD_M = 0.05
+"""Least spread of the target's positions that shows a motion, m."""
 MOST_UNEXPLAINED = 0.45  # share of the target's spread
 LEAST_TURN = 0.5  # magnitude of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
 LEAST_TURN_RAD = math.radians(65.0)
 SIGHTS_IN_A_ROW = 4
+"""Number of successive contradicting sightings that prove a wrong mounting. Smaller: single wrong
+poses end the flight."""
 JUMPS, SETTLES_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
 """`JUMPS` are pairs of a distance, m, and a time, s: a target that moves by more than the distance
 plus twice the vehicle's motion within the time was moved. `SETTLES_S` is the pause after a move,

@@ -39,17 +39,24 @@ def _battery_is_low(b: Belief) -> bool:
 
 
 TILTED = Condition("tilted", _is_tilted, lasts=True)
+"""The tilt exceeds `safety.max_tilt_deg`."""
 KNOCKED = Condition[Belief](
     "knocked aside",
     lambda b: b.position_valid and math.hypot(*b.velocity_mps[:2]) > KNOCKED_MPS,
 )
+"""The vehicle moves laterally faster than any draught moves it."""
 UNSURE = Condition[Belief]("unsure", lambda b: b.is_unsure, lasts=True)
+"""The variance of the state estimate is too large for position control."""
 TARGET_BELOW = Condition[Belief](
     "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -BELOW_M
 )
+"""The target appears below the vehicle, so the mounting must be wrong."""
 BATTERY_LOW = Condition("battery low", _battery_is_low, lasts=True)
+"""The battery is low under load."""
 MOVES_OTHERWISE = Condition("moves otherwise than its positions", _moves_otherwise, lasts=True)
+"""The estimate follows positions that contradict the accelerometer."""
 QUALITY_CONDITIONS = (TILTED, KNOCKED, UNSURE, TARGET_BELOW, BATTERY_LOW, MOVES_OTHERWISE)
+"""All conditions of this module."""
 
 
 def hold_reason(b: Belief, maneuver: Maneuver) -> str:

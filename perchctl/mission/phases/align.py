@@ -22,6 +22,7 @@ ALIGNED = Condition[Context](
         and abs(c.belief.target.error_yaw_rad) <= math.radians(c.planner.align.yaw_deg)
     ),
 )
+"""The vehicle is below a fresh target, with its heading."""
 
 
 def act(c: Context) -> Action:

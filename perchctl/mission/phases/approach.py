@@ -32,6 +32,7 @@ AT_TAKEOFF_HEIGHT = Condition[Context](
         and c.state.setpoint is not None
     ),
 )
+"""The vehicle hovers near the take-off height."""
 
 
 def act(c: Context) -> Action:

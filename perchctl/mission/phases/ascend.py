@@ -54,7 +54,9 @@ def _is_settled(c: Context) -> bool:
 NEAR_STANDOFF = Condition[Context](
     "near the stand-off", lambda c: c.belief.target.is_tracked and is_near_standoff(c)
 )
+"""The gear is at the stand-off below a tracked target."""
 SETTLED = Condition[Context]("settled", _is_settled)
+"""The vehicle is slow and aligned at the stand-off."""
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:

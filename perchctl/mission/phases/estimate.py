@@ -14,10 +14,12 @@ UNTRACKED_S = 1.0
 """Time without the target after which the search restarts, s."""
 
 UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
+"""The target is not tracked."""
 ESTIMATED = Condition[Context](
     "estimated",
     lambda c: c.belief.target.is_fresh and c.belief.target_spread_m <= c.planner.estimate.spread_m,
 )
+"""The target is fresh, and its position is steady within `estimate.spread_m`."""
 
 
 def act(c: Context) -> Action:

@@ -47,6 +47,7 @@ RECOVER_DOWN_MPS = 10.0
 """Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
 
 STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
+"""The vehicle is slower than `recover.steady_mps`."""
 
 
 def enter(state: PlannerState, before: Context) -> PlannerState:

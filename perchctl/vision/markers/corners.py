@@ -20,6 +20,7 @@ from perchctl.vision.lens import distort, undistort
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+"""Corners of the unit square in the marker's own coordinates, (4, 2)."""
 NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # indices of corner i's neighbours
 OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 """Outward normal of each side in the marker's own coordinates."""
@@ -118,7 +119,9 @@ def with_missing_marker(
 
 
 RAW_SIGMA_PX = 0.6
+"""Standard deviation of corners from OpenCV's detector, px."""
 SUBPIX_SIGMA_PX = 0.25
+"""Standard deviation of corners from `cv2.cornerSubPix`, px."""
 NESTED_SIGMA_PX = 0.6  # derived from the other marker, not measured
 
 

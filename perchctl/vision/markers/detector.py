@@ -21,6 +21,7 @@ from perchctl.vision.markers.pattern import Pattern, make_drawing, make_pattern,
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
+"""Index of the mirror image in a marker's dictionary."""
 _PRINT_M = 1e-6  # error of an edge: the errors of its hundreds of printed dots average out
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, at 640 px
 _LOOSE_PERIMETER_RATE = 0.05

@@ -136,6 +136,7 @@ def sample_profiles(
 
 
 MIN_LINE_SIGMA_PX = 0.015
+"""Lower bound of a fitted line's standard deviation, px."""
 
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
@@ -157,6 +158,7 @@ _MIN_PROFILES = 3.0  # total weight required of a side
 _SHIFT_PRIOR_PX = 0.15  # standard deviation due to glare and gamma
 _CLIPPED_PRIOR_PX = 0.4  # standard deviation due to clipping
 CLIPPED_GREY = 248.0
+"""Grey level above which white counts as clipped."""
 _ONES: Array = np.ones(PROFILES)
 _ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
 _QUARTERS: Array = np.full(4, 0.25)

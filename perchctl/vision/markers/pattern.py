@@ -18,6 +18,7 @@ LEAST_SIDE_PX = 7.0  # a smaller marker is only a spot
 MIN_CONTRAST = 10.0  # grey levels
 CELL_MARGIN = 0.1  # margin of a cell to the threshold, as a share of the contrast
 MOST_CELLS = 0.8
+"""Share of the cells that must have the right colour."""
 _MIN_RESEMBLANCE = 0.6
 _COVERED = 1.25  # half sides of a central marker that may hide cells
 _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
