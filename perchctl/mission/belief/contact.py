@@ -49,7 +49,7 @@ STILL_MOTORS_THRUST = 5000
 LEAST_HOVER = 1000
 """Raw thrust, 0..65535, below which nothing flies."""
 
-# --- motion and place ---
+# --- motion and position ---
 MOTIONLESS_MPS = 0.05
 """Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow sink looks like
 hanging."""

@@ -49,7 +49,7 @@ CLIMB_SPARE_MPS = 0.1
 """Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
 in reach too early."""
 MOST_CLIMB_MPS = 1.0
-"""Largest climb during a silence, m/s: the limit of the position mode."""
+"""Largest climb rate during a silence, m/s: the limit of the position mode."""
 MAGNET_REACH_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
