@@ -55,7 +55,7 @@ def test_each_help_is_whole_at_80_columns(name: str) -> None:
     """It begins as the list says; nothing is cut, no line is over; each has its examples."""
     helps = [run(name, "--help").stdout]
     assert COMMANDS[name] in " ".join(helps[0].split())
-    listed = helps[0].partition("Subcommands; without one it is")[2]
+    listed = helps[0].partition("Subcommands (default:")[2]
     helps += [run(name, each, "-h").stdout for each in re.findall(r"^  (\w+)  ", listed, re.M)]
     for text in helps:
         assert "\N{HORIZONTAL ELLIPSIS}" not in text

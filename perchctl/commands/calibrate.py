@@ -60,24 +60,26 @@ BoardOption = Annotated[
     typer.Option(
         "--board",
         "-b",
-        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
-        "(squares); :measured=249.3x174.9mm behind it for the black area as printed.",
+        help="Board: chessboard:9x6:25mm (inner corners) or charuco:10x7:25mm:18mm:DICT_5X5_100 "
+        "(squares). Append :measured=249.3x174.9mm if you have measured the printed black area.",
     ),
 ]
 CheckBoardOption = Annotated[
     str | None,
-    typer.Option("--board", "-b", help="The board, as for calibrate. Default: the calibration's."),
+    typer.Option("--board", "-b", help="Board, as for calibrate. Default: the calibration's."),
 ]
 SizeOption = Annotated[
     tuple[int, int] | None,
-    typer.Option("--size", help="Width and height asked of camera:N; else its driver's own."),
+    typer.Option(
+        "--size", help="Width and height to request from camera:N. Default: the driver's choice."
+    ),
 ]
 OutputOption = Annotated[
     Path | None,
     typer.Option(
         "--output",
         "-o",
-        help="Calibration file. Default: calib/camera_WIDTHxHEIGHT.yaml.",
+        help="Calibration file to write. Default: calib/camera_WIDTHxHEIGHT.yaml.",
     ),
 ]
 
@@ -99,10 +101,11 @@ def camera(
     as_json: JsonOption = False,
     size: SizeOption = None,
 ) -> None:
-    """Calibrate the camera, and report what its error means in mm at the target.
+    """Calibrate the camera, and report the resulting error at the target in mm.
 
-    A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
-    by more than 5 times its view's spread; both are named, as are pictures without a board.
+    A view is rejected if its RMS error exceeds 2.5 times that of the median view. A corner is
+    rejected if its error exceeds 5 times the spread of its view. The report lists rejected views
+    and corners, and pictures without a board.
     """
     pictures = _source(source, view)
     if output is not None:
@@ -151,12 +154,12 @@ command(
 def mask(
     source: SourceArgument,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="The mask, a PNG; camera.mask names it.")
+        Path, typer.Option("--output", "-o", help="Mask to write, a PNG. Name it in camera.mask.")
     ] = Path("gear.png"),
     force: ForceOption = False,
     size: SizeOption = None,
 ) -> None:
-    """Learn what the vehicle itself covers of the picture, while it is turned about."""
+    """Find the parts of the picture that the vehicle covers while you turn it in your hand."""
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
@@ -179,12 +182,12 @@ def mask(
     "perchctl calibrate check camera.yaml video:board.mp4 --json",
 )
 def check(
-    calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
+    calibration: Annotated[Path, typer.Argument(help="Calibration file to check.")],
     source: SourceArgument,
     board: CheckBoardOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
+    """Check a calibration against new pictures of a board (exit code 1 if it fails)."""
     pictures = _source(source)
     model = load_calibration(calibration)
     notes = load_notes(calibration)
@@ -211,11 +214,13 @@ def check(
     "perchctl calibrate convert ost.yaml -o calib/fpv.yaml",
 )
 def convert(
-    calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
+    calibration: Annotated[
+        Path, typer.Argument(help="Calibration file from OpenCV, Kalibr or ROS.")
+    ],
     output: OutputOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Write another program's calibration as perchctl's file."""
+    """Convert a calibration from OpenCV, Kalibr or ROS to perchctl's format."""
     model = load_calibration(calibration)
     file = _file(output, model.size_px)
     check_output(file, SUFFIXES, force, CONTENT)

@@ -76,27 +76,27 @@ def mount(
         Part | None,
         typer.Option(
             "--part",
-            help="Only the carry (turn and latency), or only the pivot (the gear's tip, by the "
+            help="Do only the carry (rotation and latency), or only the pivot (gear tip, by the "
             "camera alone).",
         ),
     ] = None,
     logs: Annotated[
         list[Path] | None,
-        typer.Option("--from", help="Measure from this recording of an earlier run."),
+        typer.Option("--from", help="Evaluate this recording of an earlier run. Repeatable."),
     ] = None,
     write: Annotated[
         bool,
         typer.Option(
-            "--write", help="Put the numbers into the profile; the old file is kept beside it."
+            "--write", help="Write the results to the profile, and keep the old file as a backup."
         ),
     ] = False,
     view: ViewOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Measure how the camera is mounted, how late it is, and where the gear's tip is.
+    """Measure the camera's rotation and latency, and the position of the gear's tip.
 
-    The vehicle is turned in the hand in view of the target (carry), then tilted around the tip of
-    its gear (pivot). Its motors are off, and nothing arms.
+    Turn the vehicle in your hand with the target in view (carry), then tilt it around the tip of
+    its gear (pivot). The motors are off, and perchctl never arms the vehicle.
     """
     vehicle = load_profile(profile)
     into = writable_profile(profile) if write else None

@@ -53,26 +53,30 @@ def check(
     source: SourceOption = None,
     scan: Annotated[
         bool,
-        typer.Option("--scan", help="Only show which vehicles answer, on any channel and rate."),
+        typer.Option(
+            "--scan", help="Only list the vehicles that answer, on any channel and data rate."
+        ),
     ] = False,
     cameras: Annotated[
         bool,
         typer.Option(
             "--cameras",
-            help="Only list this computer's cameras: number, name, path.",
+            help="Only list the cameras of this computer: number, name and path.",
         ),
     ] = False,
     lift: Annotated[
         bool,
-        typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
+        typer.Option(
+            "--lift", help="Also check the estimated position while you lift the vehicle by hand."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Look at vehicle, camera, computer and profile on the ground, and say what is not fit to fly.
+    """Check vehicle, camera, computer and profile on the ground, and report what is not fit to fly.
 
-    A row passes, warns, fails, or is skipped where it could not be known. Nothing is armed, and
-    no motor turns. Exits with 0 when nothing fails, with 10 when the vehicle does not answer, 20
-    when the camera gives no picture, 52 for any other failing row.
+    Each check passes, warns, fails, or is skipped if perchctl cannot find out. Nothing is armed,
+    and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle does not answer,
+    20 if the camera gives no picture, and 52 if any other check fails.
     """
     if cameras:
         return print_rows(camera_rows(), as_json)

@@ -48,22 +48,25 @@ _REFUSED: dict[int | None, str] = {
 _LONGEST_PLACE = 200
 
 COMMANDS: dict[str, str] = {
-    "make-target": "Print the target true to size, or a board; design it; write measured sizes.",
-    "calibrate": "Calibrate the camera, and report what its error means in mm at the target.",
+    "make-target": (
+        "Make a PDF of the target or a calibration board, design a target, or enter its printed "
+        "size."
+    ),
+    "calibrate": "Calibrate the camera, and report the resulting error at the target in mm.",
     "profile": (
-        "Show a profile as it is flown, every key explained, or write one of your vehicle (new)."
+        "Show a resolved profile with every key explained, or create one for your vehicle (new)."
     ),
     "fit-weights": (
-        "Fit the merge weights to poses whose truth is known, and verify that they help."
+        "Fit the merge weights to poses with known ground truth, and verify that they help."
     ),
-    "track": "Find the target in a camera, video or pictures, without a vehicle.",
+    "track": "Find the target in a camera stream, a video or pictures, without a vehicle.",
     "check": (
-        "Look at vehicle, camera, computer and profile on the ground, and say what is not fit to "
-        "fly."
+        "Check vehicle, camera, computer and profile on the ground, and report what is not fit "
+        "to fly."
     ),
-    "fly": "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
-    "simulate": "Fly many seeded scenarios in lockstep, faster than real time, and count.",
-    "log": "After a flight: show, draw, compare, export, replay or report its log.",
+    "fly": "Fly a perching mission: find the target, align, ascend, perch, stop the motors.",
+    "simulate": "Simulate many seeded flights, faster than real time, and count the outcomes.",
+    "log": "Show, plot, compare, export, replay, film or report a flight from its log.",
 }
 """In the order in which one uses them, with the first sentence of their help."""
 
@@ -94,7 +97,7 @@ class Group(TyperGroup):
         name, main_command = next(iter(self.commands.items()))
         inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
         main_command.format_help(inner, formatter)
-        with formatter.section(f"Subcommands; without one it is {name}"):
+        with formatter.section(f"Subcommands (default: {name})"):
             formatter.write_dl(
                 [(each.name, each.get_short_help_str(200)) for each in self.commands.values()]
             )
@@ -165,7 +168,7 @@ def command(
 
 ProfileOption = Annotated[
     str,
-    typer.Option("--profile", "-p", help="Profile by name or path."),
+    typer.Option("--profile", "-p", help="Profile, by name or path."),
 ]
 UriOption = Annotated[
     str | None,
@@ -173,7 +176,7 @@ UriOption = Annotated[
         "--uri",
         "-u",
         envvar="CFLIB_URI",
-        help="Vehicle: sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT, "
+        help="URI of the vehicle: sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT or "
         "my_module:MyLink.",
     ),
 ]
@@ -181,28 +184,29 @@ SourceOption = Annotated[
     str | None,
     typer.Option(
         "--source",
-        help="Camera: camera:N or camera:NAME, rtsp://..., http://..., aideck://HOST, video:FILE, "
-        "images:DIR, sim:, my_module:MyCamera.",
+        help="Camera source: camera:N, camera:NAME, rtsp://..., http://..., aideck://HOST, "
+        "video:FILE, images:DIR, sim: or my_module:MyCamera.",
     ),
 ]
 SourceArgument = Annotated[
     str,
     typer.Argument(
-        help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-        "http://..., aideck://HOST, my_module:MyCamera, or a path.",
+        help="Camera source: images:DIR or images:PATTERN, video:FILE, camera:N, camera:NAME, "
+        "rtsp://..., http://..., aideck://HOST, my_module:MyCamera, or the path of a file or "
+        "folder.",
     ),
 ]
 PositioningOption = Annotated[
     str | None,
     typer.Option(
         "--positioning",
-        help="What measures the position: deck, mocap or target; by default the profile's.",
+        help="Source of the vehicle's position: deck, mocap or target. Default: the profile's.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON on stdout.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON to stdout.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ViewOption = Annotated[
-    bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
+    bool, typer.Option("--view", help="Serve a live page on 127.0.0.1, and print its address.")
 ]
 
 
@@ -308,9 +312,11 @@ def _top(
     context: typer.Context,
     version: Annotated[
         bool,
-        typer.Option("--version", "-V", callback=_print_version, is_eager=True, help="Version."),
+        typer.Option(
+            "--version", "-V", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
-    """Hang a Crazyflie onto a ceiling by the sight of a printed target."""
+    """Hang a Crazyflie from the ceiling, guided by an upward-facing camera and a printed target."""
     if context.invoked_subcommand is None:
         print(context.get_help())

@@ -50,28 +50,31 @@ app = new_app(Group)
     "perchctl fit-weights session.csv -o weights.yaml --method lms",
 )
 def fit(
-    data: Annotated[Path, typer.Argument(help="The CSV file, as fit-weights collect writes it.")],
+    data: Annotated[
+        Path, typer.Argument(help="CSV file, in the format that fit-weights collect writes.")
+    ],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Weights file to write.")
     ] = None,
     test: Annotated[
-        Path | None, typer.Option("--test", help="Judge the weights on this other data too.")
+        Path | None, typer.Option("--test", help="Also test the weights on this second data set.")
     ] = None,
     method: Annotated[
         Literal["closed_form", "lms"],
-        typer.Option("--method", help="Least squares in closed form, or the paper's LMS."),
+        typer.Option("--method", help="Closed-form least squares, or the paper's LMS."),
     ] = "closed_form",
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Write weights that are not recommended, too.")
+        bool, typer.Option("--anyway", help="Write the weights even if they are not recommended.")
     ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Fit the merge weights to poses whose truth is known, and verify that they help.
+    """Fit the merge weights to poses with known ground truth, and verify that they help.
 
-    A CSV row is a frame: position (a number for the place), t_s, then x_m, y_m, z_m and yaw_rad
-    of large_, small_ and actual_; the cells of a marker that was not seen are empty. All three
-    poses are in one frame; collect writes the target relative to the gear in the level frame.
+    Each CSV row is one picture. Its columns are position (a number for each place), t_s, and
+    x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and actual_. The cells of a
+    marker that was not detected are empty. All three poses are in the same coordinate frame;
+    collect writes the target relative to the gear, in the level frame.
     """
     if output is not None:
         if same_file(output, data):
@@ -109,25 +112,30 @@ def fit(
     "perchctl fit-weights collect session.csv -p lab.yaml --truth mocap",
 )
 def collect(
-    session: Annotated[Path, typer.Argument(help="The CSV; an unfinished one goes on.")],
+    session: Annotated[
+        Path, typer.Argument(help="CSV file to write. An unfinished one is continued.")
+    ],
     profile: ProfileOption = "sim",
     truth: Annotated[
         Literal["typed", "mocap", "sim"],
-        typer.Option("--truth", help="Where the actual pose comes from."),
+        typer.Option("--truth", help="Source of the ground truth."),
     ] = "typed",
-    positions: Annotated[int, typer.Option("--positions", min=2, help="To collect.")] = 10,
-    frames: Annotated[int, typer.Option("--frames", min=10, help="At each position.")] = 100,
+    positions: Annotated[int, typer.Option("--positions", min=2, help="Number of positions.")] = 10,
+    frames: Annotated[int, typer.Option("--frames", min=10, help="Pictures per position.")] = 100,
     source: SourceOption = None,
     target_body: Annotated[
-        str, typer.Option("--target-body", help="Rigid body of the target, for --truth mocap.")
+        str,
+        typer.Option("--target-body", help="Name of the target's rigid body, for --truth mocap."),
     ] = "target",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the places of --truth sim.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Seed of the positions, for --truth sim.")
+    ] = 0,
 ) -> None:
-    """Collect the data of a fit: poses of both markers at places whose actual pose is known.
+    """Collect the data for a fit: poses of both markers at positions with known ground truth.
 
-    A person places the camera, and gives the actual pose; with --truth mocap the profile's motion
-    capture measures it, and with --truth sim the simulator's camera stands at seeded places. A
-    session that was stopped goes on with the same command.
+    Place the camera at each position and type in its actual pose. With --truth mocap, the profile's
+    motion capture measures that pose. With --truth sim, the simulator places the camera at seeded
+    positions. To continue a stopped session, run the same command again.
     """
     config = load_profile(profile, with_weights=False)
     camera = profile_camera(config.camera)

@@ -103,29 +103,32 @@ def fly(
     source: SourceOption = None,
     positioning: PositioningOption = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
+        int | None, typer.Option("--seed", help="Seed of the simulated scenario. Default: 11.")
     ] = None,
     log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder for the flight log and its plot.")
+        Path | None, typer.Option("--log-dir", help="Folder for the flight log and plot.")
     ] = None,
     record: Annotated[
         bool | None,
         typer.Option(
             "--record/--no-record",
-            help="Keep the pictures, in an MCAP file beside the log; by default of real vehicles.",
+            help="Record the pictures to an MCAP file next to the log. Default: only for a real "
+            "vehicle.",
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the resolved plan; connect nothing.")
+        bool, typer.Option("--dry-run", help="Show the resolved plan, and connect to nothing.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before arming.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Arm without asking for confirmation.")
+    ] = False,
     as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> int:
-    """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
+    """Fly a perching mission: find the target, align, ascend, perch, stop the motors.
 
-    Without options it flies the simulated vehicle. Press Ctrl-C to land. Press it again to cut the
-    motors. The space bar cuts the motors at once.
+    Without options, perchctl flies the simulated vehicle. Press Ctrl-C to land. Press it again to
+    cut the motors. The space bar cuts the motors at once.
     """
     options = resolve_options(profile, uri, source, positioning, seed, log_dir, record)
     if dry_run:

@@ -46,7 +46,7 @@ PAGES = ((".html", ".htm"), "a page for a browser")
 LogArgument = Annotated[
     Path | None,
     typer.Argument(
-        help="A flight log, or a folder, whose newest log is taken. Default: perchctl-logs."
+        help="Flight log, or a folder to take the newest log from. Default: perchctl-logs."
     ),
 ]
 app = new_app(Group)
@@ -85,13 +85,14 @@ def _opened(path: Path) -> Iterator[FlightLog]:
     "perchctl log show",
     "perchctl log show perchctl-logs/flight.jsonl --json",
     "perchctl log show perchctl-logs",
-    short_help="Show a flight: how it ended and why, its phases, holds, battery, frames, findings.",
+    short_help="Show how and why a flight ended: phases, holds, battery, frames and findings.",
 )
 def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
-    """After a flight: show, draw, compare, export, replay or report its log.
+    """Show, plot, compare, export, replay, film or report a flight from its log.
 
-    The subcommands work on logs of flights that were killed, of simulated ones, of an older
-    perchctl; replay needs whole turns, which logs of versions 1 and 2 do not hold.
+    All subcommands read logs of real and simulated flights, of flights that were killed, and of
+    older perchctl versions. Only replay needs complete turn records, which log versions 1 and 2 do
+    not hold.
     """
     with _opened(_log_file(file)) as log:
         analysis = FlightAnalysis(log)
@@ -109,12 +110,14 @@ def plot(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="The picture: .png, .pdf or .svg. Default: .png beside the log."
+            "--output",
+            "-o",
+            help="Plot to write: .png, .pdf or .svg. Default: .png next to the log.",
         ),
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Draw a flight: detections, lost frames, height, battery, the last seconds."""
+    """Plot a flight: detections, lost frames, height, battery and the last seconds."""
     path = _log_file(file)
     with _opened(path) as log:
         picture = _place(path, output, PLOTS, force)
@@ -131,11 +134,11 @@ def plot(
     "perchctl log compare before.jsonl after.jsonl --json",
 )
 def compare(
-    one: Annotated[Path, typer.Argument(metavar="A", help="A flight log.")],
-    other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    one: Annotated[Path, typer.Argument(metavar="A", help="First flight log.")],
+    other: Annotated[Path, typer.Argument(metavar="B", help="Second flight log.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare two flights: what differs, and in which keys their profiles do."""
+    """List the differences between two flights, and between their profiles."""
     with _opened(one) as log, _opened(other) as other_log:
         found = FlightComparison((FlightAnalysis(log), FlightAnalysis(other_log)))
         record, text = found.record(), found.text()
@@ -152,11 +155,11 @@ def export(
     file: LogArgument = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The file: .csv. Default: beside the log."),
+        typer.Option("--output", "-o", help="File to write: .csv. Default: next to the log."),
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Write a log as a table that other programs open."""
+    """Export a log as a CSV table for other programs."""
     path = _log_file(file)
     place = _place(path, output, EXPORTS, force)
     with _opened(path) as log:
@@ -179,29 +182,29 @@ def replay(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="What if this key of the profile had been another; may be given several times.",
+            help="Replay with another value of this profile key. Repeatable.",
         ),
     ] = None,
     profile: Annotated[
         str | None,
-        typer.Option(
-            "--profile", "-p", help="What if this profile had been flown, by name or path."
-        ),
+        typer.Option("--profile", "-p", help="Replay with another profile, by name or path."),
     ] = None,
     pictures: Annotated[
         bool,
         typer.Option(
-            "--pictures/--no-pictures", help="See the recorded pictures again, where there are any."
+            "--pictures/--no-pictures",
+            help="Process the recorded pictures again, if there are any.",
         ),
     ] = True,
     as_json: JsonOption = False,
 ) -> int:
-    """Decide a flight again from its log, and demand the same commands, bit by bit.
+    """Replay a flight from its log, and verify that every command is identical, bit by bit.
 
-    With pictures beside the log they are looked at again, too, and have to give the same poses.
-    With --set or --profile it says what would have been decided otherwise.
+    If there is a recording next to the log, perchctl also processes its pictures again and
+    verifies the poses. With --set or --profile, it reports which decisions would have been
+    different.
 
-    Exit codes: 0 where nothing differs, 61 where something does.
+    The exit code is 0 if nothing differs, and 61 if anything does.
     """
     path = _log_file(file)
     with _opened(path) as log:
@@ -231,14 +234,16 @@ def replay(
 def report(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Flight logs; by default the newest of perchctl-logs."),
+        typer.Argument(help="Flight logs. Default: the newest in perchctl-logs."),
     ] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Page to write: .html.")
+    ] = None,
     with_film: Annotated[bool, typer.Option("--film", help="Embed a film of each flight.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write one page that tells the flight, or several, in sentences and plots."""
+    """Write a page that describes one or more flights in sentences and plots."""
     logs = [_log_file(file) for file in files or (None,)]
     if output is None and len(logs) > 1:
         output = logs[0].with_name("session.html")
@@ -259,20 +264,20 @@ def film(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="The film: .mp4 or .gif. Default: .mp4 beside the log."
+            "--output", "-o", help="Film to write: .mp4 or .gif. Default: .mp4 next to the log."
         ),
     ] = None,
     rate_hz: Annotated[
-        float, typer.Option("--rate", min=1.0, max=60.0, help="Pictures a second.")
+        float, typer.Option("--rate", min=1.0, max=60.0, help="Frames per second.")
     ] = 15.0,
     width_px: Annotated[
-        int, typer.Option("--width", min=320, max=1920, help="Width of the film, in pixels.")
+        int, typer.Option("--width", min=320, max=1920, help="Width of the film, px.")
     ] = 960,
     force: ForceOption = False,
 ) -> None:
-    """Make a film of a flight: the camera's picture, a side view to scale, error and thrust.
+    """Make a film of a flight: camera picture, side view to scale, error and thrust.
 
-    The camera's picture needs the recording beside the log (fly --record).
+    The camera picture needs a recording next to the log (fly --record).
     """
     path = _log_file(file)
     place = _place(path, output, FILMS, force)

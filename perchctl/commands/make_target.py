@@ -22,14 +22,16 @@ from perchctl.files import check_output, write_files
 from perchctl.profile import find_calibration, load_profile, writable_profile, write_profile_values
 from perchctl.target import Board, board_pdf, make_design, measured_target, parse_length, target_pdf
 
-PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
+PageOption = Annotated[
+    str, typer.Option("--page", help="Page size: a4, letter, a3, or a size such as 220x240mm.")
+]
 MagnetOption = Annotated[
     str, typer.Option("--magnet", help="Diameter of the magnet behind the sheet.")
 ]
 
 
 CameraArgument = Annotated[
-    str | None, typer.Argument(help="Calibration file; by default the profile's.")
+    str | None, typer.Argument(help="Calibration file. Default: the profile's.")
 ]
 CeilingOption = Annotated[
     float | None,
@@ -37,12 +39,12 @@ CeilingOption = Annotated[
         "--ceiling",
         min=0.3,
         max=50.0,
-        help="Height of the ceiling over the floor, m.",
+        help="Height of the ceiling above the floor, m.",
     ),
 ]
 BlurOption = Annotated[
     float,
-    typer.Option("--blur", min=0.0, max=20.0, help="Sigma of the picture's blur, px."),
+    typer.Option("--blur", min=0.0, max=20.0, help="Blur of the picture, sigma in px."),
 ]
 
 app = new_app(Group)
@@ -53,7 +55,7 @@ app = new_app(Group)
     "perchctl make-target -p crazyflie -o target.pdf",
     "perchctl make-target -p my_vehicle.yaml --page letter",
     "perchctl make-target -p my_vehicle.yaml --page 442x478mm --magnet 80mm",
-    short_help="Print the target true to size, front and back.",
+    short_help="Write a true-to-size PDF of the target, front and back.",
 )
 def sheet(
     profile: ProfileOption = "sim",
@@ -64,9 +66,10 @@ def sheet(
     magnet: MagnetOption = "50mm",
     force: ForceOption = False,
 ) -> None:
-    """Print the target true to size, or a board; design it; write measured sizes.
+    """Make a PDF of the target or a calibration board, design a target, or enter its printed size.
 
-    sheet writes a PDF of the profile's target, front and back, checked before it is written.
+    By default (sheet), perchctl writes a true-to-size PDF of the profile's target, front and back.
+    It first verifies that the markers can be detected.
     """
     config = load_profile(profile)
     magnet_m = parse_length(magnet, "--magnet")
@@ -87,8 +90,8 @@ def board(
     notation: Annotated[
         str,
         typer.Argument(
-            help="charuco:10x7:25mm:18mm:DICT_5X5_100 (squares), chessboard:9x6:25mm (inner "
-            "corners)."
+            help="Board: charuco:10x7:25mm:18mm:DICT_5X5_100 (squares) or chessboard:9x6:25mm "
+            "(inner corners)."
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
@@ -97,7 +100,7 @@ def board(
     page: PageOption = "a4",
     force: ForceOption = False,
 ) -> None:
-    """Print a calibration board, in the notation that calibrate reads."""
+    """Write a PDF of a calibration board, named as in calibrate --board."""
     printed = Board.parse(notation)
     if printed.scale != (1.0, 1.0):
         raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
@@ -120,7 +123,7 @@ def design(
     blur: BlurOption = 1.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute from where to where a camera sees each marker, and where a gap is."""
+    """Compute the range in which the camera sees each marker, and any gap between them."""
     config = load_profile(profile)
     path = find_calibration(camera or config.camera.calibration)
     found = make_design(config.target, load_calibration(path), blur, config, ceiling)
@@ -138,14 +141,14 @@ def measured(
     profile: ProfileOption,
     large: Annotated[
         str | None,
-        typer.Option("--measured-large", help="Side of the large black square as printed, mm."),
+        typer.Option("--measured-large", help="Measured side of the large black square, mm."),
     ] = None,
     small: Annotated[
         str | None,
-        typer.Option("--measured-small", help="Side of the small black square as printed, mm."),
+        typer.Option("--measured-small", help="Measured side of the small black square, mm."),
     ] = None,
 ) -> None:
-    """Write the sizes that were measured on the print into the profile that flies."""
+    """Write the marker sizes that you measured on the print to the profile."""
     if large is None and small is None:
         raise UsageError("give --measured-large and --measured-small, in mm: nothing was measured")
     config, path = load_profile(profile), writable_profile(profile)

@@ -51,12 +51,13 @@ app = new_app(Group)
     "perchctl profile -p crazyflie",
     "perchctl profile new -o my_vehicle.yaml",
     "perchctl profile schema > perchctl.schema.json",
-    short_help="Show a profile as it is flown, every key explained.",
+    short_help="Show a resolved profile with every key explained.",
 )
 def show(profile: ProfileOption = "sim", as_json: JsonOption = False) -> int:
-    """Show a profile as it is flown, every key explained, or write one of your vehicle (new).
+    """Show a resolved profile with every key explained, or create one for your vehicle (new).
 
-    Prints every key with its value, unit, bounds and meaning, and warns about what is implausible.
+    perchctl prints the value, unit, bounds and meaning of each key, and warns about implausible
+    values.
     """
     loaded = load_profile(profile)
     if as_json:
@@ -171,20 +172,20 @@ def new(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Answer beforehand: any key of the profile, front, left (of the picture's edges) "
-            "or ceiling (m).",
+            help="Answer a question in advance: any profile key, front or left (a picture edge), "
+            "or ceiling (m). Repeatable.",
         ),
     ] = None,
     defaults: Annotated[
-        bool, typer.Option("--defaults", help="Ask nothing: defaults for what is not given.")
+        bool, typer.Option("--defaults", help="Ask nothing, and use the default answers.")
     ] = False,
     force: ForceOption = False,
 ) -> None:
-    """Write a profile of your vehicle, every key commented, in a short dialogue.
+    """Create a commented profile for your vehicle in a short dialogue.
 
-    With --set for every question, or --defaults, nothing is asked. The mounting is described in
-    words: at which edge of the camera's picture a hand over the vehicle's front comes in, and one
-    over its left side.
+    With --defaults, or with --set for every question, perchctl asks nothing. You describe the
+    camera's mounting in words: hold a hand over the vehicle's front, then over its left side, and
+    say at which edge of the picture it appears.
     """
     check_output(output, (".yaml", ".yml"), force, "what a profile is")
     given = dict(setting.partition("=")[::2] for setting in settings or ())
@@ -399,7 +400,7 @@ def _is_aideck(source: str) -> bool:
     "perchctl profile schema | grep -A 6 latency_s",
 )
 def schema() -> None:
-    """Print the JSON schema of a profile's file, by which an editor completes and explains keys."""
+    """Print the JSON schema of profiles, so that your editor can complete and explain keys."""
     print(json.dumps(json_schema(), indent=2))
 
 

@@ -48,17 +48,19 @@ CAMPAIGN_SAME_PRESS_S = 0.5
 _NO_DIFFERENCE = ("name", "description", "date")
 
 
-FlightsOption = Annotated[int, typer.Option("-n", "--flights", min=1, help="How many.")]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Of the first flight.")]
+FlightsOption = Annotated[
+    int, typer.Option("-n", "--flights", min=1, help="Number of seeds to fly.")
+]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed.")]
 JobsOption = Annotated[
-    int | None, typer.Option("--jobs", "-j", min=1, help="Flights at a time; 1 by default.")
+    int | None, typer.Option("--jobs", "-j", min=1, help="Number of parallel flights. Default: 1.")
 ]
 ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
         metavar="ADDRESS",
-        help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786.",
+        help="Fly on the workers of a Dask scheduler, such as tcp://10.0.0.5:8786.",
     ),
 ]
 app = new_app(Group)
@@ -80,7 +82,8 @@ def run(
         typer.Option(
             "--faults",
             metavar="all|list|NAME,NAME",
-            help="Lay a fault into each flight, and judge by the world's truth.",
+            help="Inject a fault into each flight, and judge the outcome by the simulator's ground "
+            "truth; list only prints the faults.",
         ),
     ] = None,
     positioning: PositioningOption = None,
@@ -88,29 +91,31 @@ def run(
     cluster: ClusterOption = None,
     log_dir: Annotated[
         Path | None,
-        typer.Option("--log-dir", help="Log the flights, into this folder."),
+        typer.Option("--log-dir", help="Write the flight logs to this folder."),
     ] = None,
     record: Annotated[
         bool,
         typer.Option(
             "--record",
-            help="Keep the pictures, in an MCAP file beside each log.",
+            help="Record the pictures to an MCAP file next to each log.",
         ),
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="JSONL file; each flight's result, as it ends."),
+        typer.Option(
+            "--out", help="JSONL file to which each result is written as its flight ends."
+        ),
     ] = None,
     resume: Annotated[
         bool,
         typer.Option(
             "--resume",
-            help="Go on with --out: fly the seeds that it lacks.",
+            help="Continue --out: fly only the seeds that it lacks.",
         ),
     ] = False,
     force: ForceOption = False,
 ) -> int:
-    """Fly many seeded scenarios in lockstep, faster than real time, and count."""
+    """Simulate many seeded flights, faster than real time, and count the outcomes."""
     if faults == "list":
         return _list_faults(as_json)
     if record and log_dir is None:
@@ -193,11 +198,11 @@ class _Campaign:
 def compare(
     profile_a: Annotated[
         str,
-        typer.Argument(metavar="PROFILE_A", help="A, by name or path."),
+        typer.Argument(metavar="PROFILE_A", help="First profile, by name or path."),
     ],
     profile_b: Annotated[
         str,
-        typer.Argument(metavar="PROFILE_B", help="B, by name or path."),
+        typer.Argument(metavar="PROFILE_B", help="Second profile, by name or path."),
     ],
     flights: FlightsOption = 10,
     seed: SeedOption = 0,
@@ -206,7 +211,7 @@ def compare(
     positioning: PositioningOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Fly each seed by two profiles: what differs, and what of it is proven."""
+    """Fly every seed with two profiles, and report which differences are significant."""
     names = (profile_a, profile_b)
     profiles = [with_positioning(load_profile(name), positioning) for name in names]
     keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
@@ -237,7 +242,7 @@ def compare(
 def sweep(
     values: Annotated[
         str,
-        typer.Argument(metavar="KEY=VALUE,VALUE", help="A key of the profile with its values."),
+        typer.Argument(metavar="KEY=VALUE,VALUE", help="Profile key and the values to try."),
     ],
     profile: ProfileOption = "sim",
     flights: FlightsOption = 10,
@@ -247,7 +252,7 @@ def sweep(
     positioning: PositioningOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Fly the same seeds with several values of a profile's key: which is the best."""
+    """Fly the same seeds with several values of a profile key, and report the best."""
     asked = campaigns.make_sweep(with_positioning(load_profile(profile), positioning), values)
 
     def report(results: list[campaigns.FlightResult], problem: PerchError | None) -> None:

@@ -68,22 +68,32 @@ def track(
     calibration: Annotated[
         Path | None,
         typer.Option(
-            "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
+            "--calibration",
+            help="Camera calibration (ROS, OpenCV or Kalibr). Default: the profile's.",
         ),
     ] = None,
     as_json: JsonOption = False,
     view: ViewOption = False,
 ) -> None:
-    """Find the target in a camera, video or pictures, without a vehicle.
+    """Find the target in a camera stream, a video or pictures, without a vehicle.
 
-    Poses are in the OpenCV camera frame with cv2.aruco's marker axes: X_cam = R(rvec) X_marker +
-    tvec. A JSON line holds frame, t_s, stage (large, both, small, none), large and small (null,
-    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px), target (null, or rvec_rad,
-    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad) and note (what is wrong with the picture, or why a
-    pose is not the target's; else empty). With both markers in sight target is their joint
-    pose; but for stills it is filtered, and goes on for a few frames after stage none.
-    yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
-    along the camera's x, y, z. A live source that is lost for good ends with exit code 10.
+    Poses are in the OpenCV camera frame, with the marker axes of cv2.aruco:
+    X_cam = R(rvec) X_marker + tvec. With --json, each line is an object with these fields:
+
+    \b
+    frame         file name of the picture, or index of the frame
+    t_s           time of the frame
+    stage         detected markers: large, both, small or none
+    large, small  null, or corners_px (TL TR BR BL), rvec_rad, tvec_m and
+                  reprojection_px
+    target        null, or rvec_rad, tvec_m, yaw_rad, sigma_m and sigma_yaw_rad
+    note          what is wrong with the picture, or why a pose is not the
+                  target's; otherwise empty
+
+    If both markers are in view, target is their joint pose. Except for still pictures, target is
+    filtered, and continues for a few frames after stage becomes none. yaw_rad is
+    atan2(R[1,0], R[0,0]), the marker's heading in the picture plane. sigma_m is along the camera's
+    x, y and z axes. If a live source is lost for good, the exit code is 10.
     """
     flown = load_profile(profile)
     source = parse_source(source).spec
