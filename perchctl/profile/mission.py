@@ -11,13 +11,18 @@ from perchctl.profile.base import Section, key
 class SearchConfig(Section):
     """Phase 2: the vehicle waits `wait_s`, climbs `step_m`, tries again, up to `max_height_m`."""
 
-    attempts: int = key(6, "number of waits for the target before landing", ge=1, le=100)
-    wait_s: float = key(1.5, "wait at each height", gt=0, le=60)
+    attempts: int = key(
+        6, "how often the vehicle waits for the target before it lands", ge=1, le=100
+    )
+    wait_s: float = key(1.5, "waiting time at each height", gt=0, le=60)
     step_m: ClassVar[float] = 0.12
     """It climbs so far between two looks."""
-    max_height_m: float = key(1.3, "greatest height of the search", gt=0, le=20)
+    max_height_m: float = key(1.3, "maximum height of the search", gt=0, le=20)
     yaw_step_deg: float = key(
-        60.0, "rotation between waits, as the picture is wider than high", ge=0, le=180
+        60.0,
+        "rotation between two waits, because the picture is wider than it is high",
+        ge=0,
+        le=180,
     )
     confirm_frames: ClassVar[int] = 3
     """In a row with the target."""
@@ -36,7 +41,9 @@ class EstimateConfig(Section):
 class AlignConfig(Section):
     """Phase 4. Errors must stay within tolerance for `dwell_s`."""
 
-    xy_m: float = key(0.04, "aligned: gear at most this far from the target's axis", gt=0, le=1)
+    xy_m: float = key(
+        0.04, "maximum distance of the gear from the target's axis to count as aligned", gt=0, le=1
+    )
     yaw_deg: ClassVar[float] = 5.0  # aligned: heading
     dwell_s: ClassVar[float] = 0.4  # for which both must hold
     timeout_s: ClassVar[float] = 20.0
@@ -55,7 +62,7 @@ class AscendConfig(Section):
     the stand-off.
     """
 
-    speed_mps: float = key(0.25, "climb speed far below the target", gt=0, le=1)
+    speed_mps: float = key(0.25, "climb speed while far below the target", gt=0, le=1)
     near_speed_mps: ClassVar[float] = 0.12
     """Climb nearer than `near_m`."""
     near_m: ClassVar[float] = 0.35
@@ -64,19 +71,32 @@ class AscendConfig(Section):
     """The cone's radius at the target."""
     cone_slope: ClassVar[float] = 0.2
     """The cone's radius grows by it a metre below."""
-    standoff_m: float = key(0.08, "distance below the target at which it settles", gt=0.01, le=0.5)
-    settle_xy_m: float = key(0.004, "settled: gear at most this far from the axis", gt=0, le=0.1)
+    standoff_m: float = key(
+        0.08,
+        "distance below the target at which the vehicle settles before contact",
+        gt=0.01,
+        le=0.5,
+    )
+    settle_xy_m: float = key(
+        0.004,
+        "maximum distance of the gear from the target's axis to count as settled",
+        gt=0,
+        le=0.1,
+    )
     settle_z_m: ClassVar[float] = 0.02  # settled: at most so far below the stand-off
     settle_yaw_deg: ClassVar[float] = 3.0
     """Settled: heading."""
     settle_speed_mps: ClassVar[float] = 0.04
     """Settled: speed."""
     settle_dwell_s: float = key(
-        0.3, "settled: time for which position, heading and speed must hold", ge=0, lt=10
+        0.3, "time for which position, heading and speed must hold to count as settled", ge=0, lt=10
     )
     settle_timeout_s: ClassVar[float] = 10.0  # at the stand-off
     fresh_s: float = key(
-        0.25, "a target estimate older than this plus the latency is not fresh", gt=0, le=2
+        0.25,
+        "maximum age of a fresh target estimate, in addition to the camera latency",
+        gt=0,
+        le=2,
     )
     timeout_s: ClassVar[float] = 40.0
     """An ascent that takes longer counts as failed."""
@@ -87,16 +107,21 @@ class PerchConfig(Section):
     `raw` raises the thrust with stabilised position control off, as the paper does."""
 
     mode: Literal["position", "raw"] = key(
-        "position", "press by a setpoint above the contact, or by raw thrust"
+        "position", "press with a position setpoint above the contact, or with raw thrust"
     )
-    thrust: int = key(60000, "thrust in raw mode", ge=1000, le=65535)
+    thrust: int = key(60000, "thrust with `mode: raw`", ge=1000, le=65535)
     press_m: ClassVar[float] = 0.25  # the setpoint above the contact
     climb_mps: ClassVar[float] = 0.2
     """Climb of the setpoint that presses."""
-    contact_dwell_s: float = key(0.25, "time for which contact must hold", gt=0, lt=3)
-    contact_z_m: float = key(0.05, "largest vertical distance to target in contact", gt=0, le=0.3)
+    contact_dwell_s: float = key(0.25, "time for which the contact must hold", gt=0, lt=3)
+    contact_z_m: float = key(
+        0.05, "maximum vertical distance to the target in contact", gt=0, le=0.3
+    )
     contact_xy_m: float = key(
-        0.025, "largest horizontal distance in contact, the magnet's radius", gt=0, le=0.5
+        0.025,
+        "maximum horizontal distance to the target in contact, the magnet's radius",
+        gt=0,
+        le=0.5,
     )
     contact_acc_g: ClassVar[float] = 0.12  # contact: off 1 g by at most this
     timeout_s: ClassVar[float] = 3.0
@@ -130,7 +155,12 @@ class CompleteConfig(Section):
     slip_mps: ClassVar[float] = 0.12  # a slip: sinking faster
     slip_dwell_s: ClassVar[float] = 0.03  # a slip: for so long; a free fall is answered at once
     slip_acc_g: ClassVar[float] = 0.5  # a free fall, or a slip wherever the estimate is: less
-    watch_s: float = key(1.5, "monitoring from the motor stop to PERCHED", gt=0, le=60)
+    watch_s: float = key(
+        1.5,
+        "time for which perchctl monitors the stopped vehicle before it reports PERCHED",
+        gt=0,
+        le=60,
+    )
 
 
 class RecoverConfig(Section):
@@ -154,13 +184,13 @@ class LandingConfig(Section):
     goal is `undershoot_m` plus `drift_mps` times the flight's time below the estimated ground,
     so that the vehicle reaches the floor in spite of drift."""
 
-    speed_mps: float = key(0.3, "descent speed of the landing", gt=0, le=1)
+    speed_mps: float = key(0.3, "descent speed during landing", gt=0, le=1)
     handover_m: float = key(
-        0.3, "height above the ground from which the vehicle lands by itself", ge=0.1, le=2
+        0.3, "height above the ground at which the firmware takes over the landing", ge=0.1, le=2
     )
-    undershoot_m: float = key(0.05, "the landing aims this far below the ground", ge=0, le=1)
+    undershoot_m: float = key(0.05, "how far below the ground the landing aims", ge=0, le=1)
     drift_mps: ClassVar[float] = 0.012  # of the estimate's height: the aim sinks so fast
-    timeout_s: float = key(30.0, "longest time of a landing", gt=0, le=120)
+    timeout_s: float = key(30.0, "time limit for a landing", gt=0, le=120)
 
     @property
     def setpoint_time_s(self) -> float:
@@ -171,10 +201,10 @@ class LandingConfig(Section):
 class PlannerConfig(Section):
     """How the mission flies, phase by phase."""
 
-    takeoff_height_m: float = key(0.5, "height of the take-off above the ground", ge=0.2, le=5)
-    takeoff_speed_mps: float = key(0.3, "climb speed of the take-off setpoint", gt=0, le=1)
+    takeoff_height_m: float = key(0.5, "take-off height above the ground", ge=0.2, le=5)
+    takeoff_speed_mps: float = key(0.3, "climb speed during take-off", gt=0, le=1)
     approach_xy_m: tuple[float, float] | None = key(
-        None, "where to fly after take-off, in the estimate's world"
+        None, "point to fly to after take-off, in the world frame of the state estimate"
     )
     approach_timeout_s: ClassVar[float] = 15.0  # for take-off and way
     search: SearchConfig = SearchConfig()
@@ -185,10 +215,14 @@ class PlannerConfig(Section):
     complete: CompleteConfig = CompleteConfig()
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
-    rows: str | None = key(None, "your own transitions: `my_module:ROWS`", pattern=PATTERN)
-    attempts: int = key(5, "perching attempts in all", ge=1, le=50)
-    perching_time_s: float = key(120.0, "time for all attempts; then it lands", gt=0, le=1200)
-    integral_per_s: float = key(0.4, "gain of the integral of the horizontal error", ge=0, le=5)
+    rows: str | None = key(
+        None, "your own mission transitions, as `my_module:ROWS`", pattern=PATTERN
+    )
+    attempts: int = key(5, "maximum number of perching attempts", ge=1, le=50)
+    perching_time_s: float = key(
+        120.0, "time for all attempts together; then the vehicle lands", gt=0, le=1200
+    )
+    integral_per_s: float = key(0.4, "integral gain of the horizontal control", ge=0, le=5)
     integral_limit_m: ClassVar[float] = 0.08
     """To which that integral grows while the vehicle moves."""
 
@@ -196,23 +230,43 @@ class PlannerConfig(Section):
 class SafetyConfig(Section):
     """Limits and reaction times: the vehicle hovers after `*_hold_s` and lands after `*_land_s`."""
 
-    min_rest_v: float = key(3.8, "least resting voltage for a take-off", ge=0, le=5)
-    min_load_v: float = key(3.0, "voltage under load below which the vehicle lands", ge=0, le=5)
+    min_rest_v: float = key(3.8, "minimum resting voltage for take-off", ge=0, le=5)
+    min_load_v: float = key(3.0, "voltage in flight below which the vehicle lands", ge=0, le=5)
     battery_debounce_s: ClassVar[float] = 1.5  # below `min_load_v` before it lands
-    energy_gate: bool = key(True, "land instead of an attempt that the battery cannot finish")
+    energy_gate: bool = key(
+        True, "land instead of starting an attempt that the battery cannot finish"
+    )
     energy_reserve_s: float = key(
-        4.0, "hover time left after an attempt and a landing", ge=0, le=120
+        4.0,
+        "hover time that the battery must have left after an attempt and a landing",
+        ge=0,
+        le=120,
     )
     battery_stale_s: ClassVar[float] = 90.0
     """A battery reading that stands still for longer is stale."""
-    telemetry_hold_s: float = key(0.3, "telemetry older than this: hold in place", gt=0, le=5)
-    telemetry_land_s: float = key(1.0, "telemetry older than this: land", gt=0, le=10)
+    telemetry_hold_s: float = key(
+        0.3, "age of the telemetry at which the vehicle holds its position", gt=0, le=5
+    )
+    telemetry_land_s: float = key(
+        1.0, "age of the telemetry at which the vehicle lands", gt=0, le=10
+    )
     proof_age_s: ClassVar[float] = 0.1
     """Older telemetry proves nothing: no contact, no landing, no stop."""
-    camera_hold_s: float = key(0.5, "time without a good picture: hold in place", gt=0, le=10)
-    camera_land_s: float = key(3.0, "time without a good picture: land", gt=0, le=60)
-    max_frame_age_s: float = key(0.4, "older pictures are not used", gt=0, le=5)
-    jump_m: float = key(0.25, "step that the estimate's speed does not explain", gt=0, le=5)
+    camera_hold_s: float = key(
+        0.5, "time without a good picture after which the vehicle holds its position", gt=0, le=10
+    )
+    camera_land_s: float = key(
+        3.0, "time without a good picture after which the vehicle lands", gt=0, le=60
+    )
+    max_frame_age_s: float = key(
+        0.4, "maximum age of a picture; older ones are not used", gt=0, le=5
+    )
+    jump_m: float = key(
+        0.25,
+        "position jump: a change of the estimate that its velocity does not explain",
+        gt=0,
+        le=5,
+    )
     jump_z_m: ClassVar[float] = 0.15
     """Such a step of its height."""
     jump_deg: ClassVar[float] = 15.0
@@ -229,12 +283,12 @@ class SafetyConfig(Section):
     variance_land_s: ClassVar[float] = 1.0  # above one of them for so long: landed
     jump_hold_s: ClassVar[float] = 0.5  # held after a jump, then landed
     max_height_m: float = key(
-        3.0, "height above ground beyond which the vehicle lands", gt=0, le=20
+        3.0, "height above the ground above which the vehicle lands", gt=0, le=20
     )
     fence_radius_m: float = key(
-        2.0, "radius around the take-off place, outside which the vehicle lands", gt=0, le=50
+        2.0, "distance from the take-off point beyond which the vehicle lands", gt=0, le=50
     )
-    max_tilt_deg: float = key(55.0, "tilt beyond which the motors are cut", gt=0, le=180)
+    max_tilt_deg: float = key(55.0, "tilt above which perchctl cuts the motors", gt=0, le=180)
     tilt_debounce_s: ClassVar[float] = 0.2  # for which it must be tilted
     loop_late_hold_s: ClassVar[float] = 0.25
     """With a turn of the loop so late it holds its place."""
@@ -247,11 +301,16 @@ class SafetyConfig(Section):
     estimator_variance_m2: ClassVar[float] = 0.01
     """A larger variance of the position refuses take-off. Ranging anchors give 0.0013; after a
     reset it is 1 m^2 in height and 100 m^2 level, until the first position."""
-    ground_z_m: float = key(0.0, "the estimate's height of the ground at take-off", ge=-10, le=10)
+    ground_z_m: float = key(
+        0.0, "height of the ground in the state estimate at take-off", ge=-10, le=10
+    )
     ground_tolerance_m: float = key(
-        0.15, "farther from `ground_z_m` the vehicle hangs or is held: no take-off", gt=0, le=10
+        0.15,
+        "maximum distance from `ground_z_m` at take-off; a vehicle farther off hangs or is held",
+        gt=0,
+        le=10,
     )
     start_tilt_deg: ClassVar[float] = 10.0
     """A larger roll or pitch refuses take-off."""
     blocked_s: ClassVar[float] = 0.7  # pressed and not moving: back off down
-    land_on_log_error: bool = key(False, "land when the log cannot be written")
+    land_on_log_error: bool = key(False, "land if the log cannot be written")

@@ -76,36 +76,52 @@ class PositioningConfig(Section):
     `body_position_m`, both in the vehicle's body axes.
     """
 
-    by: Literal["deck", "mocap", "target"] = key("deck", "what measures the position")
+    by: Literal["deck", "mocap", "target"] = key("deck", "source of the vehicle's position")
     system: System = key(
-        "vicon", "kind of motion capture, or your own source: `my_module:MySource`"
+        "vicon", "motion-capture system, or your own source, as `my_module:MySource`"
     )
-    host: str = key("", "the capture's computer, or `NAME:PORT`", pattern=_HOST)
-    body: str = key("crazyflie", "name of the vehicle's rigid body", min_length=1)
+    host: str = key("", "host of the motion capture, as `NAME` or `NAME:PORT`", pattern=_HOST)
+    body: str = key(
+        "crazyflie", "name of the vehicle's rigid body in the motion capture", min_length=1
+    )
     body_rpy_deg: Vector3 = key(
         (0.0, 0.0, 0.0), "rotation of the rigid body in the vehicle's axes: roll, pitch, yaw"
     )
     body_position_m: BodyVector3 = key(
-        (0.0, 0.0, 0.0), "the rigid body's origin in the vehicle's axes"
+        (0.0, 0.0, 0.0), "position of the rigid body's origin in the vehicle's axes"
     )
-    send: Literal["position", "pose"] = key("position", "position alone, or position and attitude")
-    rate_hz: float = key(100.0, "most positions sent a second", ge=10, le=100)
+    send: Literal["position", "pose"] = key(
+        "position", "what to send: position only, or position and attitude"
+    )
+    rate_hz: float = key(100.0, "maximum rate at which positions are sent", ge=10, le=100)
     latency_s: float = key(
         0.01,
-        "time from the cameras' exposure to arrival, as far as known",
+        "time from the exposure of the capture's cameras to arrival, as well as you know it",
         ge=0,
         le=MOST_CAPTURE_LATENCY_S,
     )
     position_sigma_m: float = key(
-        0.005, "standard deviation that the vehicle assumes: `locSrv.extPosStdDev`", gt=0, le=0.2
+        0.005,
+        "standard deviation that the vehicle assumes for the positions (`locSrv.extPosStdDev`)",
+        gt=0,
+        le=0.2,
     )
     attitude_sigma_rad: ClassVar[float] = 0.05  # what the vehicle takes it for
-    hold_s: float = key(0.15, "time without a fresh position: hold in place", gt=0, le=0.5)
-    land_s: float = key(0.7, "time without a fresh position: land", gt=0, le=2)
-    connect_timeout_s: float = key(5.0, "longest wait for the first frame", gt=0, le=60)
+    hold_s: float = key(
+        0.15,
+        "time without a fresh position after which the vehicle holds its position",
+        gt=0,
+        le=0.5,
+    )
+    land_s: float = key(
+        0.7, "time without a fresh position after which the vehicle lands", gt=0, le=2
+    )
+    connect_timeout_s: float = key(
+        5.0, "time limit for the first frame of the motion capture", gt=0, le=60
+    )
 
     decks: tuple[str, ...] = key(
-        (), "decks with your own drivers that give a position, named as `check` shows them"
+        (), "positioning decks with drivers of your own, named as `check` shows them"
     )
 
     @property

@@ -40,18 +40,24 @@ class LinkConfig(Section):
     """The profile's `link`: URI, telemetry and firmware parameters."""
 
     uri: str = key(
-        "sim://", "`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`, `my_module:MyLink`"
+        "sim://",
+        "vehicle: `sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT` or `my_module:MyLink`",
     )
-    connect_timeout_s: float = key(15.0, "time limit for both tries to connect", gt=0, le=120)
+    connect_timeout_s: float = key(
+        15.0, "time limit for connecting, both tries together", gt=0, le=120
+    )
     parameters: dict[str, int | float] = Field(
         default_factory=dict,
-        description="firmware parameters, set and read back before the flight; none turns a motor",
+        description="firmware parameters to set and read back before the flight; none may turn a "
+        "motor",
     )
-    telemetry_period_s: float = key(0.01, "period of position and attitude", ge=0.01, le=0.1)
+    telemetry_period_s: float = key(
+        0.01, "period of position and attitude in the telemetry", ge=0.01, le=0.1
+    )
     unreported: tuple[Literal["battery", "variance"], ...] = key(
         (),
-        "`battery`, `variance`: readings that this vehicle never reports, and that take-off then "
-        "does not need",
+        "readings that this vehicle never reports, so that take-off does not need them: "
+        "`battery`, `variance`",
     )
     loop_hz: float = key(50.0, "rate of the flight loop", ge=5, le=200)
 
@@ -66,11 +72,11 @@ class LinkConfig(Section):
 
 
 class LogConfig(Section):
-    directory: str = key("perchctl-logs", "folder of the log and its plot")
-    plot: bool = key(True, "draw a plot after the flight")
+    directory: str = key("perchctl-logs", "folder for logs and plots")
+    plot: bool = key(True, "plot the flight after it ends")
     max_mb: float = key(
         2000.0,
-        "size before compression at which a recording ends",
+        "size before compression at which the recording stops",
         gt=0,
         le=1e6,
     )
@@ -79,9 +85,9 @@ class LogConfig(Section):
 class Profile(Section):
     """One flight's resolved configuration."""
 
-    name: str = key("unnamed", "the profile's name; by default its file's")
-    description: str = key("", "one sentence for people")
-    date: datetime.date | None = key(None, "date of its measurements; printed on the target")
+    name: str = key("unnamed", "name of the profile; default: that of its file")
+    description: str = key("", "one-sentence description of the profile")
+    date: datetime.date | None = key(None, "date of the measurements; printed on the target")
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()

@@ -69,9 +69,12 @@ class Mounting(Section):
     image's right to the vehicle's left.
     """
 
-    position_m: BodyVector3 = key((0.0, 0.0, 0.01), "the camera in body axes: forward, left, up")
+    position_m: BodyVector3 = key(
+        (0.0, 0.0, 0.01), "position of the camera in body axes: forward, left, up"
+    )
     rpy_deg: Vector3 = key(
-        (0.0, 0.0, 0.0), "rotation: at 0 0 0 the picture's right is forward, its bottom left"
+        (0.0, 0.0, 0.0),
+        "rotation of the camera; at 0 0 0, picture right is forward and picture bottom is left",
     )
 
     @field_validator("rpy_deg")
@@ -115,32 +118,36 @@ class CameraConfig(Section):
 
     source: str = key(
         "sim:",
-        "`camera:N`, `camera:NAME`, `rtsp://...`, `http://...`, `aideck://HOST`, "
-        "`video:FILE`, `images:DIR`, `sim:`, `my_module:MyCamera`",
+        "camera source: `camera:N`, `camera:NAME`, `rtsp://...`, `http://...`, `aideck://HOST`, "
+        "`video:FILE`, `images:DIR`, `sim:` or `my_module:MyCamera`",
     )
     calibration: str = key(
-        "example_640x480.yaml", "file beside the profile or in `calib/`, or a full path"
+        "example_640x480.yaml",
+        "calibration file: one next to the profile or in `calib/`, or a full path",
     )
     cam: ClassVar[None] = None  # of a Kalibr file of several cameras: it has to hold one
     latency_s: Annotated[float, Field(ge=0, le=MOST_CAMERA_LATENCY_S)] | Literal["measured"] = key(
-        USUAL_LATENCY_S, "time from exposure to arrival; `measured`: each flight measures it"
+        USUAL_LATENCY_S, "time from exposure to arrival; with `measured`, each flight measures it"
     )
     mount: Mounting = Mounting()
-    start_timeout_s: float = key(8.0, "longest wait for the first good picture", gt=0, le=60)
+    start_timeout_s: float = key(8.0, "time limit for the first good picture", gt=0, le=60)
     mirrored: bool = key(False, "flip each picture before use")
-    mask: str | None = key(None, "picture file, white where the vehicle covers the view")
+    mask: str | None = key(None, "mask file, white where the vehicle covers the view")
     fields: ClassVar[str] = "auto"  # of interlaced pictures: found by measure
     readout_s: float | None = key(
-        0.0, "rolling shutter: time from first to last row; none: unknown", ge=0, le=0.05
+        0.0, "rolling shutter: time from the first to the last row; none if unknown", ge=0, le=0.05
     )
 
     format: str | None = key(
         None,
-        "pixel format asked of `camera:` sources, such as `MJPG`; none: the driver's",
+        "pixel format to request from `camera:` sources, such as `MJPG`; none: the driver's choice",
         pattern="^[A-Z0-9]{3,4}$",
     )
     rate_hz: float | None = key(
-        None, "rate requested from `camera:` sources; none: the driver's own", gt=0, le=500
+        None,
+        "frame rate to request from `camera:` sources; none: the driver's choice",
+        gt=0,
+        le=500,
     )
 
     @field_validator("latency_s", mode="before")
@@ -163,18 +170,21 @@ class CameraConfig(Section):
 
 class VehicleConfig(Section):
     gear_body_m: BodyVector3 = key(
-        (0.0, 0.0, 0.03), "tip of the magnet gear in body axes: forward, left, up"
+        (0.0, 0.0, 0.03), "position of the magnet gear's tip in body axes: forward, left, up"
     )
-    battery_mah: float = key(250.0, "charge of the full battery, as printed on it", ge=50, le=5000)
+    battery_mah: float = key(250.0, "capacity printed on the battery", ge=50, le=5000)
 
 
 class MarkerConfig(Section):
     """One marker of the profile's `target`: dictionary, id and side."""
 
-    dictionary: str = key(..., "an OpenCV dictionary")
-    id: int = key(..., "the marker's id in its dictionary", ge=0)
+    dictionary: str = key(..., "OpenCV dictionary of the marker")
+    id: int = key(..., "id of the marker in its dictionary", ge=0)
     side_m: float = key(
-        ..., "side of the printed black square; small: less than half of large", ge=0.004, le=2.0
+        ...,
+        "side of the printed black square; the small one must be less than half the large one",
+        ge=0.004,
+        le=2.0,
     )
 
     @model_validator(mode="after")
@@ -199,20 +209,28 @@ class TargetConfig(Section):
     large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
     size_sigma: float = key(
-        0.005, "relative error of all printed sizes, one sigma; less once measured", ge=0, le=0.1
+        0.005,
+        "relative error common to all printed sizes, one sigma; less once you have measured them",
+        ge=0,
+        le=0.1,
     )
     curl_per_m: float = key(
         0.03,
-        "greatest distance of the sheet from its plane, over r^2 from its centre",
+        "curl of the sheet: maximum distance from its plane at r from its centre, divided by r^2",
         ge=0,
         le=10,
     )
 
     expected_xy_m: tuple[_InARoom, _InARoom] | None = key(
-        None, "the target's place in the estimate's world; of several the nearest counts"
+        None,
+        "where to expect the target, in the world frame of the state estimate; of several targets "
+        "the nearest counts",
     )
     expected_within_m: float = key(
-        0.3, "a target farther from `expected_xy_m` is another vehicle's", gt=0, le=20
+        0.3,
+        "maximum distance of the target from `expected_xy_m`; one farther off is another vehicle's",
+        gt=0,
+        le=20,
     )
 
     @model_validator(mode="after")
@@ -250,9 +268,10 @@ class DetectorConfig(Section):
     """The profile's `detector`: how markers are searched and measured."""
 
     refinement: Literal["subpix", "line"] = key(
-        "line", "corners by edge lines (even if blurred or cut), or OpenCV's sub-pixel"
+        "line",
+        "find corners from edge lines (even if blurred or cut), or with OpenCV's sub-pixel method",
     )
-    own: str | None = key(None, "your own detector instead: `my_module:corners`", pattern=PATTERN)
+    own: str | None = key(None, "your own detector, as `my_module:corners`", pattern=PATTERN)
     blurred: ClassVar[bool] = True  # with lines: looked for where blur may hide the target
     blurred_every: ClassVar[int] = 4  # ... in so many pictures of a stream without it
     cut: ClassVar[bool] = True  # with lines: measured where the picture cuts both markers
@@ -265,7 +284,9 @@ class PoseConfig(Section):
 
     solver: ClassVar[str] = "sqpnp"  # OpenCV's, for the first guess
     refine: ClassVar[bool] = True  # by least squares on the corners after it
-    max_reprojection_px: float = key(3.0, "a pose above this RMS error is rejected", gt=0)
+    max_reprojection_px: float = key(
+        3.0, "RMS reprojection error above which a pose is rejected", gt=0
+    )
     each_marker: ClassVar[bool] = False  # beside the joint pose also each marker's own
 
 
@@ -283,55 +304,65 @@ class KalmanConfig(Section):
     of the state estimate by that estimate's drift only, at most so fast.
     """
 
-    k1: float = key(0.04, "measurement noise, the paper's R = k1 I, with `noise: fixed`", gt=0)
+    k1: float = key(0.04, "measurement noise with `noise: fixed`; the paper's R = k1 I", gt=0)
     k2: float = key(
-        0.004, "process noise per frame, the paper's Q = k2 I, with `noise: fixed`", gt=0
+        0.004, "process noise per frame with `noise: fixed`; the paper's Q = k2 I", gt=0
     )
-    alpha: float = key(0.85, "factor on a coasting track's speeds, per frame", gt=0, le=1)
-    n_max: int = key(8, "longest coasting of a track, in frames", ge=0, le=100)
+    alpha: float = key(
+        0.85, "factor by which a coasting track's velocities decay per frame", gt=0, le=1
+    )
+    n_max: int = key(8, "maximum number of frames for which a track coasts", ge=0, le=100)
     frame: Literal["level", "world"] = key(
-        "world", "frame in which tracks are filtered; `level` is the paper's"
+        "world", "coordinate frame in which tracks are filtered; the paper uses `level`"
     )
     noise: Literal["fixed", "measured"] = key(
-        "measured", "`fixed`: k1 and k2; `measured`: each pose's covariance, and accelerations"
+        "measured",
+        "`fixed` uses k1 and k2; `measured` uses each pose's covariance, and accelerations as "
+        "process noise",
     )
     acceleration_mps2: ClassVar[float] = 3.0
     """Of camera or target in the level frame, with `noise: measured`."""
     turn_radps2: ClassVar[float] = 3.0
     """Of the camera's attitude and heading, likewise."""
     drift_mps2: float = key(
-        0.1, "drift of the state estimate, with `frame: world`, `noise: measured`", gt=0, le=100
+        0.1,
+        "drift of the state estimate as process noise, with `frame: world` and `noise: measured`",
+        gt=0,
+        le=100,
     )
     attitude_sigma_deg: float = key(
-        0.3, "error of roll and pitch, with `noise: measured`", ge=0, le=10
+        0.3, "constant error of roll and pitch, one sigma, with `noise: measured`", ge=0, le=10
     )
     drift_mps: ClassVar[float] = 0.05
     """An unmeasured target moves in the estimate's world at most so fast."""
-    gate: bool = key(True, "reject a pose that contradicts the target's track")
+    gate: bool = key(True, "reject poses that contradict the target's track")
 
 
 class WeightsConfig(Section):
     """The paper's weights: the large marker's share in each axis and in yaw."""
 
-    x: float = key(0.275, "the large marker's share of x; the small one has the rest", ge=0, le=1)
-    y: float = key(0.306, "the large marker's share of y", ge=0, le=1)
-    z: float = key(0.728, "the large marker's share of z", ge=0, le=1)
-    yaw: float = key(0.469, "the large marker's share of yaw", ge=0, le=1)
+    x: float = key(0.275, "weight of the large marker in x; the small one has the rest", ge=0, le=1)
+    y: float = key(0.306, "weight of the large marker in y", ge=0, le=1)
+    z: float = key(0.728, "weight of the large marker in z", ge=0, le=1)
+    yaw: float = key(0.469, "weight of the large marker in yaw", ge=0, le=1)
 
 
 class MergeConfig(Section):
     """The profile's `merge`: how the two markers become one estimate."""
 
     method: Literal["weights", "joint"] = key(
-        "joint", "the paper's weights, or both markers solved as one pose"
+        "joint", "merge the markers with the paper's weights, or solve both as one pose"
     )
     weights: WeightsConfig = WeightsConfig()
-    weights_file: str | None = key(None, "file from `perchctl fit-weights`; replaces `weights`")
-    stages: Literal["seen", "range"] = key(
-        "seen", "merge all markers seen, or choose by distance (the paper's equations 4, 6, 11)"
+    weights_file: str | None = key(
+        None, "weights file from `perchctl fit-weights`; replaces `weights`"
     )
-    z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
-    z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
+    stages: Literal["seen", "range"] = key(
+        "seen",
+        "merge all markers in view, or choose by distance (the paper's equations 4, 6 and 11)",
+    )
+    z2_m: float = key(0.25, "maximum distance at which the small marker is readable", gt=0)
+    z3_m: float = key(0.12, "minimum distance at which the whole large marker is in view", gt=0)
     disagreement_m: ClassVar[float] = 0.03
     """Farther apart than this the markers contradict."""
     disagreement_frames: ClassVar[int] = 15  # so many in a row, and it lands
