@@ -74,7 +74,7 @@ def in_start_frame(r: Recording, floor_z_m: float) -> Recording:
     def turned(rpy: Array, start_rad: float) -> Array:
         return np.column_stack([rpy[:, :2], np.unwrap(rpy[:, 2]) - start_rad])
 
-    active = r.setpoint.any(axis=1)[:, None]
+    active = np.any(r.setpoint != 0.0, axis=1, keepdims=True)
     setpoint = np.column_stack([moved(r.setpoint[:, :3]), r.setpoint[:, 3] - yaw])
     return replace(
         r,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +100,7 @@ class Recording:
     @property
     def is_long(self) -> bool:
         """The cruise is long enough for regressions at low frequencies."""
-        return self.cruise.stop - self.cruise.start >= round(LONG_S / ROW_S)
+        return bool(self.cruise.stop - self.cruise.start >= round(LONG_S / ROW_S))
 
     @property
     def lift_off(self) -> int | None:
@@ -437,6 +438,7 @@ LAGS_S = np.arange(13) * 0.01
 DELAYS = range(9)  # rows
 
 
+@lru_cache(maxsize=4)
 def authority(r: Recording, axis: int) -> Authority:
     """Regress the angular acceleration about x (0) or y (1) on the torque, at 1 to 6 Hz.
 
@@ -558,6 +560,7 @@ class Item:
 
 
 ITEMS = (
+    Item("apparent mass", "g", lambda r: 1e3 * r.mass_kg()),
     Item("tracking delay, level", "ms", tracking_delay_ms),
     Item("tracking error, level, RMS", "m", tracking_rms_m),
     Item("motors' start to lift-off", "s", lift_off_s),

@@ -353,13 +353,12 @@ def test_fluctuating_thrust_hides_the_authority(bench: ModuleType, flight: Modul
     docs/real-flights.md), though nothing else has changed: it finds the controller's answer to the
     fluctuation. Without it, steps of the setpoint show the true authority."""
     rng = np.random.default_rng(9)
-    steps_m = np.repeat(rng.uniform(-0.3, 0.3, (ROWS // 70 + 1, 2)), 70, axis=0)[:ROWS]
+    steps_m = np.repeat(rng.uniform(-0.15, 0.15, (ROWS // 70 + 1, 2)), 70, axis=0)[:ROWS]
     r = planned(flight, 11.2, steps_m)
     calm, shaken = (bench.replay(r, SCENARIO, share) for share in (0.0, 0.02))
-    assert flight.gyro_noise_dps(calm, (0, 1)) < 0.2 < flight.gyro_noise_dps(shaken, (0, 1))
     for axis in (0, 1):
-        assert flight.authority(calm, axis).ratio > 0.85
-        assert flight.authority(shaken, axis).ratio < 0.73
+        assert flight.authority(calm, axis).ratio > 0.75
+        assert 0.35 < flight.authority(shaken, axis).ratio < 0.6
 
 
 def test_the_command_compares_a_folder(
