@@ -28,7 +28,7 @@ class SimulationConfig(Section):
     target_yaw_deg: Range = key((-180.0, 180.0), "the target's heading")
     ceiling_z_m: Range = key((1.8, 2.6), "the ceiling's height above the floor")
     mass_kg: Range = key((0.038, 0.042), "all-up mass")
-    battery_rest_v: Range = key((3.85, 4.2), "resting voltage at the start")
+    battery_rest_v: Range = key((4.12, 4.2), "resting voltage at the start")
     camera_latency_s: Range = key((0.03, 0.12), "true latency")
     camera_jitter_s: float = key(0.008, "scatter of the latency, one sigma", ge=0, le=0.2)
     camera_rate_hz: float = key(30.0, "frame rate", gt=0, le=200)
@@ -95,10 +95,31 @@ class SimulationConfig(Section):
     ceiling_suction: Shares = key(
         (0.1, 0.1), "share of thrust gained with the rotors at the ceiling"
     )
-    cell_resistance_ohm: Ohms | None = key(None, "internal resistance; none: 0.143, a good cell's")
+    cell_resistance_ohm: Ohms | None = key(
+        (0.11, 0.23), "internal resistance; none: 0.143, a good cell's"
+    )
     cell_slow_ohm: Ohms = key((0.0, 0.0), "further resistance of an old or cold cell, within 15 s")
-    cell_charge: Charges = key((1.0, 1.0), "charge, as a share of a new cell's")
+    cell_charge: Charges = key((0.6, 1.0), "charge, as a share of a new cell's")
     cell_knee: Knees = key((0.1, 0.1), "share of charge left where its voltage drops")
+    motor_spread: float = key(
+        0.07, "standard deviation of the motors' strengths, as a share", ge=0, le=0.2
+    )
+    centre_of_mass_m: float = key(
+        0.002, "farthest that the centre of mass lies from the middle, in x and in y", ge=0, le=0.01
+    )
+    thrust_scale: Range = key((0.95, 1.1), "thrust of all motors, as a share of the data sheet's")
+    authority: Range = key(
+        (0.55, 1.0), "angular acceleration for a torque, as a share of the data sheet's"
+    )
+    drag_nspm: Range = key((0.015, 0.0175), "level drag, N for each m/s of airspeed")
+    airspeed_moment_nmspm: Range = key(
+        (0.6e-3, 0.85e-3), "moment that lifts the nose in flight, N.m for each m/s of airspeed"
+    )
+    ground_effect: Shares = key((0.1, 0.18), "share of thrust gained on the floor")
+    thrust_noise: Shares = key(
+        (0.011, 0.022), "fluctuation of each motor's thrust within 20 ms, as a share"
+    )
+    acc_vibration_g: Range = key((0.005, 0.08), "vibration that the accelerometer reads")
     target_tilt_deg: Tilts = key((0.0, 0.0), "tilt of the target from the horizontal")
     radio_loss: Losses = key((0.0, 0.0), "share of the time in which no packet passes")
     radio_burst_s: Bursts = key((0.1, 0.1), "mean length of a radio gap")

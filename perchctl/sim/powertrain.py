@@ -8,8 +8,11 @@
   its square rises linearly with that voltage. A motor that hovers has the lag of 0.05 s of
   docs/firmware.md, "Catching a slip". One that stands still has `STANDING_LAG_S`: with it the
   slips of that page cost what was measured there.
-- Nothing brakes a brushed motor, so it runs down more slowly than it runs up.
-  `MOTOR_COAST_S` fits best what that page measured of falls, landings and take-offs.
+- Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within
+  `MOTOR_COAST_S`, which fits best what that page measured of falls, landings and take-offs. At any
+  other duty recorded flights show the same lag up and down, 30 to 50 ms.
+- Motors of a kind differ (`Scenario.motor_strength`), and what each gives fluctuates
+  (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
 - The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
   to thrust: the voltages beside the duty cycles of that page lie on one line within 0.06 V,
   0.63 V from no thrust to full.
@@ -21,6 +24,8 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable
 from math import cbrt, sqrt
+
+import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.airframe import CRAZYFLIE_21, ThrustCurve
@@ -172,11 +177,15 @@ def _charge_at(rest_v: float, knee: float) -> float:
 MOTOR_LAG_S = 0.05
 STANDING_LAG_S = 0.18
 MOTOR_COAST_S = 0.12
+FLUCTUATION_S = 0.02
+"""Memory of the fluctuation of a motor's thrust."""
 MOTOR_CURRENT_A = 1.1
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
 # The share of the way in one control period is sqrt(_STANDING + per_v * v).
 _STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
 
+_NOISE_STREAM = 24
+_NOISE_BATCH = 4096
 ForcesN = tuple[float, float, float, float]
 
 
@@ -193,9 +202,10 @@ class Powertrain:
             scenario.cell_knee,
         )
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
-        self.strength = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
+        self.strength = scenario.motor_strength  # each motor's thrust over the curve's
+        self._fluctuation = Fluctuation(scenario) if scenario.thrust_noise else None
         self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
-        self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
+        self._coasting = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
         curve = scenario.airframe.thrust
         self._thrust_n = steady_thrust(curve)
         hover_v = inverse_thrust(curve)(0.042 * GRAVITY_MPS2 / 4.0)
@@ -207,13 +217,35 @@ class Powertrain:
         for motor, duty in enumerate(duty_cycles):
             speed_v = self._speeds_v[motor]
             missing_v = scale * duty - speed_v
-            share = sqrt(_STANDING + per_v * speed_v) if missing_v > 0.0 else self._down
+            share = sqrt(_STANDING + per_v * speed_v) if duty > 0.0 else self._coasting
             self._speeds_v[motor] = speed_v + share * missing_v
         s1, s2, s3, s4 = self.strength
         f1, f2, f3, f4 = map(self._thrust_n, self._speeds_v)
+        if self._fluctuation is not None:
+            n1, n2, n3, n4 = self._fluctuation.step()
+            s1, s2, s3, s4 = s1 + n1, s2 + n2, s3 + n3, s4 + n4
         self.forces_n = f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
         self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
         return self.forces_n
+
+
+class Fluctuation:
+    """The fluctuation of four motors' thrust, as shares of it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._rng = np.random.default_rng([scenario.seed, _NOISE_STREAM])
+        self._keep = math.exp(-CONTROL_PERIOD_S / FLUCTUATION_S)
+        self._kick = scenario.thrust_noise * math.sqrt(1.0 - self._keep**2)
+        self._white: list[float] = []
+        self._now = (0.0, 0.0, 0.0, 0.0)
+
+    def step(self) -> tuple[float, float, float, float]:
+        """The shares one control period later."""
+        if not self._white:
+            self._white = (self._kick * self._rng.standard_normal(_NOISE_BATCH)).tolist()
+        keep, take, (a, b, c, d) = self._keep, self._white.pop, self._now
+        self._now = keep * a + take(), keep * b + take(), keep * c + take(), keep * d + take()
+        return self._now
 
 
 def max_thrust_n(rest_v: float) -> float:

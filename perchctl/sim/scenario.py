@@ -40,8 +40,9 @@ class Scenario:
     The world's origin is the floor under the vehicle's start, its x axis the vehicle's heading
     there.
 
-    A field named as a key of `perchctl.profile.SimulationConfig` is the value drawn from the key's
-    range.
+    The values that are given here are those of the trials in docs/firmware.md, whose vehicle has
+    four equal motors and less drag than a real one. A field named as a key of
+    `perchctl.profile.SimulationConfig` is the value drawn from the key's range.
 
     Attributes:
         target_xy_m, target_yaw_rad: centre and heading of the target.
@@ -61,6 +62,26 @@ class Scenario:
         capture_holes_s: begin and length of the times in which a motion capture does not see
             the vehicle.
         neighbours: other vehicles' targets; their downwash is in the draught.
+        motor_strength: thrust of M1..M4 at the same duty, as shares of the data sheet's. In steady
+            flight the strongest and the weakest of recorded vehicles differ by 17 % of the mean
+            (7 to 40).
+        centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles were flown
+            as if it were up to 2.4 mm off.
+        authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
+            divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz; `thrust_noise`
+            explains most of that, and how much is left is a guess.
+        drag_nspm: level drag, N for each m/s. In 104 recorded flights 0.38 (0.36 to 0.41) of the
+            mass each second, which is 0.016 at 42 g.
+        airspeed_moment_nmspm: moment that lifts the nose in forward flight, and the left side in
+            flight to the left, N.m for each m/s. In the same flights the motors hold against 0.8e-3
+            forward and 0.7e-3 sideways.
+        ground_effect: share of thrust gained with the vehicle on the floor. Recorded take-offs of
+            three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, 0.965 with 3 to 7.
+        thrust_noise: standard deviation of each motor's thrust, as a share, with a memory of 20 ms.
+            With 0.02 the body turns as much above 20 Hz as in 49 recorded flights (0.43 deg/s of
+            roll and pitch, 0.31 to 0.66), and a regression finds the same delay.
+        acc_vibration_g: what the turning motors add to each axis of the accelerometer before its
+            filter, 2.5 times what a log shows above 8 Hz: 0.003 and 0.010 to 0.028 g.
         airframe: the kind of vehicle; current and resistance of its cell are a 2.1's for each N.
     """
 
@@ -116,6 +137,14 @@ class Scenario:
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
+    motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    centre_of_mass_m: tuple[float, float] = (0.0, 0.0)
+    authority: float = 1.0
+    drag_nspm: float = 0.009
+    airspeed_moment_nmspm: float = 0.0
+    ground_effect: float = 0.0
+    thrust_noise: float = 0.0
+    acc_vibration_g: float = 0.04
     airframe: Airframe = CRAZYFLIE_21
 
     def radio_bursts(self) -> RadioBursts | None:
@@ -132,6 +161,7 @@ class Scenario:
 _SCENARIO_STREAM = 1
 _GROUPS_STREAM = 21
 _IMU_BIAS_STREAM = 22
+_VEHICLE_STREAM = 23
 _DRAWN = ("ceiling_z_m", "mass_kg", "battery_rest_v", "camera_latency_s", "camera_noise_sigma")
 """Keys that each seed draws from their range, in this order."""
 _AS_GIVEN = (
@@ -150,6 +180,8 @@ _AS_GIVEN = (
     "no_target",
 )
 """Keys of the profile that are the same for every seed."""
+_LEAST_STRENGTH = 0.8
+"""Of a motor that still flies, as a share of the others'."""
 _LONGEST_S = 240.0
 """No simulated flight lasts longer."""
 _LEAST_GAP_S = 1.0
@@ -206,6 +238,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
             for x_m, y_m, yaw_deg in sim.neighbours
         ),
         **_groups(sim, seed),
+        **_vehicle(sim, seed),
     )
 
 
@@ -244,6 +277,34 @@ def _groups(sim: SimulationConfig, seed: int) -> dict[str, Any]:
         "radio_burst_s": float(radio.uniform(*sim.radio_burst_s)),
         "capture_holes_s": _capture_holes(sim, capture),
     }
+
+
+def _vehicle(sim: SimulationConfig, seed: int) -> dict[str, Any]:
+    """What differs between two vehicles of a kind: each from a random stream of its own."""
+    motors, mass, authority, thrust, vibration, air = (
+        np.random.default_rng([seed, _VEHICLE_STREAM, part]) for part in range(6)
+    )
+    scale = motors.uniform(*sim.thrust_scale)
+    strength = scale * (1.0 + sim.motor_spread * motors.standard_normal(4))
+    m1, m2, m3, m4 = np.maximum(strength, _LEAST_STRENGTH * scale).tolist()
+    x_m, y_m = (sim.centre_of_mass_m * mass.uniform(-1.0, 1.0, size=2)).tolist()
+    return {
+        "motor_strength": (m1, m2, m3, m4),
+        "centre_of_mass_m": (x_m, y_m),
+        "authority": float(authority.uniform(*sim.authority)),
+        "drag_nspm": float(air.uniform(*sim.drag_nspm)),
+        "airspeed_moment_nmspm": float(air.uniform(*sim.airspeed_moment_nmspm)),
+        "ground_effect": float(air.uniform(*sim.ground_effect)),
+        "thrust_noise": _log_uniform(thrust, sim.thrust_noise),
+        "acc_vibration_g": _log_uniform(vibration, sim.acc_vibration_g),
+    }
+
+
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """A value whose logarithm is drawn evenly: recorded vehicles differ tenfold."""
+    low, high = bounds
+    part = float(rng.uniform())
+    return low if low <= 0.0 else low * (high / low) ** part
 
 
 def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float]:

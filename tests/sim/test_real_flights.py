@@ -24,7 +24,6 @@ from perchctl.sim.powertrain import (
 )
 from perchctl.sim.world import (
     ARM_M,
-    DRAG_LEVEL_NSPM,
     INERTIA_REFERENCE_KG,
     INERTIA_REFERENCE_KGM2,
 )
@@ -337,7 +336,7 @@ def test_a_replay_repeats_the_model(flight: ModuleType, flown: Any) -> None:
     assert flown.unusable() is None
     assert flown.begin == pytest.approx(BEGIN, abs=2)
     assert flown.mass_kg() == pytest.approx(MASS_KG, rel=0.01)
-    assert flight.drag_per_s(flown) == pytest.approx(DRAG_LEVEL_NSPM / MASS_KG, rel=0.2)
+    assert flight.drag_per_s(flown) == pytest.approx(Scenario().drag_nspm / MASS_KG, rel=0.2)
     assert flight.sag_ohm(flown) == pytest.approx(RESISTANCE_OHM, abs=0.015)
 
 

@@ -42,7 +42,6 @@ _VELOCITY_LATE = 4  # control periods: the group delay of two poles at 30 Hz, 7.
 _VELOCITY_NOISE_PER_S = 2.5  # m/s of noise a metre of position noise
 _GYRO_NOISE_DPS = 0.08
 _ACC_NOISE_G = 0.004
-_ACC_VIBRATION_G = 0.04  # added by turning motors
 _ACC_LAG = 1.0 - math.exp(-2 * math.pi * 30.0 * CONTROL_PERIOD_S)  # cut off at 30 Hz
 _NO_BIAS = (0.0, 0.0, 0.0)
 _ATTITUDE_GAIN = CONTROL_PERIOD_S / 2.0  # a memory of 2 s
@@ -173,7 +172,7 @@ class Estimator:
             self.spoil(now)
         ax, ay, az = self.acc_g
         lag, unit = _ACC_LAG, acc_unit
-        shake = _ACC_NOISE_G + _ACC_VIBRATION_G if spinning else _ACC_NOISE_G
+        shake = _ACC_NOISE_G + self._scenario.acc_vibration_g if spinning else _ACC_NOISE_G
         self.acc_g = (
             ax + lag * ((world.fx_mps2 + acc_bias[0]) * unit + shake * n4 - ax),
             ay + lag * ((world.fy_mps2 + acc_bias[1]) * unit + shake * n5 - ay),
