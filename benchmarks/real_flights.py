@@ -39,14 +39,13 @@ from recorded_flight import (
 from perchctl.geometry import Array, rotation_from_quaternion, rpy_from_rotation
 from perchctl.profile import load_profile
 from perchctl.sim import (
-    CONTROL_PERIOD_S,
     CaptureSettings,
     Scenario,
     SimulatedVehicle,
     draw_scenario,
 )
 from perchctl.sim.firmware.controller import MODE_POSITION, Setpoint
-from perchctl.sim.powertrain import FULL_COMMAND, Powertrain
+from perchctl.sim.powertrain import FULL_COMMAND
 
 CEILING_Z_M = 4.0
 LOG_HZ = 97.5
@@ -101,40 +100,13 @@ def draw_replay(r: Recording, profile: str, seed: int) -> Scenario:
     )
 
 
-class ThrustNoise:
-    """Independent fluctuations of each motor's thrust, with a memory of `MEMORY_S`.
-
-    Args:
-        share: standard deviation, as a share of the thrust.
-    """
-
-    MEMORY_S = 0.02
-
-    def __init__(self, powertrain: Powertrain, share: float, seed: int) -> None:
-        self._powertrain, self._share = powertrain, share
-        self._strength = np.array(powertrain.strength)
-        self._rng = np.random.default_rng([seed, 97])
-        self._noise = np.zeros(4)
-
-    def step(self) -> None:
-        """Advance by a control period."""
-        if self._share == 0.0:
-            return
-        keep = math.exp(-CONTROL_PERIOD_S / self.MEMORY_S)
-        kick = self._share * math.sqrt(1.0 - keep * keep) * self._rng.standard_normal(4)
-        self._noise = keep * self._noise + kick
-        s1, s2, s3, s4 = (self._strength * (1.0 + self._noise)).tolist()
-        self._powertrain.strength = s1, s2, s3, s4
-
-
-def replay(r: Recording, scenario: Scenario, thrust_noise: float = 0.0) -> Recording:
+def replay(r: Recording, scenario: Scenario) -> Recording:
     """Fly the setpoints of a record that is in its start's frame; return the simulated record.
 
     The simulated log is sampled and interpolated as NanoBench's was."""
     vehicle = SimulatedVehicle(scenario, capture=CaptureSettings(rate_hz=100.0, seed=scenario.seed))
     firmware, world, capture = vehicle.firmware, vehicle.world, vehicle.capture
     assert capture is not None
-    noise = ThrustNoise(world.powertrain, thrust_noise, scenario.seed)
     last = min(len(r.duty), r.end + round(AFTER_S / ROW_S))
     logged_s: list[float] = []
     logged: list[list[float]] = []
@@ -148,7 +120,6 @@ def replay(r: Recording, scenario: Scenario, thrust_noise: float = 0.0) -> Recor
             frame = capture.poll(vehicle.t_s)
             if frame is not None:
                 firmware.take_external(frame.bodies[capture.settings.body].position_m)
-            noise.step()
             vehicle.step()
             if vehicle.t_s >= len(logged_s) / LOG_HZ:
                 logged_s.append(vehicle.t_s)
@@ -192,11 +163,11 @@ class Compared:
     problem: str | None
 
 
-def compare(flight: tuple[int, Recording], profile: str, seed: int, noise: float) -> Compared:
+def compare(flight: tuple[int, Recording], profile: str, seed: int) -> Compared:
     number, r = flight
     scenario = draw_replay(r, profile, seed + number)
     r = in_start_frame(r, SimulatedVehicle(scenario).world.z_m)
-    simulated = replay(r, scenario, noise)
+    simulated = replay(r, scenario)
     return Compared(r.name, measure(r), measure(simulated), simulated.unusable())
 
 
@@ -305,13 +276,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("-p", "--profile", default="sim", help="whose ranges the replays draw from")
-    parser.add_argument(
-        "--thrust-noise",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="let each motor's thrust fluctuate in the replays (standard deviation, 0.02 is 2 %%)",
-    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write each flight's values, too")
     args = parser.parse_args()
     if not args.data.is_dir():
@@ -326,7 +290,7 @@ def main() -> None:
     for line in flights.left_out:
         print(f"left out: {line}")
     compared = []
-    work = partial(compare, profile=args.profile, seed=args.seed, noise=args.thrust_noise)
+    work = partial(compare, profile=args.profile, seed=args.seed)
     with contextlib.ExitStack() as stack:
         each_of: Callable[..., Iterator[Compared]] = map
         if args.jobs > 1:

@@ -473,6 +473,12 @@ def imbalance_percent(r: Recording) -> float:
     return 100.0 * float(np.ptp(each_n) / each_n.mean())
 
 
+def turning_dps(r: Recording, low_hz: float, high_hz: float) -> float:
+    """RMS of roll and pitch rate between two frequencies in cruise."""
+    turning = np.stack([band_pass(r.gyro_radps[:, k], low_hz, high_hz) for k in (0, 1)])
+    return math.degrees(float(turning[:, r.cruise].std()))
+
+
 def gyro_noise_dps(r: Recording, axes: tuple[int, ...]) -> float:
     """RMS above 20 Hz in cruise."""
     return math.degrees(float(high_pass(r.gyro_radps[:, axes], 20.0)[r.cruise].std()))
@@ -577,6 +583,10 @@ ITEMS = (
     Item("command to response, roll", "ms", lambda r: authority(r, 0).lag_ms),
     Item("command to response, pitch", "ms", lambda r: authority(r, 1).lag_ms),
     Item("motor imbalance", "%", imbalance_percent),
+    Item("gyro at 0.5..1.5 Hz", "deg/s", lambda r: turning_dps(r, 0.5, 1.5)),
+    Item("gyro at 1.5..4 Hz", "deg/s", lambda r: turning_dps(r, 1.5, 4.0)),
+    Item("gyro at 4..8 Hz", "deg/s", lambda r: turning_dps(r, 4.0, 8.0)),
+    Item("gyro at 8..20 Hz", "deg/s", lambda r: turning_dps(r, 8.0, 20.0)),
     Item("gyro above 20 Hz, roll and pitch", "deg/s", lambda r: gyro_noise_dps(r, (0, 1))),
     Item("gyro above 20 Hz, yaw", "deg/s", lambda r: gyro_noise_dps(r, (2,))),
     Item("accelerometer above 8 Hz, z", "g", acc_noise_g),

@@ -354,7 +354,7 @@ def test_fluctuating_thrust_hides_the_authority(bench: ModuleType, flight: Modul
     rng = np.random.default_rng(9)
     steps_m = np.repeat(rng.uniform(-0.15, 0.15, (ROWS // 70 + 1, 2)), 70, axis=0)[:ROWS]
     r = planned(flight, 11.2, steps_m)
-    calm, shaken = (bench.replay(r, SCENARIO, share) for share in (0.0, 0.02))
+    calm, shaken = (bench.replay(r, replace(SCENARIO, thrust_noise=n)) for n in (0.0, 0.02))
     for axis in (0, 1):
         assert flight.authority(calm, axis).ratio > 0.75
         assert 0.35 < flight.authority(shaken, axis).ratio < 0.6
