@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 from contextlib import closing
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from perchctl.positioning import CaptureFrame
 from perchctl.sim import CaptureFault, draw_scenario
 from perchctl.sim.capture import SimCapture
 from tests.helpers.capture import SWAPPED_XY, Y_UP, Rows
-from tests.helpers.flights import fly_short
+from tests.helpers.flights import DATA_SHEET, fly_short
 from tests.helpers.loop_rig import Watcher
 from tests.helpers.sights import TARGET_ONLY
 
@@ -127,8 +128,8 @@ def test_it_perches_by_the_sight_of_the_target_alone() -> None:
     assert ages_s[Phase.COMPLETE] < TARGET_ONLY.positioning.land_s
 
 
-def blown(seed: int) -> FaultResult:
-    scenario = draw_scenario(TARGET_ONLY, seed)
+def blown(seed: int, **vehicle: Any) -> FaultResult:
+    scenario = replace(draw_scenario(TARGET_ONLY, seed), **vehicle)
     result = FaultyFlight(TARGET_ONLY, draw_case(seed, scenario, ON_IT), scenario).fly()
     assert not result.counted, (result.fault, result.phase, result.reason, result.counted)
     return result
@@ -145,6 +146,6 @@ def test_no_fault_of_its_sight_makes_it_fall_or_lie(seed: int) -> None:
 @pytest.mark.parametrize("seed", [16, 30])
 def test_what_a_blow_knocks_off_the_magnet_is_braked(seed: int) -> None:
     """In COMPLETE, and in a landing that has released it: by its estimate it stands still."""
-    result = blown(seed)
+    result = blown(seed, **DATA_SHEET)
     assert result.fault == "kick"
-    assert result.astray_m < 0.5
+    assert result.astray_m < 0.6

@@ -25,7 +25,7 @@ from perchctl.profile import Profile, load_profile
 from perchctl.record import FlightLog, read_log
 from perchctl.record.fields import tick_record
 from perchctl.sim import Neighbour, SimulatedVehicle, draw_scenario
-from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile
+from tests.helpers.flights import DATA_SHEET, SEED, SHORT, Flown, fly_short, short_profile
 from tests.helpers.loop_rig import Watcher
 
 SEVEN_NAMES = [phase.value for phase in SEVEN_PHASES]
@@ -152,8 +152,9 @@ long = pytest.mark.long
     pytest.param(LOW, {"battery_rest_v": 3.3}, Outcome.SAFETY, 52, "battery",
                  ["LANDING", "LANDED"], marks=long, id="battery nearly empty"),
     # It would just do here: the gate does not bet on it, and lands with the figures.
-    pytest.param(LOW, {"battery_rest_v": 3.775}, Outcome.SAFETY, 52, " s left; an attempt takes",
-                 ["ALIGN", "LANDING", "LANDED"], marks=long, id="battery for no attempt"),
+    pytest.param(LOW, {"battery_rest_v": 3.775, **DATA_SHEET}, Outcome.SAFETY, 52,
+                 " s left; an attempt takes", ["ALIGN", "LANDING", "LANDED"], marks=long,
+                 id="battery for no attempt"),
 ])  # fmt: skip
 def test_what_goes_wrong_is_landed_and_named(
     changes: dict[str, Any], scenario: dict[str, Any], outcome: Outcome, code: int, words: str,

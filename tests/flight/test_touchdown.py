@@ -75,8 +75,10 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
     truth_mps, felt = dropped(3, share, blind)
     assert truth_mps > 0.4
     assert felt is not None
-    assert felt.speed_mps == pytest.approx(truth_mps, abs=0.15 if blind else 0.08)
-    assert felt.is_hard is (truth_mps > HARD_MPS)
+    within_mps = 0.15 if blind else 0.08
+    assert felt.speed_mps == pytest.approx(truth_mps, abs=within_mps)
+    if abs(truth_mps - HARD_MPS) > within_mps:
+        assert felt.is_hard is (truth_mps > HARD_MPS)
     assert felt.peak_g > 2.0
 
 

@@ -15,7 +15,7 @@ from perchctl.mission import Event, FlightReport, Operator, Phase, Watcher
 from perchctl.profile import Profile, load_profile
 from perchctl.record import LogWatcher
 from perchctl.record.write import Truth
-from perchctl.sim import draw_capture, draw_scenario
+from perchctl.sim import Scenario, draw_capture, draw_scenario
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,6 +26,24 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = str(Path(__file__).with_name("short.yaml"))
 SEED = 3
+
+
+DATA_SHEET: dict[str, Any] = {
+    name: getattr(Scenario(), name)
+    for name in (
+        "motor_strength",
+        "centre_of_mass_m",
+        "authority",
+        "thrust_noise",
+        "drag_nspm",
+        "airspeed_moment_nmspm",
+        "ground_effect",
+        "acc_vibration_g",
+        "cell_resistance_ohm",
+        "cell_charge",
+    )
+}
+"""A scenario's vehicle as its data sheet has it: for a law that a drawn one may break by chance."""
 
 
 @dataclass(frozen=True)
