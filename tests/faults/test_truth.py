@@ -13,9 +13,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration
+from perchctl.faults import catalogue, truth
 from perchctl.faults.effects import Effect, reboots
 from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import CUT_S, FactsRecorder, WatchedVehicle, true_sample
+from perchctl.mission import phase
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.sim import Scenario
 from tests.faults.test_oracle import HANGING
@@ -24,6 +26,17 @@ CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, no_target=True)
 PROFILE: Profile = load_profile("sim")
 DT_S = 0.01
+
+
+def test_the_faults_know_the_same_phases_as_the_mission() -> None:
+    """They keep sets of their own, so that a judge asks nothing of what it judges; a new phase has
+    to be put into each."""
+    assert truth.BY_CAMERA == phase.BY_CAMERA == set(catalogue.BY_CAMERA)
+    assert truth.IN_THE_OPEN == phase.IN_THE_OPEN
+    assert set(catalogue.AIR) == phase.AIRBORNE == set(catalogue.USUAL_S)
+    assert truth.STEERED_BY_TARGET | {phase.Phase.SEARCH, phase.Phase.APPROACH} == {
+        *phase.SEVEN_PHASES
+    }
 
 
 @pytest.fixture
