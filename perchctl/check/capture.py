@@ -405,7 +405,7 @@ def comparison_rows(
 ) -> list[Row]:
     """One row on whether `fly` finds a saved lift comparison with this motion capture; none
     without a motion capture, or for the simulated vehicle."""
-    if config.by != "mocap" or simulated:
+    if not config.source.is_mocap or simulated:
         return []
     return [_record_row(config, uri, now)]
 

@@ -99,7 +99,7 @@ MocapOrProblem = CaptureSource | str | None
 
 def _open_room(profile: Profile, scope: CheckScope, stack: contextlib.ExitStack) -> MocapOrProblem:
     config = profile.positioning
-    if config.by != "mocap":
+    if not config.source.is_mocap:
         return None
     scope.announce(f"connecting to {config.label}")
     try:
@@ -189,7 +189,7 @@ class VehicleChecks:
 
     def _lift_finding(self) -> Finding:
         config, mocap, within_s = self.profile.positioning, self.mocap, self.scope.lift_s
-        if config.by == "target":
+        if config.source.is_target:
             return skipped("only in flight it gets its position, by the target")
         if mocap is None:
             self.scope.announce(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")

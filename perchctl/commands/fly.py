@@ -422,10 +422,10 @@ def plan_text(options: FlyOptions) -> str:
 
 def _positioning(options: FlyOptions) -> str:
     profile, config = options.profile, options.profile.positioning
-    if config.by == "target":
+    if config.source.is_target:
         view = overhead_text(profile.target, profile_camera(profile.camera), profile.camera.mount)
         return f"the target itself, by the camera, from the ground on: {view}"
-    if config.by != "mocap":
+    if not config.source.is_mocap:
         return "the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
     return (

@@ -295,7 +295,7 @@ class GroundCriteria:
     def no_position_source(decks: Sequence[str], profile: Profile) -> Problem | None:
         """Problem: none of the detected `decks` measures positions, as the profile expects."""
         config = profile.positioning
-        if config.by != "deck" or {*decks} & {*POSITION_DECKS, *config.decks}:
+        if not config.source.is_deck or {*decks} & {*POSITION_DECKS, *config.decks}:
             return None
         advice = (
             "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "

@@ -254,11 +254,11 @@ def lockstep_feed(link: MockLink, profile: Profile) -> PositionFeed | None:
     there. Raises ConnectionFailed if the vehicle is not seen.
     """
     capture, config = link.vehicle.capture, profile.positioning
-    if config.by == "target":
+    if config.source.is_target:
         origin_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
         link.settle_estimator(config, VehiclePose(link.now_s, origin_m, np.eye(3)))
         return None
-    if capture is None or config.by != "mocap":
+    if capture is None or not config.source.is_mocap:
         return None
     config = config.model_copy(update={"system": capture.SYSTEM, "host": "sim"})
     feed = PositionFeed(capture, link.send_external, config)

@@ -208,7 +208,7 @@ def require_lift_check(config: PositioningConfig, uri: str, *, simulated: bool) 
     """Raises SafetyAbort unless somebody has lately compared this vehicle with the motion capture
     by hand (`perchctl check --lift`): swapped axes do not show at rest. A simulated
     vehicle passes."""
-    if config.by != "mocap" or simulated:
+    if not config.source.is_mocap or simulated:
         return
     objected = load_comparison(config, vehicle_uri(uri)).objection_and_advice(
         datetime.now().astimezone()
@@ -228,9 +228,9 @@ def start_position_feed(
     after the link has closed: a landing vehicle needs them. None without a capture.
 
     Errors: those of `CflibLink.settle_estimator`, InvalidValue, UsageError, ConnectionFailed."""
-    if config.by == "target":
+    if config.source.is_target:
         link.settle_estimator(None, ground_z_m)
-    if config.by != "mocap":
+    if not config.source.is_mocap:
         return None
     capture = open_capture(config, clock.now)
     stack.callback(capture.close)

@@ -53,7 +53,7 @@ ESTIMATE_POLL_S = 0.02
 def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
     """Return the firmware's parameters for external positions, to be set after the user's own; none
     with decks."""
-    if config.by == "deck":
+    if config.source.is_deck:
         return {}
     return {
         ESTIMATOR: KALMAN,
@@ -108,7 +108,7 @@ def settle_estimator(
         if _agree(feed, start, newest, clock, wait):
             return
     where = "the origin, where it stands"
-    if config.by != "target":
+    if not config.source.is_target:
         where = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, where {config.label} sees it"
     raise TimedOut(
         f"the estimate of {uri} does not come to {where}: does it stand still, and do positions "

@@ -96,7 +96,7 @@ class CaptureSettings:
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
     """The motion capture of the seed's flight; None if the profile uses no motion capture."""
     config, sim = profile.positioning, profile.simulation
-    if config.by != "mocap":
+    if not config.source.is_mocap:
         return None
     roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
     holes = draw_scenario(profile, seed).capture_holes_s
