@@ -62,7 +62,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import TICK_S, at, is_setpoint
+from tests.mission.rig import BEGIN_S, TICK_S, at, fly, is_setpoint
 
 DECKS = PROFILES["deck"]
 NOW_S = 10.0
@@ -446,6 +446,26 @@ def test_what_was_in_reach_and_has_not_fallen_since_hangs(
     reach_s: float | None, fell_s: float, gap_s: float, found: RestState
 ) -> None:
     assert ended(reach_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
+
+
+@pytest.mark.parametrize("part", [0.35, 1.0])
+def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float) -> None:
+    """On a thrust that does not carry it, it hangs; on hover thrust a slow sink leads away (seed
+    20591162: ten seconds in its own landing, by a state block that had died)."""
+    feels = Felt().at_rest(BEGIN_S - 0.1)
+
+    def look(t_s: float) -> Observation:
+        shakes_rad = 1e-4 * math.sin(40.0 * t_s)  # no reading stands still
+        tel = {"thrust": part * HOVER_THRUST, "acc_z_g": 0.99, "behind_s": 5.0}
+        unseen = {"target": None, "new_frame": False}
+        return at(HANG_Z_M, obs=unseen, roll_rad=shakes_rad, **tel)(t_s)
+
+    begun = remembering(
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), orders=6, ordered_s=BEGIN_S,
+        reach_s=BEGIN_S - 1.0, reckoning=DeadReckoning(below_m=0.0),
+    )  # fmt: skip
+    state = fly(begun, look, 8.0, feels=feels).state
+    assert (state.belief.reach_s is not None) is (part < 1.0)
 
 
 @pytest.mark.parametrize("reach_s", [None, NOW_S - 2.0])

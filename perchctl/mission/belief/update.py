@@ -30,6 +30,7 @@ from perchctl.mission.belief.contact import (
     STANDING_BELOW_M,
     SUPPORT_CONDITIONS,
     counts,
+    is_carried_by_other_than_thrust,
     is_hover_thrust,
 )
 from perchctl.mission.belief.evidence import Condition, lasting, update_since
@@ -249,10 +250,14 @@ def _carried_on(b: Belief) -> DeadReckoning:
 
 
 def _at_rest_on_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Set the velocity to zero for a vehicle that has been steady at its contact."""
+    """Set the velocity to zero for a vehicle that has been steady at its contact, or within the
+    magnet's reach at a thrust too small to support it: otherwise the accelerometer's bias would
+    carry a hanging vehicle out of the reach within ten seconds."""
     obs = b.obs
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
-    if b.contact_z_m is None or not new.below_m < MAGNET_REACH_M or not rests:
+    hangs = b.reach_s is not None and is_carried_by_other_than_thrust(b)
+    touched = b.contact_z_m is not None or hangs
+    if not touched or not new.below_m < MAGNET_REACH_M or not rests:
         return new
     blown = obs.t_s - obs.imu.steady_aside_s < AT_REST_S
     x_mps, y_mps, _ = new.velocity_mps
