@@ -70,6 +70,9 @@ LEAST_COSINE = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
 BRAKE_RAD_PER_MPS = 0.25
 """Lean per lateral speed."""
+SEEN_BRAKED_S = 0.5
+"""Oldest lateral speed from pictures that the vehicle brakes, s. Larger: after the last picture it
+keeps leaning against a speed that is gone. Smaller: a few lost pictures end the braking."""
 MOST_BRAKE_RAD = 0.22
 """Largest lean due to the lateral speed, rad; it costs 2.5 % of the thrust."""
 MOST_LEAN_RAD = 0.2
@@ -262,7 +265,8 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
         return clear_contact_below(state, PEELED_M)
     reach_s = b.reach_s
     fell = reach_s is not None and b.imu.fell_s > max(reach_s, state.entry.t_s)
-    if fell or (seen is not None and seen.e_m[2] > SEEN_BELOW_M):
+    seen_below = seen is not None and seen.e_m[2] > SEEN_BELOW_M
+    if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
             contact_z_m=None,
@@ -316,7 +320,9 @@ def _braking(c: Context) -> tuple[float, float]:
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
     seen, gain = _seen_motion(c), BRAKE_RAD_PER_MPS
     if seen is not None and b.camera_is_proven:
-        (ahead_mps, left_mps, _), gain = seen.velocity_mps, BRAKE_BY_TARGET_RAD_PER_MPS
+        ahead_mps, left_mps, gain = 0.0, 0.0, BRAKE_BY_TARGET_RAD_PER_MPS
+        if c.t_s - seen.t_s <= SEEN_BRAKED_S:
+            ahead_mps, left_mps, _ = seen.velocity_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
         reckoning.bias_mps2,
         reckoning.mean_lateral_mps2,

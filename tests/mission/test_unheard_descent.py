@@ -188,6 +188,15 @@ def test_without_pictures_the_same_vehicle_drops() -> None:
 
 
 @pytest.mark.parametrize("wind_mps", [-1.0, 1.0])
+def test_a_speed_that_was_seen_long_ago_is_not_braked(wind_mps: float) -> None:
+    """It would lean for ever against a speed that is gone."""
+    orders = come_down(Falling(1.8, 0.0, 1.0, wind_mps), 3.5, seen=lambda t_s: t_s < 1.5)
+    leans_rad = [each.pitch_rad for each in orders if isinstance(each, RawThrust)]
+    assert max(abs(lean_rad) for lean_rad in leans_rad[: round(1.9 / TICK_S)]) > 0.01
+    assert max(abs(lean_rad) for lean_rad in leans_rad[round(2.1 / TICK_S) :]) < 1e-3
+
+
+@pytest.mark.parametrize("wind_mps", [-1.0, 1.0])
 def test_it_brakes_what_carries_it_aside(wind_mps: float) -> None:
     """Less than half of the way that a steady wind would carry it in the same time."""
     vehicle, carried = (Falling(1.8, 0.0, 1.0, wind_mps) for _ in range(2))
