@@ -10,7 +10,7 @@
   slips of that page cost what was measured there.
 - Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within
   `MOTOR_COAST_S`, which fits best what that page measured of falls, landings and take-offs. At any
-  other duty recorded flights show the same lag up and down, 30 to 50 ms.
+  other duty recorded flights show the same lag up and down (`Scenario.motors_brake`).
 - Motors of a kind differ (`Scenario.motor_strength`), and what each gives fluctuates
   (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
 - The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
@@ -205,6 +205,7 @@ class Powertrain:
         self.strength = scenario.motor_strength  # each motor's thrust over the curve's
         self._fluctuation = Fluctuation(scenario) if scenario.thrust_noise else None
         self._speeds_v = [0.0] * 4  # each as the voltage that would keep it
+        self._brakes = scenario.motors_brake
         self._coasting = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
         curve = scenario.airframe.thrust
         self._thrust_n = steady_thrust(curve)
@@ -217,7 +218,8 @@ class Powertrain:
         for motor, duty in enumerate(duty_cycles):
             speed_v = self._speeds_v[motor]
             missing_v = scale * duty - speed_v
-            share = sqrt(_STANDING + per_v * speed_v) if duty > 0.0 else self._coasting
+            driven = missing_v > 0.0 or (self._brakes and duty > 0.0)
+            share = sqrt(_STANDING + per_v * speed_v) if driven else self._coasting
             self._speeds_v[motor] = speed_v + share * missing_v
         s1, s2, s3, s4 = self.strength
         f1, f2, f3, f4 = map(self._thrust_n, self._speeds_v)

@@ -65,6 +65,9 @@ class Scenario:
         motor_strength: thrust of M1..M4 at the same duty, as shares of the data sheet's. In steady
             flight the strongest and the weakest of recorded vehicles differ by 17 % of the mean
             (7 to 40).
+        motors_brake: the motors slow down as fast as they speed up at any duty but 0, as recorded
+            take-offs show (30 to 50 ms both ways); else they coast whenever they get less, as the
+            trials do.
         centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles were flown
             as if it were up to 2.4 mm off.
         authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
@@ -138,6 +141,7 @@ class Scenario:
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
     motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    motors_brake: bool = False
     centre_of_mass_m: tuple[float, float] = (0.0, 0.0)
     authority: float = 1.0
     drag_nspm: float = 0.009
@@ -290,6 +294,7 @@ def _vehicle(sim: SimulationConfig, seed: int) -> dict[str, Any]:
     x_m, y_m = (sim.centre_of_mass_m * mass.uniform(-1.0, 1.0, size=2)).tolist()
     return {
         "motor_strength": (m1, m2, m3, m4),
+        "motors_brake": True,
         "centre_of_mass_m": (x_m, y_m),
         "authority": float(authority.uniform(*sim.authority)),
         "drag_nspm": float(air.uniform(*sim.drag_nspm)),

@@ -55,11 +55,15 @@ def assert_landed(flown: Flown, outcome: Outcome, exit_code: int, words: str = "
 # --- A flight under good conditions ---------------------------------------------------
 
 
+QUIET = {"simulation.thrust_noise": (0.0, 0.0)}
+"""A hovering vehicle whose thrust fluctuates wanders by millimetres."""
+
+
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlightResult, Path]:
     """The result of one flight of the short profile, and its log."""
     path = tmp_path_factory.mktemp("quiet") / "flight.jsonl"
-    return fly_seed(load_profile(SHORT), SEED, path), path
+    return fly_seed(load_profile(SHORT).with_(QUIET), SEED, path), path
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +77,7 @@ def test_a_quiet_flight_perches_by_the_seven_phases_in_order(
     result, _ = quiet
     assert (result.outcome, result.attempts) == ("perched", 1)
     assert result.miss_m is not None
-    assert result.miss_m < 0.008  # a hovering vehicle wanders by millimetres
+    assert result.miss_m < 0.005
     assert not any((result.locked, result.fell))
     assert [span.phase for span in quiet_log.phases] == [*SEVEN_NAMES, "PERCHED"]
     assert all(span.reason for span in quiet_log.phases)
@@ -85,9 +89,9 @@ def test_a_quiet_flight_perches_by_the_seven_phases_in_order(
 def test_the_same_seed_gives_the_same_bytes_and_another_is_another_flight(
     quiet: tuple[FlightResult, Path], tmp_path: Path
 ) -> None:
-    fly_seed(load_profile(SHORT), SEED, tmp_path / "again.jsonl")
+    fly_seed(load_profile(SHORT).with_(QUIET), SEED, tmp_path / "again.jsonl")
     assert (tmp_path / "again.jsonl").read_bytes() == quiet[1].read_bytes()
-    assert fly_seed(load_profile(SHORT), SEED + 1).miss_m != quiet[0].miss_m
+    assert fly_seed(load_profile(SHORT).with_(QUIET), SEED + 1).miss_m != quiet[0].miss_m
 
 
 # --- The scenario of the shipped profile -------------------------------------------------

@@ -32,6 +32,7 @@ DATA_SHEET: dict[str, Any] = {
     name: getattr(Scenario(), name)
     for name in (
         "motor_strength",
+        "motors_brake",
         "centre_of_mass_m",
         "authority",
         "thrust_noise",

@@ -172,7 +172,7 @@ def test_motors_answer_as_fast_downwards_but_coast_without_a_voltage(
 ) -> None:
     """NB: command to response 60 ms (50..80) in flight; NS: take-offs fit 30 to 50 ms up and down;
     at duty 0 nothing brakes a brushed motor. 63 % of the way of the speed."""
-    motors = Powertrain(Scenario(battery_rest_v=4.2, cell_resistance_ohm=0.0))
+    motors = Powertrain(Scenario(battery_rest_v=4.2, cell_resistance_ohm=0.0, motors_brake=True))
     volts = motor_voltage(MASS_KG * GRAVITY_MPS2 / 4.0)
     duty = FULL_COMMAND * volts / motors.cell.battery_v
     for _ in range(1000):
