@@ -47,7 +47,7 @@ from perchctl.sim import (
 from perchctl.sim.firmware.controller import MODE_POSITION, Setpoint
 from perchctl.sim.powertrain import FULL_COMMAND
 
-CEILING_Z_M = 4.0
+REPLAY_CEILING_M = 4.0
 LOG_HZ = 97.5
 """Rate at which NanoBench's vehicle logged; the rows of its files are interpolated from that."""
 AFTER_S = 0.3
@@ -92,7 +92,7 @@ def draw_replay(r: Recording, profile: str, seed: int) -> Scenario:
         drawn,
         mass_kg=r.mass_kg(),
         battery_rest_v=r.rest_v,
-        ceiling_z_m=CEILING_Z_M,
+        ceiling_z_m=REPLAY_CEILING_M,
         no_target=True,
         draught_mps=(0.0, 0.0, 0.0),
         drift_mps=(0.0, 0.0, 0.0),

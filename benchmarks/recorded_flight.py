@@ -536,7 +536,7 @@ def moment_nm_per_mps(r: Recording, axis: int) -> float:
     return slope(v, torque) * (-1.0, 1.0)[axis]
 
 
-MOTOR_LAG_S = 0.04
+ASSUMED_LAG_S = 0.04
 NEAR_FLOOR_M = ((0.01, 0.03), (0.03, 0.07))
 FREE_M = 0.07
 
@@ -546,7 +546,7 @@ def ground_effect(r: Recording, band: int) -> float:
     needed above `FREE_M`."""
     flown = slice(r.begin, r.end)
     clearance_m = (r.position_m[:, 2] - r.position_m[0, 2])[flown]
-    thrust_n = lagged(r.thrusts_n().sum(axis=1), MOTOR_LAG_S)[flown]
+    thrust_n = lagged(r.thrusts_n().sum(axis=1), ASSUMED_LAG_S)[flown]
     force_g = low_pass(r.acc_g[:, 2], 8.0)[flown]
     low_m, high_m = NEAR_FLOOR_M[band]
     near, free = (clearance_m > low_m) & (clearance_m < high_m), clearance_m > FREE_M

@@ -184,8 +184,8 @@ _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
 # The share of the way in one control period is sqrt(_STANDING + per_v * v).
 _STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
 
-_NOISE_STREAM = 24
-_NOISE_BATCH = 4096
+_FLUCTUATION_STREAM = 24
+_FLUCTUATION_BATCH = 4096
 ForcesN = tuple[float, float, float, float]
 
 
@@ -235,7 +235,7 @@ class Fluctuation:
     """The fluctuation of four motors' thrust, as shares of it."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._rng = np.random.default_rng([scenario.seed, _NOISE_STREAM])
+        self._rng = np.random.default_rng([scenario.seed, _FLUCTUATION_STREAM])
         self._keep = math.exp(-CONTROL_PERIOD_S / FLUCTUATION_S)
         self._kick = scenario.thrust_noise * math.sqrt(1.0 - self._keep**2)
         self._white: list[float] = []
@@ -244,7 +244,7 @@ class Fluctuation:
     def step(self) -> tuple[float, float, float, float]:
         """The shares one control period later."""
         if not self._white:
-            self._white = (self._kick * self._rng.standard_normal(_NOISE_BATCH)).tolist()
+            self._white = (self._kick * self._rng.standard_normal(_FLUCTUATION_BATCH)).tolist()
         keep, take, (a, b, c, d) = self._keep, self._white.pop, self._now
         self._now = keep * a + take(), keep * b + take(), keep * c + take(), keep * d + take()
         return self._now

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from perchctl.vehicle import Command, RawThrust
 from tests.helpers.mission import (
     BY_TARGET,
     CEILING_M,
+    HANG_Z_M,
     HOVER_THRUST,
     Felt,
     observation,
@@ -102,9 +104,13 @@ class Falling:
     thrust: float = HOVER_THRUST
     lean_rad: float = 0.0
     touched_mps: float | None = None
+    held: bool = False
+    state: PlannerState | None = None  # of the planner that flew it, at the end
 
     def step(self, command: Command) -> None:
-        """A tick later, by a raw thrust; the floor is at 0."""
+        """A tick later, by a raw thrust; the floor is at 0. A held vehicle stays where it is."""
+        if self.held:
+            return
         if isinstance(command, RawThrust):
             share = 1.0 - math.exp(-TICK_S / 0.06)
             self.thrust += share * (command.thrust - self.thrust)
@@ -122,15 +128,21 @@ class Falling:
 
 
 def come_down(
-    vehicle: Falling, lasts_s: float, *, seen: Callable[[float], bool] = lambda _: True
+    vehicle: Falling,
+    lasts_s: float,
+    *,
+    seen: Callable[[float], bool] = lambda _: True,
+    proven: bool = True,
+    **remembered: Any,
 ) -> list[Command]:
     """Let a landing that has not heard the vehicle for a second fly it, by pictures that are late
-    and show the target while it is `seen`; its last telemetry had it hovering where it was."""
+    and show the target while it is `seen`; its last telemetry had it hovering where it was. The
+    camera is `proven` if pictures and accelerometer have agreed before."""
     heard = telemetry(BEGIN_S - 1.1, vehicle.z_m)
     state: PlannerState = remembering(
-        state_in(Phase.LANDING, z_m=vehicle.z_m), hover_thrust=HOVER_THRUST
+        state_in(Phase.LANDING, z_m=vehicle.z_m), hover_thrust=HOVER_THRUST, **remembered
     )
-    felt = VisualInertialMotion(heard.t_s, (0.0, 0.0), (0.0, 0.0), None)
+    felt = VisualInertialMotion(heard.t_s, (0.0, 0.0), (0.0, 0.0), None) if proven else None
     look: Callable[[Observation], Observation] = Felt()
     past: list[tuple[float, float]] = [(vehicle.x_m, vehicle.z_m)] * round(PICTURES_LATE_S / TICK_S)
     commands: list[Command] = []
@@ -147,7 +159,14 @@ def come_down(
         state, command = step_mission(state, look(obs), BY_TARGET)
         commands.append(command)
         vehicle.step(command)
+    vehicle.state = state
     return commands
+
+
+def raw_orders(commands: list[Command], begin_s: float, end_s: float) -> list[RawThrust]:
+    """The raw thrusts ordered between two times."""
+    ticks = commands[round(begin_s / TICK_S) : round(end_s / TICK_S)]
+    return [command for command in ticks if isinstance(command, RawThrust)]
 
 
 @pytest.mark.parametrize("climb_mps", [-0.4, 0.0, 0.3])
@@ -203,3 +222,41 @@ def test_it_brakes_what_carries_it_aside(wind_mps: float) -> None:
     come_down(vehicle, 4.0)
     come_down(carried, 4.0, seen=lambda _: False)
     assert abs(vehicle.x_m) < 0.5 * abs(carried.x_m)
+
+
+def test_a_camera_that_nothing_has_proven_does_not_brake() -> None:
+    """Turned by 90 degrees it would lead aside: only the climb counts then."""
+    orders = come_down(Falling(1.8, 0.0, 1.0, 1.0), 3.0, proven=False)
+    assert max(abs(each.pitch_rad) for each in raw_orders(orders, 0.0, 3.0)) < 1e-3
+
+
+def test_a_target_that_is_seen_again_changes_nothing_until_its_motion_is_known() -> None:
+    """A third of a second of detections after a gap of more than a second."""
+    orders = come_down(Falling(1.8, 0.0, 1.0), 3.0, seen=lambda t_s: not 0.6 <= t_s < 2.0)
+    thrusts = [each.thrust for each in raw_orders(orders, 2.1, 2.25)]
+    assert len({*thrusts}) == 1
+
+
+def test_what_pictures_show_standing_on_little_thrust_stands_on_the_floor() -> None:
+    vehicle = Falling(0.8, 0.0, 1.0)
+    come_down(vehicle, 9.0)
+    assert vehicle.state is not None
+    assert vehicle.state.descent.floor_felt_s is not None
+
+
+def test_what_hangs_right_below_the_target_does_not() -> None:
+    """It may hang on the magnet, whatever its thrust is."""
+    vehicle = Falling(HANG_Z_M - 0.05, 0.0, 1.0, held=True)
+    come_down(vehicle, 9.0)
+    assert vehicle.state is not None
+    assert vehicle.state.descent.floor_felt_s is None
+
+
+def test_pictures_that_show_it_below_its_contact_clear_that() -> None:
+    """Once, and not the time since which it has been without a position."""
+    vehicle = Falling(HANG_Z_M, 0.0, 1.0)
+    come_down(vehicle, 5.0, contact_z_m=HANG_Z_M, reach_s=BEGIN_S - 1.5)
+    assert vehicle.state is not None
+    assert vehicle.state.belief.contact_z_m is None
+    assert vehicle.state.belief.dead_reckoned_s is not None
+    assert vehicle.state.belief.dead_reckoned_s < BEGIN_S + 4.0

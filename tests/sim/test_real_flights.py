@@ -341,7 +341,7 @@ def test_a_replay_repeats_the_model(flight: ModuleType, flown: Any) -> None:
 
 
 def test_a_replay_lies_where_recorded_flights_do(flight: ModuleType, flown: Any) -> None:
-    """10th to 90th percentile of 49 flights of NanoBench (docs/real-flights.md)."""
+    """10th to 90th percentile of 47 flights of NanoBench (docs/real-flights.md)."""
     assert 478.0 < flight.tracking_delay_ms(flown) < 604.0
     assert 0.131 < flight.sag_ohm(flown) < 0.222
     assert 2.6 < flight.discharge_mv_per_s(flown) < 6.7
