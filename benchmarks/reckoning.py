@@ -116,7 +116,7 @@ class Filter:
 
     def add_velocity(self, b: Belief, dt_s: float) -> None:
         for i, axis in enumerate(self.axes):
-            pushed = b.by_target and not b.is_corrected and i < 2
+            pushed = b.is_target_positioned and not b.is_velocity_corrected and i < 2
             if not pushed:
                 v = b.telemetry.velocity_mps[i]
                 axis.update(1, v, axis.rv**2 / dt_s, 2.0 * MOST_SIGMAS)
@@ -181,7 +181,12 @@ def moments(log: FlightLog) -> Iterator[Moment]:
             filter_.predict(np.subtract(imu.velocity_mps, before.velocity_mps), dt_s)
         before = imu if before is None or dt_s > 0.0 else before
         filter_.remember(b.telemetry.t_s, b.telemetry.yaw_rad)
-        if b.position_valid and b.dead_reckoned_s is None and b.jump_s is None and dt_s > 0.0:
+        if (
+            b.is_position_valid
+            and b.dead_reckoned_s is None
+            and b.first_jump_s is None
+            and dt_s > 0.0
+        ):
             filter_.add_velocity(b, dt_s)
         pose = next((turn.poses[n] for n in ("joint", "large", "small") if n in turn.poses), None)
         if pose is not None and b.mismatch.later_s == 0.0:
@@ -195,7 +200,7 @@ def errors(log: FlightLog) -> Iterator[tuple[float, list[tuple[float, float]]]]:
     last_s = -math.inf
     for k, moment in enumerate(flown):
         b = moment.belief
-        known = b.position_valid and b.dead_reckoned_s is None and b.reckoning.imu is not None
+        known = b.is_position_valid and b.dead_reckoned_s is None and b.reckoning.imu is not None
         if not known or b.height_m < LEAST_HEIGHT_M or b.obs.t_s - last_s < BEGINS_EVERY_S:
             continue
         last_s = b.obs.t_s
@@ -227,7 +232,7 @@ def _blind(
         if now.obs.t_s - begin_s >= left[0]:
             v = truth.velocity_mps(now.obs.t_s)
             way_m = truth.position_m(now.obs.t_s) - truth.position_m(begin_s)
-            old_way_m = np.subtract(b.reckoning.aside_m, old.aside_m)
+            old_way_m = np.subtract(b.reckoning.lateral_offset_m, old.lateral_offset_m)
             found = np.array([axis.x for axis in new])
             yield (
                 left.pop(0),

@@ -27,12 +27,12 @@ from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.link import Link  # noqa: E402
 from perchctl.mission import Phase, step_mission, table  # noqa: E402
 from perchctl.mission.phase import (  # noqa: E402
-    AIRBORNE,
-    BEFORE_CONTACT,
-    BY_CAMERA,
+    AIRBORNE_PHASES,
+    CAMERA_GUIDED_PHASES,
     FLYING_PHASES,
-    IN_THE_OPEN,
-    MAGNET_MAY_CATCH,
+    FREE_AIR_PHASES,
+    MAGNET_ATTACH_PHASES,
+    PRE_CONTACT_PHASES,
 )
 from perchctl.mission.transition import Transition  # noqa: E402
 from perchctl.perception import Perception  # noqa: E402
@@ -206,13 +206,13 @@ def corner_methods() -> str:
 
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
-    (AIRBORNE, "in the air"),
+    (AIRBORNE_PHASES, "in the air"),
     (FLYING_PHASES, "before landing"),
-    (BEFORE_CONTACT, "before contact"),
-    (BY_CAMERA, "by camera"),
-    (IN_THE_OPEN, "in the open"),
-    (MAGNET_MAY_CATCH, "by camera, PERCH"),
-    (IN_THE_OPEN | {Phase.LANDING}, "in the open, LANDING"),
+    (PRE_CONTACT_PHASES, "before contact"),
+    (CAMERA_GUIDED_PHASES, "by camera"),
+    (FREE_AIR_PHASES, "in the open"),
+    (MAGNET_ATTACH_PHASES, "by camera, PERCH"),
+    (FREE_AIR_PHASES | {Phase.LANDING}, "in the open, LANDING"),
 )
 
 

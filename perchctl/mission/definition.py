@@ -14,7 +14,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition
 
 
-def enter_as_it_is(state: PlannerState, before: Context) -> PlannerState:
+def keep_state(state: PlannerState, before: Context) -> PlannerState:
     """Enter a phase that needs no preparation."""
     del before
     return state
@@ -37,6 +37,6 @@ class PhaseDefinition:
     phase: Phase
     maneuver: Maneuver
     act: Callable[[Context], Action]
-    enter: Callable[[PlannerState, Context], PlannerState] = enter_as_it_is
+    enter: Callable[[PlannerState, Context], PlannerState] = keep_state
     exits: tuple[Transition, ...] = ()
     conditions: tuple[Condition[Context], ...] = ()

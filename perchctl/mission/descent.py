@@ -24,19 +24,19 @@ import math
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.contact import (
     HANGING,
-    HANGING_S,
+    HANGING_DWELL_S,
     ON_FLOOR,
     has_slipped,
     is_pressing,
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.reckoning import MAGNET_REACH_M
-from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
+from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
 from perchctl.mission.belief.update import (
-    STILL_THRUST,
-    after_command,
-    forget_evidence,
-    give_up_position,
+    KEEPALIVE_THRUST,
+    reset_evidence,
+    start_dead_reckoning,
+    update_after_command,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
@@ -118,7 +118,7 @@ def step_landing(
     """Fly one tick of the descent without the mission's table, for watchdog and rescue. The first
     call begins the landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.on_ground(obs, profile)
-    state = replace(state, belief=state.belief.seen(obs, profile))
+    state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, MANEUVER)
     return remember_command(*act(Context(state)))
 
@@ -128,7 +128,7 @@ def remember_command(state: PlannerState, command: Command) -> tuple[PlannerStat
     order = state.raw_order
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
-    belief = after_command(state.belief, command)
+    belief = update_after_command(state.belief, command)
     return replace(state, belief=belief, raw_order=order, t_s=belief.obs.t_s), command
 
 
@@ -143,7 +143,7 @@ def begin_landing(state: PlannerState) -> PlannerState:
         entry=replace(state.entry, t_s=b.obs.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
         severity=max(state.severity, Severity.LAND),
         since={},
-        belief=forget_evidence(b),
+        belief=reset_evidence(b),
         pressed=state.catch_above_m is None and is_pressing(b),
         ordered_s=None,
         orders=0,
@@ -155,28 +155,30 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
     """Return the state at the start of a landing; `before` is the state before the transition."""
     b, tel, old = state.belief, state.belief.telemetry, before.belief
     heard = b.attitude_age_s <= b.profile.safety.proof_age_s
-    if heard and tel.has_bit(HL_ACTIVE) and not b.by_target and not b.diverged:
+    if heard and tel.has_bit(HL_ACTIVE) and not b.is_target_positioned and not b.diverged:
         state = replace(state, orders=LEAST_ORDERS, ordered_s=b.obs.t_s)
     elif heard and tel.thrust < 1 and before.stopped_s is None:
         # The motors were stopped or never ran; no order may start them again.
         state = replace(state, stopped_s=b.obs.t_s)
     contact_z_m = old.contact_z_m
-    pressed_unseen = state.pressed and b.by_target
+    pressed_unseen = state.pressed and b.is_target_positioned
     if contact_z_m is None and (before.phase is Phase.PERCH or pressed_unseen):
         # The vehicle may be within the magnet's reach, also below a sheet that hangs from an unseen
         # ceiling. It counts as free only after a sighting from below.
         contact_z_m = tel.position_m[2]
     # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
     state = anchor_in_wind(Context(state))
-    within = contact_z_m is not None or b.reckoning.below_m < MAGNET_REACH_M
-    lost = b.has_lost_its_position
+    within = contact_z_m is not None or b.reckoning.distance_below_m < MAGNET_REACH_M
+    lost = b.has_lost_position
     b = replace(
         b,
-        reach_s=before.t_s if within and old.reach_s is None else old.reach_s,
+        in_reach_since_s=before.t_s
+        if within and old.in_reach_since_s is None
+        else old.in_reach_since_s,
         contact_z_m=contact_z_m,
-        hover=hover.best_estimate(old),
+        hover=hover.estimate_hover_thrust(old),
     )
-    return replace(state, belief=give_up_position(b) if lost else b)
+    return replace(state, belief=start_dead_reckoning(b) if lost else b)
 
 
 def act(c: Context) -> Action:
@@ -195,7 +197,7 @@ def act(c: Context) -> Action:
     # changing to another policy during the firmware's own landing would cost height
     if c.state.orders:
         return _own_landing(c)
-    return _release(c) if c.held_s(HANGING) >= HANGING_S else descend(c)
+    return _release(c) if c.held_s(HANGING) >= HANGING_DWELL_S else descend(c)
 
 
 def descend(c: Context) -> Action:
@@ -210,19 +212,23 @@ def descend(c: Context) -> Action:
     level.
     """
     b = c.belief
-    if not b.knows_its_place:
+    if not b.can_descend_by_position:
         return _level(c)
-    landing, in_reach, doubtful = c.planner.landing, b.is_in_magnet_reach, b.is_doubtful
-    if b.by_target or not (in_reach or doubtful):
+    landing, in_reach, doubtful = (
+        c.planner.landing,
+        b.is_in_magnet_reach,
+        b.is_flight_data_unreliable,
+    )
+    if b.is_target_positioned or not (in_reach or doubtful):
         state, away = leave_press(c)
         if away is not None:
             return state, away
         c = Context(state)
     low = b.height_m <= landing.handover_m
     if in_reach:
-        gives_up = c.in_phase_s > PEEL_S and (b.imu_proves or not doubtful)
+        gives_up = c.in_phase_s > PEEL_S and (b.is_imu_fresh or not doubtful)
         return _release(c) if gives_up else _by_setpoints(c)
-    if b.by_target:
+    if b.is_target_positioned:
         return _level(c) if c.state.descent.thrust or low else _by_setpoints(c)
     overdue = c.in_phase_s > landing.setpoint_time_s
     return _own_landing(c) if doubtful or overdue or low else _by_setpoints(c)
@@ -231,9 +237,9 @@ def descend(c: Context) -> Action:
 def is_landing_over(c: Context) -> bool:
     """True if a landing is over: its raw thrust is at the minimum, or its setpoint at the floor.
     Without a stop, the firmware would lock the vehicle."""
-    setpoint, ground_m = c.state.setpoint, c.belief.ground_m
-    if setpoint is not None and ground_m is not None:
-        low = setpoint.z_m <= ground_m[2] + c.planner.landing.handover_m
+    setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
+    if setpoint is not None and takeoff_position_m is not None:
+        low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
         if low and Claim.UNCONFIRMED in c.state.entry.claims:
             return True
     return 0.0 < c.state.descent.thrust <= LEAST_ORDERED_PART * c.belief.hover_thrust + 1.0
@@ -244,9 +250,9 @@ def is_landing_over(c: Context) -> bool:
 
 def _falls_free(c: Context) -> bool:
     b, state = c.belief, c.state
-    if not b.imu_proves:
+    if not b.is_imu_fresh:
         return False
-    if not state.is_motor_borne:
+    if not state.is_under_power:
         return b.is_in_magnet_reach and has_slipped(b)
     if state.orders:
         return False
@@ -259,7 +265,7 @@ def _stands(c: Context) -> bool:
     b = c.belief
     if b.proves and c.held_s(ON_FLOOR) >= ON_FLOOR_S:
         return True
-    placed = b.by_target and b.position_valid and b.dead_reckoned_s is None
+    placed = b.is_target_positioned and b.is_position_valid and b.dead_reckoned_s is None
     low = b.height_m < STOP_BELOW_M and not b.is_in_magnet_reach
     return placed and c.state.descent.thrust > 0.0 and low and abs(b.climb_mps) < RESTS_MPS
 
@@ -268,7 +274,10 @@ def _caught_again(c: Context) -> Action:
     """Restart the landing at the present height, with a catch."""
     tel, b = c.telemetry, c.belief
     belief = replace(
-        b, contact_z_m=None, reach_s=None, reckoning=replace(b.reckoning, below_m=math.inf)
+        b,
+        contact_z_m=None,
+        in_reach_since_s=None,
+        reckoning=replace(b.reckoning, distance_below_m=math.inf),
     )
     state = replace(
         c.state,
@@ -328,22 +337,27 @@ def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z
     above the vehicle: the motors stop at the end of the trajectory.
     """
     drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
-    aim_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
-    return Land(aim_m, LANDING_MARGIN_S + PEAK_OF_MEAN * (z_m - aim_m) / PLANNED_MPS)
+    axis_intersection_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
+    return Land(
+        axis_intersection_m,
+        LANDING_MARGIN_S + PEAK_OF_MEAN * (z_m - axis_intersection_m) / PLANNED_MPS,
+    )
 
 
 def _own_landing(c: Context) -> Action:
     """Order the firmware's own landing until the telemetry shows that the vehicle executes it."""
     tel, b = c.telemetry, c.belief
     state, away = leave_press(c)
-    if away is not None and not b.is_doubtful and not state.orders:
+    if away is not None and not b.is_flight_data_unreliable and not state.orders:
         return state, away
-    ends = state.orders >= LEAST_ORDERS and not (b.position_valid and b.height_m >= FALLEN_BELOW_M)
+    ends = state.orders >= LEAST_ORDERS and not (
+        b.is_position_valid and b.height_m >= FALLEN_BELOW_M
+    )
     carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
-    if b.imu_proves and tel.thrust < 1 and carried and (state.orders or not tel.has_bit(FLYING)):
+    if b.is_imu_fresh and tel.thrust < 1 and carried and (state.orders or not tel.has_bit(FLYING)):
         return state, Idle()  # on the floor, another order would start the motors again
     waited = math.inf if state.ordered_s is None else c.t_s - state.ordered_s
-    seen = state.orders >= LEAST_ORDERS and b.imu_proves and tel.has_bit(HL_ACTIVE)
+    seen = state.orders >= LEAST_ORDERS and b.is_imu_fresh and tel.has_bit(HL_ACTIVE)
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.t_s - state.started_s
         order = onboard_landing(c.planner, b.ground_z_m, flown_s, tel.position_m[2])
@@ -363,5 +377,5 @@ def _weight_on_magnet(c: Context) -> Action:
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _release(c)
     part = LEAST_ORDERED_PART * c.belief.hover_thrust
-    thrust = int(max(STILL_THRUST, min(LEAST_POSITION_THRUST, part)))
+    thrust = int(max(KEEPALIVE_THRUST, min(MIN_POSITION_MODE_THRUST, part)))
     return replace(c.state, released_s=c.t_s), RawThrust(thrust)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.belief.battery import (
-    LEAST_LOADED_S,
+    MIN_LOADED_S,
+    BatteryFit,
     Drive,
-    EnergyState,
     charge_from_rest_v,
-    drive_of,
     fit_sag_model,
-    full_thrust_share_per_s,
+    full_thrust_discharge_per_s,
+    identify_drive,
 )
 from perchctl.mission.belief.contact import max_press_thrust
 from perchctl.mission.context import Context
@@ -39,10 +39,10 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     """Return how long the battery lasts, and for how many attempts. An unknown charge counts for at
     most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.belief.energy
-    used_mah = energy.used_share * c.profile.vehicle.battery_mah
+    used_mah = energy.counted_discharge * c.profile.vehicle.battery_mah
     load = (c.belief.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
-    counted_s = hover_left_s(energy, c.profile, load, drive_of(c.telemetry))
-    seconds = None if energy.unknown_s > UNKNOWN_S else counted_s
+    counted_s = hover_left_s(energy, c.profile, load, identify_drive(c.telemetry))
+    seconds = None if energy.no_reading_s > UNKNOWN_S else counted_s
     if c.belief.target.world_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
     enough_s, (attempt_s, again_s, landing_s) = seconds, attempt_retry_landing_s(c)
@@ -56,10 +56,10 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
-def hover_left_s(state: EnergyState, profile: Profile, load: float, drive: Drive) -> float | None:
+def hover_left_s(state: BatteryFit, profile: Profile, load: float, drive: Drive) -> float | None:
     """Return the hover time, s, at `load` (share of full thrust) until `battery-low` fires; None if
     unknown."""
-    if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
+    if state.rest_v is None or state.loaded_s < MIN_LOADED_S or not load > 0.0:
         return None
     safety, perch = profile.safety, profile.planner.perch
     hover_v = max(
@@ -68,11 +68,11 @@ def hover_left_s(state: EnergyState, profile: Profile, load: float, drive: Drive
     lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
     press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
     press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
-    sag_v, hunger = fit_sag_model(state)
+    sag_v, discharge_factor = fit_sag_model(state)
     end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
     share = charge_from_rest_v(state.rest_v) - charge_from_rest_v(end_v)
     return max(0.0, share) / (
-        hunger * load * full_thrust_share_per_s(profile.vehicle.battery_mah, drive)
+        discharge_factor * load * full_thrust_discharge_per_s(profile.vehicle.battery_mah, drive)
     )
 
 
@@ -80,7 +80,7 @@ def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
     """Return the times, s, that this attempt, each retry and the landing take, in this order, from
     the height of the known target."""
     planner = c.planner
-    up_m = max(0.0, c.belief.target.contact_goal_z_m - c.telemetry.position_m[2])
+    up_m = max(0.0, c.belief.target.contact_body_z_m - c.telemetry.position_m[2])
     touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
@@ -117,7 +117,7 @@ def battery_shortfall(c: Context) -> str:
 
 def _grace_s(c: Context) -> float:
     """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
-    return c.safety.battery_stale_s - max(c.belief.energy.unknown_s, c.obs.battery_age_s)
+    return c.safety.battery_stale_s - max(c.belief.energy.no_reading_s, c.obs.battery_age_s)
 
 
 def _climb_s(profile: Profile, up_m: float) -> float:

@@ -18,9 +18,9 @@ import math
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief import hover
-from perchctl.mission.belief.contact import MOST_RAW
-from perchctl.mission.belief.reckoning import BIAS_MEMORY_S
-from perchctl.mission.belief.target import SEEN_MEMORY_S, TargetMotion
+from perchctl.mission.belief.contact import MAX_RAW_THRUST
+from perchctl.mission.belief.reckoning import BIAS_TIME_CONSTANT_S
+from perchctl.mission.belief.target import CAMERA_VELOCITY_TIME_CONSTANT_S, TargetMotion
 from perchctl.mission.context import Context
 from perchctl.mission.release import clear_contact_below
 from perchctl.mission.setpoints import Action
@@ -142,12 +142,12 @@ def _is_seen_again(c: Context) -> bool:
 def _measured_s(c: Context) -> float:
     """Return the time at which telemetry or pictures measured the vertical speed."""
     seen = _seen_motion(c)
-    return c.telemetry.t_s if seen is None else seen.t_s - SEEN_MEMORY_S
+    return c.telemetry.t_s if seen is None else seen.t_s - CAMERA_VELOCITY_TIME_CONSTANT_S
 
 
 def _is_unmeasured(c: Context) -> bool:
     """True if telemetry and pictures are too old to determine the vertical speed."""
-    return _age_s(c) > hover.LATEST_S
+    return _age_s(c) > hover.MAX_TELEMETRY_AGE_S
 
 
 def _step_s(c: Context) -> float:
@@ -163,7 +163,7 @@ def _age_s(c: Context) -> float:
 def waits_for_its_own_estimate(c: Context) -> bool:
     """True if the vertical speed is unknown and the hover thrust is rough: setpoints are better for
     a while."""
-    begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_rough
+    begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_imprecise
     return _is_unmeasured(c) and begins_rough and c.in_phase_s < OWN_ESTIMATE_S
 
 
@@ -177,28 +177,30 @@ def descend_level(c: Context) -> Action:
     sinks, ramp_per_s = climb_mps <= -LEAST_SINK_MPS, RAMP_PER_S
     if _seen_motion(c) is not None:  # on the floor, recent orders cause no climb
         sinks, ramp_per_s = measured_mps <= -SEEN_LEAST_SINK_MPS, SEEN_RAMP_PER_S
-    hover_thrust = hover.best_estimate(b).thrust
+    hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
     thrust = _rate_thrust(c, hover_thrust, climb_mps, height_m)
-    if age_s > hover.LATEST_S:
+    if age_s > hover.MAX_TELEMETRY_AGE_S:
         thrust *= UNHEARD_PART
-    floor_felt_s = _floor_felt_s(c, hover_thrust, height_m, sinks=sinks)
-    touched_s = math.inf if floor_felt_s is None else c.t_s - floor_felt_s
+    floor_detected_s = _floor_detected_s(c, hover_thrust, height_m, sinks=sinks)
+    touched_s = math.inf if floor_detected_s is None else c.t_s - floor_detected_s
     # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
-    falls = b.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
+    falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
     if touched_s >= TOUCH_S and falls:
-        floor_felt_s = None  # the vehicle falls at low thrust, so it did not touch the floor
-    carried = b.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover_thrust
-    overdue = _is_overdue(c) and not (b.imu_proves and tel.acc_z_g < AIRBORNE_G)
+        floor_detected_s = None  # the vehicle falls at low thrust, so it did not touch the floor
+    carried = (
+        b.is_imu_fresh and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover_thrust
+    )
+    overdue = _is_overdue(c) and not (b.is_imu_fresh and tel.acc_z_g < AIRBORNE_G)
     before = descent.thrust or hover_thrust
     if touched_s < TOUCH_S:
         thrust = TOUCH_PART * hover_thrust
     elif _is_seen_again(c):
         thrust = before
-    elif floor_felt_s is not None or carried or not sinks or overdue:
+    elif floor_detected_s is not None or carried or not sinks or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
-    thrust = max(LEAST_ORDERED_PART * hover_thrust, min(MOST_RAW, thrust))
+    thrust = max(LEAST_ORDERED_PART * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the orders since the newest sample have caused.
     shown_s = 0.0 if b.last is None else max(0.0, measured_s - descent.sample_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
@@ -209,7 +211,7 @@ def descend_level(c: Context) -> Action:
         descent=replace(
             descent,
             thrust=thrust,
-            floor_felt_s=floor_felt_s,
+            floor_detected_s=floor_detected_s,
             under_way_mps=under_way_mps,
             sample_s=measured_s,
         ),
@@ -217,7 +219,7 @@ def descend_level(c: Context) -> Action:
         orders=0,
         catch_above_m=None,
     )
-    roll_rad, pitch_rad = (0.0, 0.0) if floor_felt_s is not None else _braking(c)
+    roll_rad, pitch_rad = (0.0, 0.0) if floor_detected_s is not None else _braking(c)
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
 
@@ -231,13 +233,15 @@ def _measured_climb_mps(c: Context) -> float:
     return 0.0 if held else c.belief.climb_mps
 
 
-def _floor_felt_s(c: Context, hover_thrust: float, height_m: float, *, sinks: bool) -> float | None:
+def _floor_detected_s(
+    c: Context, hover_thrust: float, height_m: float, *, sinks: bool
+) -> float | None:
     """Return when the floor was first detected: by a blow from below during a sink, or by pictures
     of a motionless vehicle at a thrust too low to carry it."""
     descent, b, seen = c.state.descent, c.belief, _seen_motion(c)
-    if descent.floor_felt_s is not None:
-        return descent.floor_felt_s
-    struck = c.t_s - b.imu.blow_s < TOUCH_S and b.reckoning.struck_mps < 0.0
+    if descent.floor_detected_s is not None:
+        return descent.floor_detected_s
+    struck = c.t_s - b.imu.blow_s < TOUCH_S and b.reckoning.impact_mps < 0.0
     weak = 0.0 < descent.thrust < SEEN_STANDING_PART * hover_thrust
     stands = seen is not None and seen.e_m[2] > SEEN_BELOW_M and weak and not sinks
     return c.t_s if stands or (struck and height_m < TOUCH_BELOW_M) else None
@@ -261,17 +265,17 @@ def _clear_contact_after_fall(c: Context) -> PlannerState:
     """Return the state, without its contact once a position or pictures show the vehicle lower, or
     after a fall."""
     state, b, seen = c.state, c.belief, _seen_motion(c)
-    if b.position_valid and b.dead_reckoned_s is None:
+    if b.is_position_valid and b.dead_reckoned_s is None:
         return clear_contact_below(state, PEELED_M)
-    reach_s = b.reach_s
-    fell = reach_s is not None and b.imu.fell_s > max(reach_s, state.entry.t_s)
+    in_reach_since_s = b.in_reach_since_s
+    fell = in_reach_since_s is not None and b.imu.fell_s > max(in_reach_since_s, state.entry.t_s)
     seen_below = seen is not None and seen.e_m[2] > SEEN_BELOW_M
     if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
             contact_z_m=None,
-            reach_s=None,
-            reckoning=replace(b.reckoning, below_m=math.inf),
+            in_reach_since_s=None,
+            reckoning=replace(b.reckoning, distance_below_m=math.inf),
             dead_reckoned_s=None if b.dead_reckoned_s is None else c.t_s,
         )
         return replace(state, belief=belief)
@@ -286,9 +290,9 @@ def _is_overdue(c: Context) -> bool:
         return False
     way_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
-    measured = c.t_s - _measured_s(c) <= hover.LATEST_S
+    measured = c.t_s - _measured_s(c) <= hover.MAX_TELEMETRY_AGE_S
     spare_s = LEVEL_SPARE_S if measured else UNHEARD_SPARE_S
-    if not measured and b.hover.is_rough:
+    if not measured and b.hover.is_imprecise:
         spare_s += OWN_ESTIMATE_S
     return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
@@ -302,9 +306,9 @@ def _braking(c: Context) -> tuple[float, float]:
     attitude is wrong by b / g, where b is the bias of accelerometer and attitude, so the estimated
     lean is (b - w) / g. Both are means over the time with a known position, and an offset of the
     accelerometer is part of both. The present reading is not used: most of it is the drag of the
-    vehicle's own motion, which brakes it. Means over less than `BIAS_MEMORY_S` have less weight,
-    and means from wrong positions have none; then the bias that pictures have shown recently is
-    used.
+    vehicle's own motion, which brakes it. Means over less than `BIAS_TIME_CONSTANT_S` have less
+    weight, and means from wrong positions have none; then the bias that pictures have shown
+    recently is used.
     """
     b = c.belief
     if b.heading_lost or b.is_in_magnet_reach:
@@ -319,7 +323,7 @@ def _braking(c: Context) -> tuple[float, float]:
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, b.attitude_age_s))
     ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
     seen, gain = _seen_motion(c), BRAKE_RAD_PER_MPS
-    if seen is not None and b.camera_is_proven:
+    if seen is not None and b.is_camera_consistent:
         ahead_mps, left_mps, gain = 0.0, 0.0, BRAKE_BY_TARGET_RAD_PER_MPS
         if c.t_s - seen.t_s <= SEEN_BRAKED_S:
             ahead_mps, left_mps, _ = seen.velocity_mps
@@ -327,7 +331,7 @@ def _braking(c: Context) -> tuple[float, float]:
         reckoning.bias_mps2,
         reckoning.mean_lateral_mps2,
     )
-    known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_MEMORY_S)
+    known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_TIME_CONSTANT_S)
     counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
     ahead_mps2, left_mps2 = _in_heading(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad

@@ -42,6 +42,6 @@ def _moved_with_estimate(state: PlannerState) -> PlannerState:
     return replace(
         state,
         setpoint=b.sent.setpoint,
-        entry=replace(state.entry, position_m=b.sent.began_m),
-        blocked_z_m=None if blocked_z_m is None else blocked_z_m + b.shift_m[2],
+        entry=replace(state.entry, position_m=b.sent.maneuver_start_m),
+        blocked_z_m=None if blocked_z_m is None else blocked_z_m + b.frame_shift_m[2],
     )

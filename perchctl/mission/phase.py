@@ -31,31 +31,33 @@ class Phase(Enum):
     @property
     def is_before_contact(self) -> bool:
         """True while flying, until a contact is proven."""
-        return self in BEFORE_CONTACT
+        return self in PRE_CONTACT_PHASES
 
     @property
     def is_over(self) -> bool:
         """True for the final phases."""
-        return self in TERMINALS
+        return self in FINAL_PHASES
 
 
 # Sets of phases in which rows apply. The first ones are defined by the phases they exclude, so that
 # the most severe rows apply in a new phase by default.
-TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
+FINAL_PHASES = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 """Final phases."""
-AIRBORNE = frozenset(Phase) - TERMINALS
+AIRBORNE_PHASES = frozenset(Phase) - FINAL_PHASES
 """Phases in which the motors may run."""
-FLYING_PHASES = AIRBORNE - {Phase.LANDING}
+FLYING_PHASES = AIRBORNE_PHASES - {Phase.LANDING}
 """Phases before the landing."""
-BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
+PRE_CONTACT_PHASES = FLYING_PHASES - {Phase.COMPLETE}
 """Phases before a contact is proven."""
-BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
-"""Phases in which the camera guides the vehicle: their maneuver is `by_camera`."""
-IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
-"""Phases in which nothing but air should touch the vehicle: their maneuver is `in_the_open`."""
-MAGNET_MAY_CATCH = BY_CAMERA | {Phase.PERCH}
+CAMERA_GUIDED_PHASES = frozenset(
+    {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER}
+)
+"""Phases in which the camera guides the vehicle: their maneuver is `is_camera_guided`."""
+FREE_AIR_PHASES = CAMERA_GUIDED_PHASES | {Phase.APPROACH}
+"""Phases in which nothing but air should touch the vehicle: their maneuver is `in_free_air`."""
+MAGNET_ATTACH_PHASES = CAMERA_GUIDED_PHASES | {Phase.PERCH}
 """Phases in which the magnet may catch the vehicle before a contact is proven."""
-SEVEN_PHASES = (
+PAPER_PHASES = (
     Phase.APPROACH,
     Phase.SEARCH,
     Phase.ESTIMATE,

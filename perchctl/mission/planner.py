@@ -15,7 +15,7 @@ from __future__ import annotations
 from perchctl.mission.belief.contact import is_pressing
 from perchctl.mission.belief.evidence import update_since
 from perchctl.mission.belief.quality import hold_reason
-from perchctl.mission.belief.update import forget_evidence
+from perchctl.mission.belief.update import reset_evidence
 from perchctl.mission.context import Context
 from perchctl.mission.descent import remember_command
 from perchctl.mission.endurance import battery_outlook
@@ -78,7 +78,7 @@ def _enter(c: Context, row: Transition) -> PlannerState:
     presses = state.phase is Phase.PERCH or is_pressing(c.belief)
     new = replace(
         state,
-        belief=forget_evidence(c.belief),
+        belief=reset_evidence(c.belief),
         phase=row.to,
         entry=PhaseEntry(
             t_s=c.t_s,

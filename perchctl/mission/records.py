@@ -71,11 +71,11 @@ class Event:
             held = EventKind.HOLD, state.pause, state.phase
             events.append(cls(obs.t_s, *held, severity=Severity.HOLD))
         elif (
-            state.belief.stale_s == obs.t_s
-            and before.belief.stale_s != before.t_s
+            state.belief.last_stale_s == obs.t_s
+            and before.belief.last_stale_s != before.t_s
             and not state.hold
         ):
-            text = position_loss_text(state.belief.seen(obs, profile))
+            text = position_loss_text(state.belief.with_observation(obs, profile))
             events.append(cls(obs.t_s, EventKind.NOTE, text, state.phase))
         return events
 

@@ -1,15 +1,15 @@
 """Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
-In position mode, the onboard controller never goes below `LEAST_POSITION_THRUST`. Raw thrust
+In position mode, the onboard controller never goes below `MIN_POSITION_MODE_THRUST`. Raw thrust
 continues down to motors at rest (docs/firmware.md, "Release in raw mode"): the whole weight is
 transferred to the magnet and monitored before the motors are stopped.
 """
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import WEIGHT_HANGS, exceeds_hover_thrust
-from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
-from perchctl.mission.belief.update import STILL_THRUST
+from perchctl.mission.belief.contact import FULL_WEIGHT_HANGS, is_above_hover_thrust
+from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
+from perchctl.mission.belief.update import KEEPALIVE_THRUST
 from perchctl.mission.context import Context
 from perchctl.mission.setpoints import (
     Action,
@@ -79,16 +79,18 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     away_m = z - tel.position_m[2]
     calm = (
         away_m > CONTACT_LEFT_M
-        and not exceeds_hover_thrust(c.belief)
+        and not is_above_hover_thrust(c.belief)
         and tel.velocity_mps[2] > PULLED_MPS
     )
     if calm or c.in_phase_s > UNPRESS_LIMIT_S:
         return replace(state, pressed=False), None
-    below_m = UNWIND_M if away_m < CONTACT_LEFT_M else UNWIND_AWAY_M
+    distance_below_m = UNWIND_M if away_m < CONTACT_LEFT_M else UNWIND_AWAY_M
     if tel.velocity_mps[2] < PULLED_MPS:
-        below_m = 0.0
+        distance_below_m = 0.0
     dx, dy = state.integral_m
-    setpoint = PositionSetpoint(x + dx, y + dy, tel.position_m[2] - below_m, state.entry.yaw_rad)
+    setpoint = PositionSetpoint(
+        x + dx, y + dy, tel.position_m[2] - distance_below_m, state.entry.yaw_rad
+    )
     return state, limit_setpoint(c, setpoint)
 
 
@@ -98,13 +100,13 @@ def lower_thrust(c: Context) -> Action:
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
     if perch.mode == "raw":
-        if not b.imu_proves:
+        if not b.is_imu_fresh:
             return hold_by_position(c)
         lowest = LOWEST_PART * complete.hold_ratio * b.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
     assert b.contact_z_m is not None
-    slid_m = 0.0 if b.position_valid else c.telemetry.position_m[2] - b.contact_z_m
+    slid_m = 0.0 if b.is_position_valid else c.telemetry.position_m[2] - b.contact_z_m
     top = state.entry.position_m[2] + perch.press_m + slid_m
     low = b.contact_z_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
@@ -117,21 +119,21 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
     once the whole weight has hung for long enough. Telemetry that is too old as evidence and older
     than `late_s` restarts the stage."""
     complete, state, b = c.planner.complete, c.state, c.belief
-    if not b.imu_proves and b.attitude_age_s > late_s:
+    if not b.is_imu_fresh and b.attitude_age_s > late_s:
         return hold_by_position(c)
     released_s = state.released_s
     if released_s is None:
         released_s, z_m = c.t_s, c.telemetry.position_m[2]
         b = replace(b, contact_z_m=z_m if b.contact_z_m is None else b.contact_z_m)
         state = replace(state, released_s=released_s, belief=b)
-    hung_s = c.held_s(WEIGHT_HANGS)
-    unread_s = UNREAD_S if b.unread_s >= c.t_s - hung_s else 0.0
-    if hung_s >= complete.hang_s + unread_s:
+    hung_s = c.held_s(FULL_WEIGHT_HANGS)
+    last_thrust_mismatch_s = UNREAD_S if b.last_thrust_mismatch_s >= c.t_s - hung_s else 0.0
+    if hung_s >= complete.hang_s + last_thrust_mismatch_s:
         return stop_motors(c)
     part = min(1.0, (c.t_s - released_s) / complete.ramp_s)
-    start = c.planner.perch.thrust if state.setpoint is None else LEAST_POSITION_THRUST
-    start = min(start, LEAST_POSITION_THRUST)
-    return state, RawThrust(int(start + part * (STILL_THRUST - start)))
+    start = c.planner.perch.thrust if state.setpoint is None else MIN_POSITION_MODE_THRUST
+    start = min(start, MIN_POSITION_MODE_THRUST)
+    return state, RawThrust(int(start + part * (KEEPALIVE_THRUST - start)))
 
 
 def hold_by_position(c: Context) -> Action:
@@ -139,7 +141,7 @@ def hold_by_position(c: Context) -> Action:
     fall."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
-    if b.contact_z_m is not None and b.position_valid:
+    if b.contact_z_m is not None and b.is_position_valid:
         z_m = b.contact_z_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, released_s=None), limit_setpoint(c, setpoint)
@@ -174,7 +176,7 @@ def catch_slip(c: Context) -> Action | None:
     """Return the setpoint far above that catches a slip; None after the fall, or with old
     telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief
-    if state.catch_above_m is None or not b.imu_proves:
+    if state.catch_above_m is None or not b.is_imu_fresh:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
     if begun or (b.climb_mps < CATCH_END_MPS and c.in_phase_s < CATCH_LIMIT_S):
@@ -189,15 +191,16 @@ def catch_slip(c: Context) -> Action | None:
 def _braked_place_m(c: Context) -> tuple[float, float]:
     """Return the x and y of a setpoint that brakes a lateral speed missing from the estimate."""
     tel, reckoned_mps = c.telemetry, c.belief.reckoning.velocity_mps
-    missed_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
-    x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in missed_mps)
+    imu_only_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
+    x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in imu_only_mps)
     x_m, y_m, _ = tel.position_m
     return x_m - x_mps / POSITION_GAIN_PER_S, y_m - y_mps / POSITION_GAIN_PER_S
 
 
-def clear_contact_below(state: PlannerState, below_m: float) -> PlannerState:
-    """Return the state, without its contact if the vehicle is more than `below_m` below it."""
+def clear_contact_below(state: PlannerState, distance_below_m: float) -> PlannerState:
+    """Return the state, without its contact if the vehicle is more than `distance_below_m` below
+    it."""
     b = state.belief
-    if b.contact_z_m is None or b.telemetry.position_m[2] >= b.contact_z_m - below_m:
+    if b.contact_z_m is None or b.telemetry.position_m[2] >= b.contact_z_m - distance_below_m:
         return state
     return replace(state, belief=replace(b, contact_z_m=None, contact=None))

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.belief.belief import ContactOffset
-from perchctl.mission.belief.contact import DOWN, contact_offset
+from perchctl.mission.belief.contact import MOTORS_STOPPED, contact_offset
 from perchctl.mission.context import Context
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Claim, Outcome, Phase
@@ -149,7 +149,7 @@ class FlightReport:
         simulated: bool = False,
     ) -> FlightReport:
         """Return the report of a completed mission from its last tick."""
-        b = state.belief.seen(obs, profile)
+        b = state.belief.with_observation(obs, profile)
         hangs, contact = state.phase is Phase.PERCHED, b.contact
         if hangs and contact is None:  # the magnet caught the vehicle during the descent
             contact = contact_offset(b)
@@ -191,8 +191,8 @@ class Rest:
 
 def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
     """Return the rest state; None until telemetry has shown the motors off for `off_s`."""
-    c = Context(replace(state, belief=state.belief.seen(obs, profile)))
-    if c.held_s(DOWN) < off_s:
+    c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
+    if c.held_s(MOTORS_STOPPED) < off_s:
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
@@ -210,10 +210,10 @@ def find_touchdown(c: Context) -> Touchdown | None:
     if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > TOUCHDOWN_WITHIN_S:
         return None
     higher = blow.z_m - tel.position_m[2] > SAME_HEIGHT_M
-    if b.position_valid and b.dead_reckoned_s is None and higher:
+    if b.is_position_valid and b.dead_reckoned_s is None and higher:
         return None
     reckoned = b.dead_reckoned_s is not None or b.diverged
-    speed_mps = -(reckoning.struck_mps if reckoned else blow.estimated_mps)
+    speed_mps = -(reckoning.impact_mps if reckoned else blow.estimated_mps)
     return Touchdown(max(0.0, speed_mps), blow.peak_g)
 
 

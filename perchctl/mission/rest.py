@@ -7,7 +7,7 @@ import math
 from enum import Enum
 
 from perchctl.mission.belief.contact import possible_contact_tolerance_m
-from perchctl.mission.belief.target import FAR_BELOW_M
+from perchctl.mission.belief.target import MIN_FAR_ABOVE_M
 from perchctl.mission.context import Context
 from perchctl.mission.phase import Claim, Phase
 
@@ -40,7 +40,7 @@ def find_rest_state(c: Context) -> RestState:
     b, state = c.belief, c.state
     if _is_held_elsewhere(c):
         return RestState.HELD
-    if b.by_target or not b.position_valid:
+    if b.is_target_positioned or not b.is_position_valid:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
         return _by_falls(c)
@@ -57,34 +57,42 @@ def _is_held_elsewhere(c: Context) -> bool:
     b, state = c.belief, c.state
     if state.phase is not Phase.LANDING:
         return False
-    if b.position_valid and state.entry.position_m[2] - b.telemetry.position_m[2] >= STAYED_M:
+    if b.is_position_valid and state.entry.position_m[2] - b.telemetry.position_m[2] >= STAYED_M:
         return False
     if Claim.HELD_BY_OTHER in state.entry.claims:
         return b.imu.fell_s <= state.entry.t_s
     below = (
-        possible_contact_tolerance_m(b) < b.target.error_z_m <= FAR_BELOW_M and b.contact is None
+        possible_contact_tolerance_m(b) < b.target.error_z_m <= MIN_FAR_ABOVE_M
+        and b.contact is None
     )
-    by_position = b.position_valid and not b.by_target and b.jump_s is None and b.height_m > HIGH_M
+    by_position = (
+        b.is_position_valid
+        and not b.is_target_positioned
+        and b.first_jump_s is None
+        and b.height_m > HIGH_M
+    )
     return below and (b.target.is_fresh or by_position)
 
 
 def _by_falls(c: Context) -> RestState:
     """Return the rest state from the falls since the vehicle came within the magnet's reach, if
     ever, and from silences that could hide a fall."""
-    b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.reach_s
-    felt_s = c.state.descent.floor_felt_s
+    b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_reach_since_s
+    felt_s = c.state.descent.floor_detected_s
     down_s = max(b.imu.fell_s, -math.inf if felt_s is None else felt_s)
-    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sighting resolves the doubt
+    unsure = reckoning.doubtful_gap_s > max(
+        down_s, reckoning.sighting_s
+    )  # a sighting resolves the doubt
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
-    came_unheard = unsure and reckoning.unsure_s <= since_s
+    came_unheard = unsure and reckoning.doubtful_gap_s <= since_s
     return RestState.UNKNOWN if came_unheard or b.imu.gap_s > since_s else RestState.HANGS
 
 
 def is_still_hanging(c: Context) -> bool:
     """True if a position shows the vehicle at its contact, or the accelerometer shows no fall."""
     b, tel = c.belief, c.telemetry
-    if not b.by_target and b.position_valid and b.contact_z_m is not None:
+    if not b.is_target_positioned and b.is_position_valid and b.contact_z_m is not None:
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
         if not falls and b.contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
             return True

@@ -12,8 +12,8 @@ import math
 from perchctl.mission.belief.contact import (
     BLOCKED,
     HANGING,
-    HANGING_S,
-    PRESS_SATURATED_PART,
+    HANGING_DWELL_S,
+    PRESS_SATURATION_FRACTION,
     SATURATED_THRUST,
     contact_offset,
     is_at_contact_height,
@@ -23,24 +23,24 @@ from perchctl.mission.belief.contact import (
     newest_contact_offset,
     possible_contact_tolerance_m,
 )
-from perchctl.mission.belief.motion import PUSHED_S
+from perchctl.mission.belief.motion import MAX_PUSH_DELAY_S
 from perchctl.mission.belief.quality import (
     BATTERY_LOW,
-    MOVES_OTHERWISE,
     TARGET_BELOW,
     TILTED,
-    UNSURE,
+    VARIANCE_TOO_LARGE,
+    VELOCITY_DISAGREES,
     no_picture_reason,
     position_loss_text,
-    unsure_text,
+    variance_text,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.phase import (
-    BEFORE_CONTACT,
-    BY_CAMERA,
+    CAMERA_GUIDED_PHASES,
     FLYING_PHASES,
-    IN_THE_OPEN,
-    MAGNET_MAY_CATCH,
+    FREE_AIR_PHASES,
+    MAGNET_ATTACH_PHASES,
+    PRE_CONTACT_PHASES,
     Claim,
     Operator,
     Outcome,
@@ -79,7 +79,7 @@ latency's standard deviation: pictures that are 0.1 s later than assumed cause u
 a rotated camera leads the vehicle further away."""
 ABOVE_START_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
-MOVES_OTHERWISE_S = 0.1
+VELOCITY_DISAGREES_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
 SWINGS_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
@@ -107,24 +107,24 @@ def has_diverged(c: Context) -> bool:
     """True if external positions in wrong axes lead position control away from its setpoint (fault
     11): further than any draught does, or in oscillations."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
-    if b.profile.positioning.source.is_deck or not b.position_valid:
+    if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
-    if c.held_s(MOVES_OTHERWISE) >= MOVES_OTHERWISE_S or _swings(c):
+    if c.held_s(VELOCITY_DISAGREES) >= VELOCITY_DISAGREES_DWELL_S or _swings(c):
         return True
     if setpoint is None:
         return False
     if phase is Phase.LANDING:
         touched = b.contact_z_m is not None or c.state.stopped_s is not None
         return not touched and _away_m(c) > DIVERGED_LANDING_M
-    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if b.by_target else 0.0
+    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if b.is_target_positioned else 0.0
     if phase is Phase.APPROACH and b.height_m < TAKEOFF_LIFTED_M:
         return _away_m(c) > SIDEWAYS_M + spare_m
-    ground = b.ground_m
+    ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < ABOVE_START_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
-    is_pushed = b.imu.t_s - b.imu.pushed_s <= PUSHED_S  # by moving air
+    is_pushed = b.imu.t_s - b.imu.pushed_s <= MAX_PUSH_DELAY_S  # by moving air
     stays = b.height_m < DIVERGED_BELOW_M or (only_climbs and not is_pushed)
     return _away_m(c) > (DIVERGED_LOW_M + spare_m if stays else DIVERGED_M)
 
@@ -152,7 +152,7 @@ def divergence_reason(c: Context) -> str:
         "swapped axes in the motion capture, positions that are late, or a body that is turned in "
         "it; perchctl check --lift tells"
     )
-    if b.by_target:
+    if b.is_target_positioned:
         cause = "does camera.mount have the camera turned as it is?"
     return (
         f"position control leads astray, {_away_m(c):.2f} m aside at a height of {b.height_m:.2f} "
@@ -170,16 +170,16 @@ def is_position_lost(c: Context) -> bool:
     if b.position_age_s > CONTRADICTED_S and c.obs.position_beside_m > CONTRADICTED_M:
         return True
     unsure = b.velocity_variance_m2ps2 > BLIND_VARIANCE_M2PS2
-    return b.by_target and b.position_is_stale and unsure
+    return b.is_target_positioned and b.is_position_stale and unsure
 
 
 def is_outside_fence(c: Context) -> bool:
     """True if the vehicle is further from its start than the fence allows."""
-    ground_m = c.belief.ground_m
-    if ground_m is None:
+    takeoff_position_m = c.belief.takeoff_position_m
+    if takeoff_position_m is None:
         return False
     x, y, _ = c.telemetry.position_m
-    dx, dy = x - ground_m[0], y - ground_m[1]
+    dx, dy = x - takeoff_position_m[0], y - takeoff_position_m[1]
     return math.hypot(dx, dy) > c.safety.fence_radius_m
 
 
@@ -234,10 +234,10 @@ def mounting_reason(c: Context) -> str:
 
 def is_held(c: Context) -> bool:
     """True if the target's magnet already holds the vehicle."""
-    if c.held_s(HANGING) < HANGING_S:
+    if c.held_s(HANGING) < HANGING_DWELL_S:
         return False
     touched, radius_m = last_touch_offset(c.belief), c.planner.perch.contact_xy_m
-    near = touched is not None and max(touched.aside_m, touched.sigma_m) <= radius_m
+    near = touched is not None and max(touched.lateral_offset_m, touched.sigma_m) <= radius_m
     return near or is_at_target(c.belief)
 
 
@@ -246,7 +246,7 @@ def is_held_elsewhere(c: Context) -> bool:
     touched = last_touch_offset(c.belief)
     offset = touched or contact_offset(c.belief)
     at_its_height = touched is not None or is_at_contact_height(c.belief)
-    beside = offset.aside_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
+    beside = offset.lateral_offset_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
     return c.held_s(HANGING) >= HELD_S and (beside or not at_its_height)
 
 
@@ -271,7 +271,7 @@ def lacks_press_thrust(c: Context) -> bool:
     if c.held_s(SATURATED_THRUST) >= WEAK_S:
         return True
     near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
-    return near and c.belief.hover_thrust > PRESS_SATURATED_PART * max_press_thrust(c.profile)
+    return near and c.belief.hover_thrust > PRESS_SATURATION_FRACTION * max_press_thrust(c.profile)
 
 
 SAFETY_ROWS: tuple[Transition, ...] = (
@@ -322,71 +322,74 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     land_row(
         "heading-lost",
-        BEFORE_CONTACT,
+        PRE_CONTACT_PHASES,
         lambda c: c.belief.heading_lost,
         "the estimated heading jumped: down level, by thrust alone",
     ),
     land_row(
         "position-astray",
-        IN_THE_OPEN | {Phase.LANDING},
+        FREE_AIR_PHASES | {Phase.LANDING},
         has_diverged,
         divergence_reason,
         claims=Claim.POSITIONS_WRONG | Claim.PROFILE_SUSPECT,
     ),
     land_row(
         "position-lost",
-        IN_THE_OPEN | {Phase.PERCH},
+        FREE_AIR_PHASES | {Phase.PERCH},
         is_position_lost,
         lambda c: f"{position_loss_text(c.belief)}; down level, by thrust alone",
     ),
     land_row(
         "estimator-jump",
-        BEFORE_CONTACT,
-        lambda c: c.belief.jump_s is not None and c.t_s - c.belief.jump_s >= c.safety.jump_hold_s,
+        PRE_CONTACT_PHASES,
+        lambda c: (
+            c.belief.first_jump_s is not None
+            and c.t_s - c.belief.first_jump_s >= c.safety.jump_hold_s
+        ),
         "the state estimate jumped: landing where it is",
     ),
     land_row(
         "estimate-unsure",
-        IN_THE_OPEN,
-        lambda c: c.held_s(UNSURE) >= c.safety.variance_land_s,
-        lambda c: f"{unsure_text(c.belief)}: is the positioning system gone?",
+        FREE_AIR_PHASES,
+        lambda c: c.held_s(VARIANCE_TOO_LARGE) >= c.safety.variance_land_s,
+        lambda c: f"{variance_text(c.belief)}: is the positioning system gone?",
     ),
     land_row(
         "battery-low",
-        BEFORE_CONTACT,
+        PRE_CONTACT_PHASES,
         lambda c: c.held_s(BATTERY_LOW) >= c.safety.battery_debounce_s,
         lambda c: f"battery at {c.telemetry.battery_v:.2f} V under load",
     ),
     land_row(
         "battery-unknown",
-        BEFORE_CONTACT,
+        PRE_CONTACT_PHASES,
         lambda c: c.obs.battery_age_s > c.safety.battery_stale_s,
         "the battery's reading stands still",
     ),
     land_row(
         "latency",
-        IN_THE_OPEN,
+        FREE_AIR_PHASES,
         lambda c: c.belief.mismatch.later_s != 0.0,
         latency_reason,
         claims=Claim.PROFILE_SUSPECT,
     ),
     land_row(
         "mounting",
-        IN_THE_OPEN,
+        FREE_AIR_PHASES,
         is_mounting_wrong,
         mounting_reason,
         claims=Claim.MOUNTING_WRONG | Claim.PROFILE_SUSPECT,
     ),
     land_row(
         "height-limit",
-        BEFORE_CONTACT,
+        PRE_CONTACT_PHASES,
         lambda c: c.belief.height_m > c.safety.max_height_m,
         lambda c: f"height {c.belief.height_m:.2f} m is above the limit",
     ),
-    land_row("fence", BEFORE_CONTACT, is_outside_fence, "outside the fence"),
+    land_row("fence", PRE_CONTACT_PHASES, is_outside_fence, "outside the fence"),
     land_row(
         "camera-gone",
-        BY_CAMERA,
+        CAMERA_GUIDED_PHASES,
         lambda c: c.obs.camera_age_s > c.safety.camera_land_s,
         lambda c: no_picture_reason(c.belief),
     ),
@@ -398,38 +401,38 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     land_row(
         "markers-disagree",
-        BY_CAMERA,
+        CAMERA_GUIDED_PHASES,
         lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames,
         "large and small marker contradict each other: check the printed sizes in the "
         "profile and the camera's calibration",
     ),
     land_row(
         "log-lost",
-        BEFORE_CONTACT,
+        PRE_CONTACT_PHASES,
         lambda c: c.safety.land_on_log_error and c.obs.log_problem is not None,
         lambda c: f"flight log: {c.obs.log_problem}",
     ),
     land_row(
         "time-over",
-        BEFORE_CONTACT,
+        PRE_CONTACT_PHASES,
         lambda c: c.t_s - c.state.started_s > c.planner.perching_time_s,
         "the perching time is over",
         Outcome.ATTEMPTS_USED_UP,
     ),
     # --- the magnet may catch early ---
     Transition(
-        "caught", MAGNET_MAY_CATCH, is_held, Phase.COMPLETE, "hanging on the magnet already"
+        "caught", MAGNET_ATTACH_PHASES, is_held, Phase.COMPLETE, "hanging on the magnet already"
     ),
     land_row(
         "held",
-        MAGNET_MAY_CATCH,
+        MAGNET_ATTACH_PHASES,
         is_held_elsewhere,
         "something holds it where the target is not",
         claims=Claim.HELD_BY_OTHER,
     ),
     land_row(
         "hangs-at-contact",
-        MAGNET_MAY_CATCH,
+        MAGNET_ATTACH_PHASES,
         lambda c: c.held_s(HANGING) >= HELD_S,
         lambda c: (
             f"it hangs at the target's height, {newest_contact_offset(c.belief).text}: "
@@ -448,7 +451,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     back_off_row(
         "blocked",
-        MAGNET_MAY_CATCH,
+        MAGNET_ATTACH_PHASES,
         is_blocked_off_target,
         lambda c: (
             f"pressed against something at {c.belief.height_m:.2f} m"
@@ -458,7 +461,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     land_row(
         "too-weak",
-        BY_CAMERA,
+        CAMERA_GUIDED_PHASES,
         lacks_press_thrust,
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
         "something is above",

@@ -156,7 +156,7 @@ def anchor_in_wind(c: Context) -> PlannerState:
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.diverged:
         return replace(c.state, integral_m=(0.0, 0.0))
-    if not c.belief.position_valid or c.belief.speed_mps > STANDS_MPS:
+    if not c.belief.is_position_valid or c.belief.speed_mps > STANDS_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
@@ -207,9 +207,9 @@ def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the held setpoint one tick later; lower if the target is the position source and out
     of view."""
     b = c.belief
-    if not (b.by_target and b.position_is_stale) or b.ground_m is None:
+    if not (b.is_target_positioned and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
-    lowest_m = min(setpoint.z_m, b.ground_m[2] + LOWEST_M)
+    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + LOWEST_M)
     z_m = setpoint.z_m - OUT_OF_VIEW_SINK_MPS * max(0.0, c.t_s - c.state.t_s)
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
@@ -217,7 +217,7 @@ def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the setpoint moved inside the fence, below the height limit and (fault 36) at least
     `GROUND_CLEARANCE_M` above the ground; in a take-off, at least at the ground."""
-    ground, safety = c.belief.ground_m, c.safety
+    ground, safety = c.belief.takeoff_position_m, c.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]

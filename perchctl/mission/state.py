@@ -8,7 +8,7 @@ from typing import Any
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.maneuver import Maneuver, Sent
+from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Claim, Outcome, Phase, Severity
 from perchctl.profile import Profile
@@ -33,7 +33,7 @@ class LevelDescent:
     thrust: float = 0.0  # last ordered thrust
     sample_s: float = -math.inf  # time of the newest sample at the last tick
     under_way_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
-    floor_felt_s: float | None = None  # time at which the floor was detected
+    floor_detected_s: float | None = None  # time at which the floor was detected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,20 +99,20 @@ class PlannerState:
         return self.hold or self.waits
 
     @property
-    def is_motor_borne(self) -> bool:
+    def is_under_power(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
         return self.released_s is None and self.stopped_s is None
 
-    def sent(self, maneuver: Maneuver) -> Sent:
+    def sent(self, maneuver: Maneuver) -> SentOrders:
         """Return the orders so far, in the form that the belief uses."""
-        return Sent(
+        return SentOrders(
             maneuver=maneuver,
-            began_m=self.entry.position_m,
+            maneuver_start_m=self.entry.position_m,
             setpoint=self.setpoint,
             raw_thrust=self.raw_order,
             released_s=self.released_s,
             stopped_s=self.stopped_s,
-            floor_felt_s=self.descent.floor_felt_s,
+            floor_detected_s=self.descent.floor_detected_s,
         )
 
     @classmethod

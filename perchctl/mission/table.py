@@ -14,7 +14,7 @@ from perchctl.errors import InvalidValue
 from perchctl.extensions import error_at, load_extension
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.phase import BEFORE_CONTACT, FLYING_PHASES, Outcome, Phase, Severity
+from perchctl.mission.phase import FLYING_PHASES, PRE_CONTACT_PHASES, Outcome, Phase, Severity
 from perchctl.mission.phases.align import ALIGN
 from perchctl.mission.phases.approach import APPROACH
 from perchctl.mission.phases.ascend import ASCEND
@@ -79,7 +79,7 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
 ALLOWED = frozenset(
     (phase, row.to, row.severity)
     for row in TABLE
-    for phase in row.phases & BEFORE_CONTACT - {row.to}
+    for phase in row.phases & PRE_CONTACT_PHASES - {row.to}
     if row.severity >= Severity.HOLD and not row.to.is_over
 ) | {(Phase.ALIGN, Phase.ALIGN, Severity.HOLD)}
 """Combinations of phase, next phase and severity allowed for your own rows: wait in ALIGN, or

@@ -6,7 +6,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from perchctl.mission.context import Context
-from perchctl.mission.phase import AIRBORNE, Claim, Outcome, Phase, Severity
+from perchctl.mission.phase import AIRBORNE_PHASES, Claim, Outcome, Phase, Severity
 from perchctl.vehicle import EmergencyStop, StopMotors
 
 Predicate = Callable[[Context], bool]
@@ -54,7 +54,14 @@ def motor_cut_row(
 ) -> Transition:
     """Return a row that cuts and locks the motors at once, in any airborne phase."""
     return Transition(
-        name, AIRBORNE, when, Phase.ABORTED, reason, Severity.STOP, outcome, stop=EmergencyStop()
+        name,
+        AIRBORNE_PHASES,
+        when,
+        Phase.ABORTED,
+        reason,
+        Severity.STOP,
+        outcome,
+        stop=EmergencyStop(),
     )
 
 
@@ -66,7 +73,7 @@ def supervisor_row(name: str, bit: int, reason: str) -> Transition:
 
     return Transition(
         name,
-        AIRBORNE,
+        AIRBORNE_PHASES,
         when,
         Phase.ABORTED,
         reason,

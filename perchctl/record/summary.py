@@ -161,7 +161,7 @@ def is_simulated(header: Mapping[str, Any]) -> bool:
 
 
 # A part of the summary by the record's keys and its own fields, in their order.
-_CONTACT = {"contact_aside_m": "aside_m", "contact_sigma_m": "sigma_m"}
+_CONTACT = {"contact_aside_m": "lateral_offset_m", "contact_sigma_m": "sigma_m"}
 _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _FINDINGS = {
     "latency_s": "latency_s",

@@ -20,10 +20,10 @@ from perchctl.faults.oracle import (
     rescue_claims,
 )
 from perchctl.mission import Event, EventKind, FlightReport, Outcome, Phase, RestState
-from perchctl.mission.phase import TERMINALS
+from perchctl.mission.phase import FINAL_PHASES
 from perchctl.mission.table import TABLE
 
-LAST_ROWS = {row.name: row for row in TABLE if row.to in TERMINALS}
+LAST_ROWS = {row.name: row for row in TABLE if row.to in FINAL_PHASES}
 
 
 def report(phase: Phase, outcome: Outcome, row: str, locked: bool = False) -> FlightReport:

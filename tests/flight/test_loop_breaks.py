@@ -174,7 +174,7 @@ def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() ->
     aims = []
     for ground_z_m in (-1.0, 0.0, 0.75):
         rig = Rig(Vehicle(lambda s: None))  # silent: its own landing at once
-        rig.rescue(telemetry(-1.0, 1.5), ground_m=(0.0, 0.0, ground_z_m))
+        rig.rescue(telemetry(-1.0, 1.5), takeoff_position_m=(0.0, 0.0, ground_z_m))
         aims.append(orders(rig)[0].height_m - ground_z_m)
     assert aims == pytest.approx([aims[0]] * 3)
     assert -1.0 < aims[0] <= 0.0

@@ -11,7 +11,7 @@ import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
 from perchctl.mission import Observation, Operator, Phase, PlannerState
-from perchctl.mission.belief.update import STILL_THRUST
+from perchctl.mission.belief.update import KEEPALIVE_THRUST
 from perchctl.mission.descent import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, STOPS
 from perchctl.profile import Profile
@@ -38,17 +38,19 @@ LAND_S = PROFILE.safety.loop_late_land_s
 PERIOD_S = 0.02
 T_S = 100.0
 HOVER = PositionSetpoint(0.1, 0.2, 0.9, 0.5)
-RELEASED = RawThrust(STILL_THRUST)
+RELEASED = RawThrust(KEEPALIVE_THRUST)
 CEILING_M = 2.0
 AT_CEILING = state_with(
     phase=Phase.COMPLETE,
     t_s=T_S,
-    ground_m=(0.0, 0.0, 0.0),
+    takeoff_position_m=(0.0, 0.0, 0.0),
     contact_z_m=CEILING_M,
     released_s=T_S - 1.0,
     hover_thrust=HOVER_THRUST,
 )
-IN_AIR = state_with(phase=Phase.ALIGN, t_s=T_S, ground_m=(0.0, 0.0, 0.0), hover_thrust=HOVER_THRUST)
+IN_AIR = state_with(
+    phase=Phase.ALIGN, t_s=T_S, takeoff_position_m=(0.0, 0.0, 0.0), hover_thrust=HOVER_THRUST
+)
 SILENT_S = (0.31, 0.5, 0.9)
 
 
@@ -283,7 +285,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
         sent += [command] if command is not None else []
     raw = [c.thrust for c in sent if isinstance(c, RawThrust)]
     assert raw == sorted(raw, reverse=True)
-    assert raw[-1] == STILL_THRUST
+    assert raw[-1] == KEEPALIVE_THRUST
     complete = PROFILE.planner.complete
     assert len(raw) * 0.02 == pytest.approx(complete.ramp_s + complete.hang_s, abs=0.2)
     assert sent[-STOPS:] == [StopMotors()] * STOPS

@@ -35,7 +35,7 @@ def tick(
         )
     state = state_with(
         phase=Phase(phase), entered_s=entered_s, reason=reason, hold=hold, attempts=1,
-        ground_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
+        takeoff_position_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
     )  # fmt: skip
     sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v, behind_s=telemetry_age_s)
     command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)

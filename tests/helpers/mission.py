@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.mission import Event, EventKind, ImuMotion, Observation, Phase, PlannerState
-from perchctl.mission.belief.battery import EnergyState
+from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.context import Context
@@ -26,8 +26,8 @@ READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING
 HOVER_THRUST = 56000.0
 CEILING_M = 2.2
-FINE_BATTERY = EnergyState(
-    ground_v=4.1,
+FINE_BATTERY = BatteryFit(
+    takeoff_rest_v=4.1,
     rest_v=4.08,
     load=HOVER_THRUST / 65535,
     mean_load=HOVER_THRUST / 65535,
@@ -203,7 +203,9 @@ def state_with(**changes: Any) -> PlannerState:
 def context_at(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> Context:
     """The tick in which this state meets this observation, before it has taken it in."""
     sent = state.sent(PHASES[state.phase].maneuver)
-    return Context(replace(state, belief=replace(state.belief.seen(obs, profile), sent=sent)))
+    return Context(
+        replace(state, belief=replace(state.belief.with_observation(obs, profile), sent=sent))
+    )
 
 
 def observing(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> PlannerState:
@@ -220,7 +222,7 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         search_step_s=t_s,
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
         entry_m=(0.0, 0.0, z_m),
-        last_target_m=np.array([0.0, 0.0, CEILING_M]),
+        last_target_world_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
         energy=FINE_BATTERY,
         contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,

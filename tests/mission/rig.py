@@ -138,6 +138,8 @@ class Motors:
                 self.thrust = self.held_part * HOVER_THRUST
 
 
-def is_setpoint(command: object, above_m: float = -math.inf, below_m: float = math.inf) -> bool:
+def is_setpoint(
+    command: object, above_m: float = -math.inf, distance_below_m: float = math.inf
+) -> bool:
     """True if it is a position setpoint between two heights."""
-    return isinstance(command, PositionSetpoint) and above_m < command.z_m < below_m
+    return isinstance(command, PositionSetpoint) and above_m < command.z_m < distance_below_m

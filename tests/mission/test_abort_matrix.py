@@ -54,7 +54,7 @@ def _bits(bit: int) -> Event:
 
 STOP, LAND = "stop", "land"
 CAMERA_PHASES = {Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER}
-BEFORE_CONTACT = FLYING_PHASES - {Phase.COMPLETE}
+PRE_CONTACT_PHASES = FLYING_PHASES - {Phase.COMPLETE}
 ALL = FLYING_PHASES | {Phase.LANDING}
 
 # event: (what happens, seconds it lasts, where it counts, how it ends, outcome)
@@ -75,20 +75,20 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         CAMERA_PHASES | {Phase.APPROACH, Phase.PERCH}, LAND, Outcome.SAFETY,
     ),
     "heading-lost": (
-        _obs(jumped=True, turned_rad=1.5), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY,
+        _obs(jumped=True, turned_rad=1.5), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
     ),
-    "estimator-jump": (_obs(jumped=True), 0.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
+    "estimator-jump": (_obs(jumped=True), 0.8, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
     "estimate-unsure": (
         _tel(velocity_variance_m2ps2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
         Outcome.SAFETY,
     ),
-    "battery-low": (_tel(battery_v=2.8), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
-    "battery-low-power": (_tel(battery_state=3), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
-    "battery-unknown": (_obs(battery_age_s=99.0), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY),
+    "battery-low": (_tel(battery_v=2.8), 1.8, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
+    "battery-low-power": (_tel(battery_state=3), 1.8, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
+    "battery-unknown": (_obs(battery_age_s=99.0), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
     "height-limit": (
-        _tel(position_m=(0.0, 0.0, 3.4)), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY,
+        _tel(position_m=(0.0, 0.0, 3.4)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY,
     ),
-    "fence": (_tel(position_m=(2.5, 0.0, 1.0)), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY),
+    "fence": (_tel(position_m=(2.5, 0.0, 1.0)), 0.1, PRE_CONTACT_PHASES, LAND, Outcome.SAFETY),
     "camera-gone": (
         _obs(camera_age_s=4.0, new_frame=False, camera_problem="camera unplugged"),
         0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
@@ -98,7 +98,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         _obs(disagreeing_frames=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
     "time-over": (
-        lambda o: o, 0.1, BEFORE_CONTACT, LAND, Outcome.ATTEMPTS_USED_UP,
+        lambda o: o, 0.1, PRE_CONTACT_PHASES, LAND, Outcome.ATTEMPTS_USED_UP,
     ),
 }  # fmt: skip
 
@@ -226,7 +226,7 @@ def test_the_perch_ends_by_itself(mode: str, kind: type) -> None:
     flight = fly(state_in(Phase.PERCH, z_m=2.09), at(2.09), 4.0, profile, one_phase=True)
     assert flight.state.phase is Phase.RECOVER
     lowest_m = 2.09 - PROFILE.planner.recover.descend_m
-    assert is_setpoint(flight.command, below_m=lowest_m + 1e-9)
+    assert is_setpoint(flight.command, distance_below_m=lowest_m + 1e-9)
     *sent, _ = flight.commands
     assert all(isinstance(c, kind) for c in sent)
     assert math.isclose(len(sent) * TICK_S, PROFILE.planner.perch.timeout_s, abs_tol=0.1)
@@ -316,7 +316,7 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
     if above_m[0] >= 0.0:
         slow = at(HANG_Z_M - 0.2, velocity_mps=(0.0, 0.0, 0.01))(10.2)
         _, command = planner.step_mission(flight.state, slow, PROFILE)
-        assert is_setpoint(command, below_m=HANG_Z_M - 0.1)
+        assert is_setpoint(command, distance_below_m=HANG_Z_M - 0.1)
 
 
 @pytest.mark.parametrize("stopped", [{}, {"stopped_s": 9.5, "orders": 5}], ids=["turns", "stopped"])
@@ -330,7 +330,7 @@ def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str
     for i in range(1, 40):
         held = at(HANG_Z_M - 0.2)(10.2 + TICK_S * i)
         state, command = planner.step_mission(state, held, PROFILE)
-        assert is_setpoint(command, below_m=HANG_Z_M - 0.2 + 1e-9)
+        assert is_setpoint(command, distance_below_m=HANG_Z_M - 0.2 + 1e-9)
     assert state.stopped_s is None
 
 

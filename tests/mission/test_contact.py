@@ -9,9 +9,9 @@ import pytest
 from perchctl.mission import ImuMotion, Observation, Phase
 from perchctl.mission.belief.contact import (
     BLOCKED,
-    CARRIED,
     CONTACT,
-    PRESSING_RATIO,
+    PRESS_THRUST_RATIO,
+    SUPPORTED_BY_IMU,
     is_pressing,
 )
 from perchctl.profile import Profile
@@ -36,12 +36,12 @@ PRESSED = 1.2 * HOVER_THRUST
 
 
 def touching(
-    below_m: float = 0.0, steady_s: float = 5.0, unseen_s: float = 0.0, **changes: Any
+    distance_below_m: float = 0.0, steady_s: float = 5.0, unseen_s: float = 0.0, **changes: Any
 ) -> Observation:
-    """A vehicle that presses its gear against the target, `below_m` too low by the target's place,
-    which was seen `unseen_s` ago, its vertical speed steady since `steady_s`; with changes of its
-    telemetry."""
-    place_m = (0.0, 0.0, CEILING_M + below_m)
+    """A vehicle that presses its gear against the target, `distance_below_m` too low by the
+    target's place, which was seen `unseen_s` ago, its vertical speed steady since `steady_s`; with
+    changes of its telemetry."""
+    place_m = (0.0, 0.0, CEILING_M + distance_below_m)
     seen = {
         "target": target_at(BEGIN_S, place_m, (0, 0, HANG_Z_M), measured_s=BEGIN_S - unseen_s),
         "imu": ImuMotion(t_s=BEGIN_S, steady_s=steady_s),
@@ -63,8 +63,8 @@ def test_all_terms_together_are_a_contact(profile: Profile) -> None:
 @pytest.mark.parametrize(
     "spoilt",
     [
-        touching(below_m=0.1),  # the gear is not at the target's height
-        touching(below_m=-0.1),
+        touching(distance_below_m=0.1),  # the gear is not at the target's height
+        touching(distance_below_m=-0.1),
         touching(velocity_mps=(0.0, 0.0, 0.3), steady_s=BEGIN_S),  # it still moves
         touching(acc_z_g=1.3),  # it speeds up
         touching(acc_z_g=0.7),
@@ -83,8 +83,8 @@ def test_without_one_of_them_there_is_none(spoilt: Observation, profile: Profile
         (PROFILE, touching(thrust=1.09 * HOVER_THRUST), touching(thrust=1.07 * HOVER_THRUST)),
         (PROFILE, touching(acc_z_g=1.11), touching(acc_z_g=1.13)),
         (PROFILE, touching(acc_z_g=0.89), touching(acc_z_g=0.87)),
-        (PROFILE, touching(below_m=0.049), touching(below_m=0.051)),
-        (PROFILE, touching(below_m=-0.049), touching(below_m=-0.051)),
+        (PROFILE, touching(distance_below_m=0.049), touching(distance_below_m=0.051)),
+        (PROFILE, touching(distance_below_m=-0.049), touching(distance_below_m=-0.051)),
         (
             PROFILE,
             touching(velocity_mps=(0.0, 0.0, 0.045), steady_s=BEGIN_S),
@@ -106,7 +106,7 @@ def test_each_term_has_its_limit(
 def test_without_a_reference_for_the_thrust_there_is_none() -> None:
     """No hover thrust was learned, or the thrust that is read is not the one that was ordered."""
     assert not is_contact(touching(), hover_thrust=0.0)
-    unanswered = {"raw_order": 20000, "unanswered_s": BEGIN_S - 1.0, "setpoint": None}
+    unanswered = {"raw_order": 20000, "thrust_mismatch_since_s": BEGIN_S - 1.0, "setpoint": None}
     assert not is_contact(touching(), **unanswered)
 
 
@@ -117,8 +117,8 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     pressing = state_in(Phase.PERCH, z_m=HANG_Z_M)
     above = PositionSetpoint(0.0, 0.0, HANG_Z_M + 0.2, 0.0)
     b = observing(replace(pressing, setpoint=above), obs).belief
-    found = [CONTACT in b.since, BLOCKED in b.since, CARRIED in b.since, is_pressing(b)]
-    assert found == [thrust >= PRESSING_RATIO] * 4
+    found = [CONTACT in b.since, BLOCKED in b.since, SUPPORTED_BY_IMU in b.since, is_pressing(b)]
+    assert found == [thrust >= PRESS_THRUST_RATIO] * 4
 
 
 @pytest.mark.parametrize(("raw_order", "presses"), [(60_000, True), (None, False)])

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    FALL_S,
-    OFFSET_MEMORY_S,
-    PUSHED_G,
-    STEADY_MPS,
+    FREE_FALL_S,
+    MAX_STEADY_CLIMB_DEVIATION_MPS,
+    MIN_PUSH_G,
+    OFFSET_TIME_CONSTANT_S,
     FallDetector,
     FreezeDetector,
     Impact,
@@ -44,11 +44,11 @@ def watched(
         for _ in range(round(lasts_s * rate_hz)):
             t_s += dt_s
             reads_g = 1.0 + (mps2 + bias_mps2) / GRAVITY_MPS2
-            fall = fall.with_fall(t_s, mps2 + bias_mps2, reads_g, dt_s)
+            fall = fall.update_fall(t_s, mps2 + bias_mps2, reads_g, dt_s)
     return fall
 
 
-LEARNED_S = 4.0 * OFFSET_MEMORY_S
+LEARNED_S = 4.0 * OFFSET_TIME_CONSTANT_S
 
 
 @given(RATES_HZ, BIAS_MPS2)
@@ -81,7 +81,7 @@ def test_a_fall_is_noticed_after_the_same_time_at_each_rate(part: float) -> None
                 break
     assert len(found) == 3
     assert max(found) - min(found) <= 0.02 + 1e-9  # one sample at the lowest rate
-    assert max(found) <= FALL_S + 0.04
+    assert max(found) <= FREE_FALL_S + 0.04
 
 
 @given(RATES_HZ, st.floats(1.0, 6.0))
@@ -101,10 +101,10 @@ def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_
     fall, t_s, dt_s = FallDetector(), 1.0, 1.0 / rate_hz
     for _ in range(round(rate_hz)):
         t_s += dt_s
-        fall = fall.with_fall(t_s, up_mps2, reads_g, dt_s)
+        fall = fall.update_fall(t_s, up_mps2, reads_g, dt_s)
         if fall.fell_s > 0.0:
             break
-    assert FALL_S <= t_s - 1.0 <= FALL_S + 2.1 * dt_s
+    assert FREE_FALL_S <= t_s - 1.0 <= FREE_FALL_S + 2.1 * dt_s
 
 
 # --- Impacts -------------------------------------------------------------------------------------
@@ -118,7 +118,7 @@ def struck(gained_mps: float, rate_hz: float, sinks_mps: float = -0.7) -> Impact
         up_mps2 = gained_mps / (blows * dt_s) if 0 <= k - round(0.5 * rate_hz) < blows else 0.0
         t_s, v_mps = t_s + dt_s, v_mps + up_mps2 * dt_s
         now = Impact(t_s, v_mps, v_mps, 1.0 + up_mps2 / GRAVITY_MPS2, 0.0)
-        impact = impact.with_impact(now, 0.0, up_mps2, dt_s)
+        impact = impact.update_impact(now, 0.0, up_mps2, dt_s)
     return impact
 
 
@@ -147,7 +147,7 @@ def test_full_thrust_is_no_blow(rate_hz: float) -> None:
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
         now = Impact(t_s, 0.0, 0.0, 1.2)
-        impact = impact.with_impact(now, 1.0, 0.2 * GRAVITY_MPS2, dt_s)
+        impact = impact.update_impact(now, 1.0, 0.2 * GRAVITY_MPS2, dt_s)
     assert impact.blow_s == -math.inf
 
 
@@ -157,16 +157,16 @@ def test_full_thrust_is_no_blow(rate_hz: float) -> None:
 @given(st.integers(1, 60), RATES_HZ)
 def test_a_frozen_reading_is_as_old_as_its_first(samples: int, rate_hz: float) -> None:
     last, freeze = telemetry(0.0), FreezeDetector()
-    freeze = freeze.compare(None, last)
+    freeze = freeze.update_freeze(None, last)
     moved = replace(telemetry(0.01), acc_x_g=0.01, roll_rad=0.01, position_m=(0.1, 0.0, 1.0))
-    freeze, last = freeze.compare(last, moved), moved
+    freeze, last = freeze.update_freeze(last, moved), moved
     assert (freeze.frozen_s, freeze.attitude_frozen_s, freeze.place_frozen_s) == (0.0, 0.0, 0.0)
     for k in range(samples):
         now = replace(last, t_s=last.t_s + 1.0 / rate_hz, acc_x_g=0.02 + 1e-6 * k)
-        freeze, last = freeze.compare(last, now), now
+        freeze, last = freeze.update_freeze(last, now), now
     assert freeze.frozen_s == 0.0
-    assert freeze.attitude_age_s == pytest.approx(samples / rate_hz)
-    assert freeze.place_age_s == pytest.approx(samples / rate_hz)
+    assert freeze.stuck_attitude_s == pytest.approx(samples / rate_hz)
+    assert freeze.stuck_position_s == pytest.approx(samples / rate_hz)
 
 
 # --- Steady speeds -------------------------------------------------------------------------------
@@ -181,10 +181,12 @@ def test_a_constant_speed_is_steady_whatever_it_is(
     velocity = (aside_mps * math.cos(heading_rad), aside_mps * math.sin(heading_rad), climb_mps)
     for _ in range(round(2.0 * rate_hz)):
         t_s += dt_s
-        speed = speed.with_speed(t_s, velocity, dt_s)
-    assert t_s - min(speed.steady_s, t_s) >= 1.9 or abs(climb_mps) <= STEADY_MPS
+        speed = speed.update_steady_speed(t_s, velocity, dt_s)
+    assert t_s - min(speed.steady_s, t_s) >= 1.9 or abs(climb_mps) <= MAX_STEADY_CLIMB_DEVIATION_MPS
     assert t_s - min(speed.steady_aside_s, t_s) >= 1.0 or abs(aside_mps) <= 0.15
-    jerked = speed.with_speed(t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * STEADY_MPS), dt_s)
+    jerked = speed.update_steady_speed(
+        t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * MAX_STEADY_CLIMB_DEVIATION_MPS), dt_s
+    )
     assert jerked.steady_s == t_s + dt_s
 
 
@@ -202,7 +204,7 @@ def pushed(
             acc_x_g=force_g * math.cos(heading_rad) + offset_g[0],
             acc_y_g=force_g * math.sin(heading_rad) + offset_g[1],
         )
-        push = push.with_push(sample, (*offset_g, 0.0), dt_s)
+        push = push.update_push(sample, (*offset_g, 0.0), dt_s)
     return push
 
 
@@ -210,9 +212,9 @@ def pushed(
 def test_a_push_is_one_from_each_side_and_with_each_offset_at_rest(
     rate_hz: float, heading_rad: float, force_g: float, offset_g: float
 ) -> None:
-    assume(abs(force_g - PUSHED_G) > 1e-3)
+    assume(abs(force_g - MIN_PUSH_G) > 1e-3)
     found = pushed(force_g, heading_rad, rate_hz, (offset_g, -offset_g))
-    assert (found.pushed_s > 0.0) is (force_g > PUSHED_G)
+    assert (found.pushed_s > 0.0) is (force_g > MIN_PUSH_G)
 
 
 # --- All of it -----------------------------------------------------------------------------------

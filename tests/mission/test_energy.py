@@ -15,9 +15,9 @@ from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.belief.battery import (
     BRUSHED,
     BRUSHLESS,
+    BatteryFit,
     Drive,
-    EnergyState,
-    update_energy,
+    update_battery_fit,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.endurance import battery_outlook, hover_left_s
@@ -49,7 +49,7 @@ ATTEMPT_S, LANDING_S = 12.0, 10.0
 @dataclass(frozen=True)
 class Moment:
     t_s: float
-    energy: EnergyState
+    energy: BatteryFit
     under_load_v: float
 
 
@@ -62,14 +62,14 @@ def hovering(
     mah: float = MAH,
 ) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
-    cell, energy, reading_v = Cell(rest_v, **kind), EnergyState(), rest_v
+    cell, energy, reading_v = Cell(rest_v, **kind), BatteryFit(), rest_v
     for i in range(round(most_s / PERIOD_S)):
         t_s = PERIOD_S * i
         load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else hover
         for _ in range(round(PERIOD_S / CONTROL_PERIOD_S)):
-            cell.step(drive.full_a * load)
+            cell.step(drive.full_thrust_current_a * load)
         reading_v += 0.1 * (cell.battery_v - reading_v)  # the firmware's, low-passed
-        energy = update_energy(energy, PERIOD_S, reading_v, load * FULL_THRUST, mah, drive)
+        energy = update_battery_fit(energy, PERIOD_S, reading_v, load * FULL_THRUST, mah, drive)
         yield Moment(
             t_s, energy, cell.rest_v - (cell.rest_v - cell.battery_v) / (load or 1) * hover
         )
@@ -126,18 +126,18 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
         assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
 
 
-def used_up(energy: EnergyState, volts: float, thrust: float, lasts_s: float) -> EnergyState:
+def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
-        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
+        energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
     return energy
 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
-    energy = used_up(used_up(EnergyState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
+    energy = used_up(used_up(BatteryFit(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert hover_left_s(energy, PROFILE, HOVER, BRUSHED) is None
-    assert energy.unknown_s == pytest.approx(10.0)
+    assert energy.no_reading_s == pytest.approx(10.0)
 
 
 @settings(max_examples=60)
@@ -153,7 +153,7 @@ def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
 def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
-        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
+        energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
     seconds = hover_left_s(energy, PROFILE, HOVER, BRUSHED)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
@@ -163,13 +163,13 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
 
 
 def flown(
-    phase: Phase, energy: EnergyState, seconds: float, profile: Profile = PROFILE, **tel: Any
+    phase: Phase, energy: BatteryFit, seconds: float, profile: Profile = PROFILE, **tel: Any
 ) -> PlannerState:
     begin = remembering(state_in(phase), energy=energy)
     return fly(begin, at(**tel), seconds, profile, one_phase=True).state
 
 
-NEAR_ITS_END = replace(FINE_BATTERY, ground_v=3.79, rest_v=3.77)
+NEAR_ITS_END = replace(FINE_BATTERY, takeoff_rest_v=3.79, rest_v=3.77)
 
 
 @pytest.mark.parametrize("phase", [Phase.ALIGN, Phase.RECOVER])
@@ -194,15 +194,15 @@ GRACE_S = PROFILE.safety.battery_stale_s
         (Phase.ALIGN, NEAR_ITS_END, 3.24, OPEN, False),
         # Fault 7: a vehicle that tells nothing of its battery is landed after
         # `safety.battery_stale_s`, and not in the middle of an ascent.
-        (Phase.ALIGN, EnergyState(unknown_s=8.0), 0.0, PROFILE, False),
-        (Phase.ALIGN, EnergyState(unknown_s=GRACE_S - 10.0), 0.0, PROFILE, True),
+        (Phase.ALIGN, BatteryFit(no_reading_s=8.0), 0.0, PROFILE, False),
+        (Phase.ALIGN, BatteryFit(no_reading_s=GRACE_S - 10.0), 0.0, PROFILE, True),
         # What was little is no more without a reading.
-        (Phase.ALIGN, replace(NEAR_ITS_END, unknown_s=8.0), 0.0, PROFILE, True),
+        (Phase.ALIGN, replace(NEAR_ITS_END, no_reading_s=8.0), 0.0, PROFILE, True),
     ],
     ids=["ascends", "presses", "open", "grace", "grace is over", "little before"],
 )
 def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
-    phase: Phase, energy: EnergyState, battery_v: float, profile: Profile, gated: bool
+    phase: Phase, energy: BatteryFit, battery_v: float, profile: Profile, gated: bool
 ) -> None:
     lasts_s = 2.0 if phase is Phase.ALIGN else 1.0
     state = flown(phase, energy, lasts_s, profile, battery_v=battery_v)

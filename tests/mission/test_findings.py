@@ -72,30 +72,35 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
 def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase) -> None:
     """A contact is proven only in PERCH; what hangs after a landing was carried there by the dead
     reckoning."""
-    reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), aside_m=(0.03, 0.04), aside_sigma_m=0.01)
+    reckoning = DeadReckoning(
+        imu=ImuMotion(t_s=BEGIN_S), lateral_offset_m=(0.03, 0.04), lateral_sigma_m=0.01
+    )
     state = remembering(state_in(phase), reckoning=reckoning, contact=None)
     report = FlightReport.of(state, observation(BEGIN_S), BY_TARGET, (), None)
     if phase is Phase.LANDED:
         assert report.contact is None
         return
     assert report.contact is not None
-    assert report.contact.aside_m == pytest.approx(0.05)
+    assert report.contact.lateral_offset_m == pytest.approx(0.05)
     assert 0.01 <= report.contact.sigma_m < 0.02
 
 
 def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     """Its distance does not become unsure while it hangs there."""
     reckoning = DeadReckoning(
-        aside_m=(0.02, 0.0), aside_sigma_m=0.01, below_m=0.0, sight_s=BEGIN_S - 0.5
+        lateral_offset_m=(0.02, 0.0),
+        lateral_sigma_m=0.01,
+        distance_below_m=0.0,
+        sighting_s=BEGIN_S - 0.5,
     )
     begun = remembering(
         state_in(Phase.LANDING, z_m=1.9),
-        reckoning=reckoning, contact_z_m=1.9, reach_s=BEGIN_S, stopped_s=BEGIN_S,
+        reckoning=reckoning, contact_z_m=1.9, in_reach_since_s=BEGIN_S, stopped_s=BEGIN_S,
         dead_reckoned_s=BEGIN_S,
     )  # fmt: skip
     flight = fly(begun, hangs(1.9), 4.0, BY_TARGET, feels=True)
     rest = [
-        tick.state.belief.reckoning.aside_sigma_m
+        tick.state.belief.reckoning.lateral_sigma_m
         for tick in flight.ticks
         if tick.t_s > BEGIN_S + 1.0
     ]

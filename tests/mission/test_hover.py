@@ -12,15 +12,20 @@ from hypothesis import strategies as st
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.hover import (
-    DESCENT_DRIFT,
-    DESCENT_SIGMA,
-    MOST_SIGMAS,
-    best_estimate,
+    DESCENT_RANDOM_WALK,
+    MAX_DESCENT_CORRECTION_SIGMAS,
+    MIN_DESCENT_SIGMA,
+    estimate_hover_thrust,
     learn_in_descent,
     learn_in_quiet_flight,
 )
-from perchctl.mission.belief.maneuver import Maneuver, Sent
-from perchctl.mission.belief.thrust import FELT_SIGMA, OPEN_DRIFT, THRUST_NOISE, HoverThrust
+from perchctl.mission.belief.maneuver import Maneuver, SentOrders
+from perchctl.mission.belief.thrust import (
+    ACCELEROMETER_SIGMA,
+    QUIET_RANDOM_WALK,
+    THRUST_SIGMA,
+    HoverThrust,
+)
 from perchctl.mission.phase import Phase
 from perchctl.values import replace
 from tests.helpers.mission import (
@@ -33,8 +38,8 @@ from tests.helpers.mission import (
 )
 
 thrusts = st.floats(30_000.0, 62_000.0)
-drifts = st.sampled_from([OPEN_DRIFT, DESCENT_DRIFT])
-DESCENDS = Sent(maneuver=Maneuver(descends=True), raw_thrust=48_000)
+drifts = st.sampled_from([QUIET_RANDOM_WALK, DESCENT_RANDOM_WALK])
+DESCENDS = SentOrders(maneuver=Maneuver(descends=True), raw_thrust=48_000)
 
 
 def believing(phase: Phase, thrust: float, acc_z_g: float = 1.0) -> Belief:
@@ -46,15 +51,15 @@ def believing(phase: Phase, thrust: float, acc_z_g: float = 1.0) -> Belief:
 
 def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: float) -> HoverThrust:
     for value in values:
-        start = start.after(dt_s, drift).with_measured(value, dt_s)
+        start = start.propagate(dt_s, drift).with_measurement(value, dt_s)
     return start
 
 
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
-    settled_s = 12.0 * THRUST_NOISE / drift  # the filter's own time, twelve times
+    settled_s = 12.0 * THRUST_SIGMA / drift  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
-    found = measured(HoverThrust(first, FELT_SIGMA), [true] * steps, 0.02, drift)
+    found = measured(HoverThrust(first, ACCELEROMETER_SIGMA), [true] * steps, 0.02, drift)
     assert found.thrust == pytest.approx(true, rel=1e-3)
 
 
@@ -62,13 +67,13 @@ def test_it_converges_to_what_is_measured(first: float, true: float, drift: floa
 def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: float) -> None:
     """P = r d for a scalar Kalman filter, within the step of a tick."""
     found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
-    assert found.sigma == pytest.approx(math.sqrt(THRUST_NOISE * drift), rel=0.05)
+    assert found.sigma == pytest.approx(math.sqrt(THRUST_SIGMA * drift), rel=0.05)
 
 
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: float) -> None:
     """Half as many measurements that stand for twice the time; 2 % of the step that is measured."""
-    start = HoverThrust(first, FELT_SIGMA)
+    start = HoverThrust(first, ACCELEROMETER_SIGMA)
     slow = measured(start, [true] * 25, 0.02, drift)
     fast = measured(start, [true] * 50, 0.01, drift)
     assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
@@ -78,10 +83,10 @@ def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: 
 @given(old=thrusts, one=thrusts, other=thrusts, sigma=st.floats(1e-3, 0.2))
 def test_more_measured_is_more_believed(old: float, one: float, other: float, sigma: float) -> None:
     start = HoverThrust(old, sigma)
-    low, high = (start.with_measured(each, 0.02).thrust for each in sorted((one, other)))
+    low, high = (start.with_measurement(each, 0.02).thrust for each in sorted((one, other)))
     assert low <= high
-    assert min(old, one) - 1e-6 <= start.with_measured(one, 0.02).thrust <= max(old, one) + 1e-6
-    assert start.with_measured(one, 0.0) == start  # no time, no evidence
+    assert min(old, one) - 1e-6 <= start.with_measurement(one, 0.02).thrust <= max(old, one) + 1e-6
+    assert start.with_measurement(one, 0.0) == start  # no time, no evidence
 
 
 @pytest.mark.parametrize(("thrust", "learns"), [(52_000.0, True), (62_000.0, False)])
@@ -97,16 +102,19 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
     b = believing(Phase.LANDING, thrust, acc_z_g)
     for _ in range(200):
         b = replace(b, hover=learn_in_descent(b, 0.02))
-    assert abs(b.hover_thrust / 50_000.0 - 1.0) <= MOST_SIGMAS * DESCENT_SIGMA + 1e-9
+    assert (
+        abs(b.hover_thrust / 50_000.0 - 1.0)
+        <= MAX_DESCENT_CORRECTION_SIGMAS * MIN_DESCENT_SIGMA + 1e-9
+    )
     assert (b.hover_thrust > 50_000.0) is (thrust / acc_z_g > 50_000.0)
 
 
 @pytest.mark.parametrize(
     "hides",
     [
-        {"sent": replace(DESCENDS, floor_felt_s=9.9)},
+        {"sent": replace(DESCENDS, floor_detected_s=9.9)},
         {"contact_z_m": 1.0},  # a magnet may hold it
-        {"reach_s": 9.0},
+        {"in_reach_since_s": 9.0},
     ],
     ids=["floor", "contact", "reach"],
 )
@@ -118,9 +126,9 @@ def test_what_may_carry_it_teaches_a_descent_nothing(hides: dict[str, Any]) -> N
 
 def test_what_was_never_learned_is_felt_and_rough() -> None:
     b = replace(believing(Phase.LANDING, 45_000.0), hover=HoverThrust())
-    assert best_estimate(b).thrust == pytest.approx(45_000.0)
-    assert best_estimate(b).is_rough
-    assert not learn_in_quiet_flight(b, 0.02).is_rough
+    assert estimate_hover_thrust(b).thrust == pytest.approx(45_000.0)
+    assert estimate_hover_thrust(b).is_imprecise
+    assert not learn_in_quiet_flight(b, 0.02).is_imprecise
 
 
 def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
@@ -151,12 +159,12 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
 
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
-    later = HoverThrust(50_000.0, sigma).aged(dt_s)
-    assert sigma <= later.sigma <= max(sigma, FELT_SIGMA)
+    later = HoverThrust(50_000.0, sigma).propagate_unmeasured(dt_s)
+    assert sigma <= later.sigma <= max(sigma, ACCELEROMETER_SIGMA)
 
 
 def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:
-    found = HoverThrust().with_measured(48_000.0, 0.02)
+    found = HoverThrust().with_measurement(48_000.0, 0.02)
     assert found.thrust == 48_000.0
     assert math.isfinite(found.sigma)
 

@@ -11,10 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion
-from perchctl.mission.belief.motion import FROZEN_READING_S, GAP_S, PUSHED_G, UNCORRECTED_S
+from perchctl.mission.belief.motion import (
+    CORRECTION_TIMEOUT_S,
+    MAX_FROZEN_READING_S,
+    MAX_TELEMETRY_GAP_S,
+    MIN_PUSH_G,
+)
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_M,
-    MOST_CLIMB_MPS,
+    MAX_SILENT_CLIMB_MPS,
     DeadReckoning,
     add_sighting,
     advance_reckoning,
@@ -37,7 +42,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     assert motion.frozen_s == pytest.approx(2.99)
     assert motion.silent_s == pytest.approx(2.99)
     assert motion.fell_s < 0.0
-    assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * FROZEN_READING_S
+    assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_S
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.frozen_s == 0.0
     assert alive.fell_s > 0.0
@@ -52,7 +57,7 @@ def since_heard(after: Telemetry, before: Telemetry | None = None) -> ImuMotion:
     return UNTIL_THEN.with_sample(before or HUNG[-1], after)
 
 
-@given(silent_s=st.floats(GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
+@given(silent_s=st.floats(MAX_TELEMETRY_GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
 def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
     silent_s: float, drift_mps: float
 ) -> None:
@@ -120,27 +125,29 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
     assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
 
 
-@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 3.0))
+@given(distance_below_m=st.floats(0.05, 2.0), silent_s=st.floats(MAX_TELEMETRY_GAP_S + 0.01, 3.0))
 def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
-    below_m: float, silent_s: float
+    distance_below_m: float, silent_s: float
 ) -> None:
     """However it was last heard to sink. With motors that were off, or started anew, it lies, or
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
-    near = below_m - MOST_CLIMB_MPS * silent_s < MAGNET_REACH_M
+    near = distance_below_m - MAX_SILENT_CLIMB_MPS * silent_s < MAGNET_REACH_M
     off = {"thrust": 0.0}
     for z_m, before, after, unsure, kept in (
-        (below_m, telemetry(1.0, **sinks), telemetry(1.0 + silent_s, **sinks), near, True),
-        (below_m, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), False, False),
-        (below_m, telemetry(1.0), telemetry(1.0 + silent_s, start=1, **off), False, False),
+        (distance_below_m, telemetry(1.0, **sinks), telemetry(1.0 + silent_s, **sinks), near, True),
+        (distance_below_m, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), False, False),
+        (distance_below_m, telemetry(1.0), telemetry(1.0 + silent_s, start=1, **off), False, False),
         (0.02, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), True, True),
     ):
         imu = flown([before])
         old = add_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
         new = advance_reckoning(old, imu.with_sample(before, after), after, believed=False)
-        assert (new.unsure_s == after.t_s) is unsure
-        assert new.below_m == (z_m if kept else math.inf)
-        assert add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).nearest_m == z_m
+        assert (new.doubtful_gap_s == after.t_s) is unsure
+        assert new.distance_below_m == (z_m if kept else math.inf)
+        assert (
+            add_sighting(new, after.t_s + 0.1, (0.0, 0.0), z_m, 0.001).min_distance_below_m == z_m
+        )
 
 
 def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
@@ -150,14 +157,16 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     reckoning = add_sighting(DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001)
     late = telemetry(falls[-1].t_s + 1.5)
     for last, new in pairwise([*falls, late]):
-        assert new is not late or 0.02 < reckoning.nearest_m < 0.1
+        assert new is not late or 0.02 < reckoning.min_distance_below_m < 0.1
         motion = motion.with_sample(last, new)
         reckoning = advance_reckoning(reckoning, motion, new, believed=False)
     assert motion.fell_s > 1.0
-    assert reckoning.unsure_s == late.t_s
+    assert reckoning.doubtful_gap_s == late.t_s
 
 
-def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:
+def estimate_only_mps(
+    turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0
+) -> float:
     """After 0.4 s of a tilt that speeds it up by 1 m/s2, with an estimate that follows as it is, or
     mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
     many samples show. `offset_g`: what the accelerometer reads too much."""
@@ -172,15 +181,15 @@ def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: flo
         motion = motion.with_sample(last, new)
         reckoning = advance_reckoning(reckoning, motion, new, believed=True)
         last = new
-    return abs(reckoning.beside_mps[0])
+    return abs(reckoning.estimate_only_mps[0])
 
 
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
-    assert beside_mps(1) < 0.05
-    assert beside_mps(-1) > 0.3
-    assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
-    assert beside_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
-    assert beside_mps(-1, offset_g=1.2 * PUSHED_G) > 0.3
+    assert estimate_only_mps(1) < 0.05
+    assert estimate_only_mps(-1) > 0.3
+    assert estimate_only_mps(-1, pushed_g=2.0 * MIN_PUSH_G) == 0.0
+    assert estimate_only_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
+    assert estimate_only_mps(-1, offset_g=1.2 * MIN_PUSH_G) > 0.3
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------
@@ -203,7 +212,7 @@ def uncorrected_s(*growths: tuple[float, float]) -> float:
 
 def test_a_variance_that_grows_on_and_on_is_corrected_no_more() -> None:
     """After 0.5 s it is certain, and then the age counts from the last correction."""
-    assert uncorrected_s((0.0, 1.0), (1e-3, UNCORRECTED_S)) == 0.0
+    assert uncorrected_s((0.0, 1.0), (1e-3, CORRECTION_TIMEOUT_S)) == 0.0
     assert uncorrected_s((0.0, 1.0), (1e-3, 0.6)) == pytest.approx(0.6, abs=0.11)
     assert uncorrected_s((0.0, 1.0), (1e-3, 5.0)) == pytest.approx(5.0, abs=0.11)
 

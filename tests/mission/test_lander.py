@@ -24,9 +24,9 @@ from perchctl.mission import (
     planner,
     rest,
 )
-from perchctl.mission.belief.contact import CARRIED, DOWN
+from perchctl.mission.belief.contact import MOTORS_STOPPED, SUPPORTED_BY_IMU
 from perchctl.mission.belief.motion import FusionAge
-from perchctl.mission.belief.mounting import SIGHTS_IN_A_ROW, MountingMonitor
+from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
 from perchctl.mission.belief.quality import BATTERY_LOW
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
@@ -110,7 +110,7 @@ def context(
     state = remembering(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
         t_s=NOW_S - TICK_S, last=sample, reckoned_height_m=z_m,
-        contact_z_m=z_m if held else None, reach_s=NOW_S - 2.0 if held else None,
+        contact_z_m=z_m if held else None, in_reach_since_s=NOW_S - 2.0 if held else None,
         reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = remembering(state, **{**remembered, **changes})
@@ -161,7 +161,7 @@ def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     assert state.released_s == NOW_S
     if known == "onboard":
         deaf, command = descent.act(context(known, True, since_s=PEEL_S + 0.1, tel={"t_s": 8.0}))
-        assert is_setpoint(command, below_m=HANG_Z_M)
+        assert is_setpoint(command, distance_below_m=HANG_Z_M)
         assert deaf.released_s is None
 
 
@@ -178,7 +178,7 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
 
 
 @pytest.mark.parametrize(
-    ("observed", "with_decks", "by_target"),
+    ("observed", "with_decks", "is_target_positioned"),
     [
         ({}, PositionSetpoint, PositionSetpoint),
         ({"position_age_s": 0.6}, RawThrust, RawThrust),
@@ -197,12 +197,12 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
     ],
 )
 def test_each_part_of_what_is_known_has_its_own_age(
-    observed: dict[str, Any], with_decks: type[Command], by_target: type[Command]
+    observed: dict[str, Any], with_decks: type[Command], is_target_positioned: type[Command]
 ) -> None:
     """A dead position block leaves acceleration and thrust fresh; and what a picture carries is
     doubted sooner than what decks measure."""
     assert sent(DECKS, {}, **observed) is with_decks
-    assert sent(BY_TARGET, {}, **observed) is by_target
+    assert sent(BY_TARGET, {}, **observed) is is_target_positioned
 
 
 def uncorrected(for_s: float) -> dict[str, Any]:
@@ -236,7 +236,8 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
 ) -> None:
     """By such positions a landing would speed up until it tilts over."""
     begin = remembering(
-        state_in(Phase.ALIGN, NOW_S), mounting=MountingMonitor(doubts=SIGHTS_IN_A_ROW)
+        state_in(Phase.ALIGN, NOW_S),
+        mounting=MountingMonitor(contradictions=REQUIRED_CONTRADICTIONS),
     )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
@@ -274,23 +275,25 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
     aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
-        floor_felt_s=NOW_S - 0.5, thrust=half, reckoning=aside,
+        floor_detected_s=NOW_S - 0.5, thrust=half, reckoning=aside,
     )  # fmt: skip
     state, command = descent.act(c)
-    assert (state.descent.floor_felt_s is not None) is stands
+    assert (state.descent.floor_detected_s is not None) is stands
     assert isinstance(command, RawThrust)
     assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
 
 
-@pytest.mark.parametrize(("struck_mps", "floor"), [(-0.3, True), (0.3, False)])
-def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(struck_mps: float, floor: bool) -> None:
+@pytest.mark.parametrize(("impact_mps", "floor"), [(-0.3, True), (0.3, False)])
+def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, floor: bool) -> None:
     """A vehicle that climbs, just after the lift-off, has not met the floor."""
     imu = ImuMotion(t_s=NOW_S - 0.01, blow_s=NOW_S - 0.05)
-    struck = DeadReckoning(imu=imu, struck_mps=struck_mps)
+    struck = DeadReckoning(imu=imu, impact_mps=impact_mps)
     c = context("imu", z_m=0.15, reckoning=struck)
-    c = Context(replace(c.state, belief=c.belief.seen(replace(c.obs, imu=imu), c.profile)))
+    c = Context(
+        replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
+    )
     state, _ = descent.act(c)
-    assert (state.descent.floor_felt_s is not None) is floor
+    assert (state.descent.floor_detected_s is not None) is floor
 
 
 @pytest.mark.parametrize(("vz_mps", "stops"), [(-0.35, False), (-0.05, True), (0.2, False)])
@@ -359,10 +362,10 @@ def test_what_carries_it_near_its_only_position_is_the_target(
     phase: Phase, since_s: float, is_there: bool
 ) -> None:
     """Late pictures show it lower. On its way down the floor carries it, too."""
-    c = context("sight", phase=phase, since={CARRIED: NOW_S - since_s})
-    reckoning = replace(c.state.belief.reckoning, below_m=0.1)
+    c = context("sight", phase=phase, since={SUPPORTED_BY_IMU: NOW_S - since_s})
+    reckoning = replace(c.state.belief.reckoning, distance_below_m=0.1)
     state = observing(remembering(c.state, reckoning=reckoning), c.obs, c.profile)
-    assert (state.belief.reckoning.below_m == 0.0) is is_there
+    assert (state.belief.reckoning.distance_below_m == 0.0) is is_there
 
 
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
@@ -393,13 +396,13 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     profile, stale = PROFILES[positioning], hung > 1.0
     state = remembering(
         state_in(Phase.LANDING, z_m=HIGH_M), last=telemetry(NOW_S, HIGH_M), catch_above_m=1.0,
-        since={DOWN: 0.0, BATTERY_LOW: 1.0},
+        since={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
     off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
     obs = observation(later_s, telemetry=telemetry(later_s, HIGH_M, **off))
     after = observing(state, obs, profile)
-    assert after.belief.since[DOWN] == (later_s if stale else 0.0)
+    assert after.belief.since[MOTORS_STOPPED] == (later_s if stale else 0.0)
     assert after.belief.since[BATTERY_LOW] == 1.0
     assert (after.catch_above_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
@@ -416,23 +419,24 @@ UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoning()
 
 
 def ended(
-    reach_s: float | None = None,
+    in_reach_since_s: float | None = None,
     imu: ImuMotion = UNMOVED,
     reckoning: DeadReckoning = UNRECKONED,
-    floor_felt_s: float | None = None,
+    floor_detected_s: float | None = None,
     **observed: Any,
 ) -> RestState:
     seen = {"target": None, "position_age_s": 3.0, "imu": imu, **observed}
     obs = at(HANG_Z_M, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), stopped_s=NOW_S - 1.0,
-        reach_s=reach_s, floor_felt_s=floor_felt_s, reckoning=replace(reckoning, imu=imu),
+        in_reach_since_s=in_reach_since_s, floor_detected_s=floor_detected_s,
+        reckoning=replace(reckoning, imu=imu),
     )  # fmt: skip
     return rest.find_rest_state(context_at(state, obs, BY_TARGET))
 
 
 @pytest.mark.parametrize(
-    ("reach_s", "fell_s", "gap_s", "found"),
+    ("in_reach_since_s", "fell_s", "gap_s", "found"),
     [
         (4.0, -math.inf, -math.inf, RestState.HANGS),
         (4.0, 3.0, 3.5, RestState.HANGS),  # before it came there
@@ -443,9 +447,9 @@ def ended(
     ],
 )
 def test_what_was_in_reach_and_has_not_fallen_since_hangs(
-    reach_s: float | None, fell_s: float, gap_s: float, found: RestState
+    in_reach_since_s: float | None, fell_s: float, gap_s: float, found: RestState
 ) -> None:
-    assert ended(reach_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
+    assert ended(in_reach_since_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
 
 
 @pytest.mark.parametrize("part", [0.35, 1.0])
@@ -462,35 +466,41 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
 
     begun = remembering(
         state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), orders=6, ordered_s=BEGIN_S,
-        reach_s=BEGIN_S - 1.0, reckoning=DeadReckoning(below_m=0.0),
+        in_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(distance_below_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
-    assert (state.belief.reach_s is not None) is (part < 1.0)
+    assert (state.belief.in_reach_since_s is not None) is (part < 1.0)
 
 
-@pytest.mark.parametrize("reach_s", [None, NOW_S - 2.0])
+@pytest.mark.parametrize("in_reach_since_s", [None, NOW_S - 2.0])
 def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
-    reach_s: float | None,
+    in_reach_since_s: float | None,
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = DeadReckoning(unsure_s=NOW_S - 3.0)
-    assert ended(reach_s, reckoning=silence) is RestState.UNKNOWN
-    assert ended(reach_s, reckoning=silence, floor_felt_s=NOW_S - 1.5) is RestState.STANDS
-    seen = replace(silence, sight_s=NOW_S - 2.5)
-    told = RestState.STANDS if reach_s is None else RestState.HANGS
-    assert ended(reach_s, reckoning=seen) is told
+    silence = DeadReckoning(doubtful_gap_s=NOW_S - 3.0)
+    assert ended(in_reach_since_s, reckoning=silence) is RestState.UNKNOWN
+    assert (
+        ended(in_reach_since_s, reckoning=silence, floor_detected_s=NOW_S - 1.5) is RestState.STANDS
+    )
+    seen = replace(silence, sighting_s=NOW_S - 2.5)
+    told = RestState.STANDS if in_reach_since_s is None else RestState.HANGS
+    assert ended(in_reach_since_s, reckoning=seen) is told
 
 
-@pytest.mark.parametrize(("phase", "below_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)])
+@pytest.mark.parametrize(
+    ("phase", "distance_below_m"), [(Phase.PERCH, math.inf), (Phase.ASCEND, 0.02)]
+)
 def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
-    phase: Phase, below_m: float
+    phase: Phase, distance_below_m: float
 ) -> None:
     """The loop comes back after 11 s, and the motors stand still already."""
     seen = {"target": None, "position_age_s": 11.0, "imu": UNMOVED}
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
-    before = remembering(before, reckoning=DeadReckoning(UNMOVED, below_m=below_m))
+    before = remembering(
+        before, reckoning=DeadReckoning(UNMOVED, distance_below_m=distance_below_m)
+    )
     entered = remembering(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
     new = descent.enter_landing(
         context_at(entered, obs, BY_TARGET).state, context_at(before, obs, BY_TARGET).state
@@ -537,9 +547,15 @@ BITS = st.lists(BIT, min_size=1, max_size=5)
 REMEMBERED = st.sampled_from(
     [
         {},
-        {"contact_z_m": HANG_Z_M, "reach_s": 9.0},
-        {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.9},
-        {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.0, "stopped_s": 9.8, "orders": 2},
+        {"contact_z_m": HANG_Z_M, "in_reach_since_s": 9.0},
+        {"contact_z_m": HANG_Z_M, "in_reach_since_s": 9.0, "released_s": 9.9},
+        {
+            "contact_z_m": HANG_Z_M,
+            "in_reach_since_s": 9.0,
+            "released_s": 9.0,
+            "stopped_s": 9.8,
+            "orders": 2,
+        },
         {"catch_above_m": 1.0},
         {"pressed": True},
         {"hover_thrust": 0.0},
@@ -600,8 +616,8 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
         if Phase.LANDING not in (before.phase, state.phase):
             continue
         assert state.severity >= before.severity
-        z_m, ground_m = obs.telemetry.position_m[2], state.belief.ground_m
-        floor_m = ground_m[2] if ground_m else 0.0
+        z_m, takeoff_position_m = obs.telemetry.position_m[2], state.belief.takeoff_position_m
+        floor_m = takeoff_position_m[2] if takeoff_position_m else 0.0
         if (
             isinstance(command, PositionSetpoint)
             and state.catch_above_m is None

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.mounting import (
     MountingMonitor,
-    MountSample,
-    mount_sample,
+    MountingSample,
+    make_mounting_sample,
     update_monitor,
 )
 from perchctl.vehicle import Command, PositionSetpoint
@@ -46,7 +46,7 @@ def flown(seen: Seen, way_m: float = 0.5, noise_m: float = 0.003) -> tuple[Mount
         moved_m = max(0.0, t_s - 0.5) * SPEED_MPS
         p = moved_m * cmath.exp(0.7j)
         spoiled = seen(t_s, p) + complex(*rng.normal(0.0, noise_m, 2))
-        watch = update_monitor(watch, MountSample(t_s, p, spoiled))
+        watch = update_monitor(watch, MountingSample(t_s, p, spoiled))
     return watch, moved_m
 
 
@@ -69,7 +69,7 @@ def _tilting(deg: float) -> MountingMonitor:
     for i in range(120):
         t_s = i * FRAME_S
         lean = reach_m * complex(math.sin(4.0 * t_s), 0.8 * math.sin(5.0 * t_s + 1.0))
-        watch = update_monitor(watch, MountSample(t_s, 0j, turned(deg)(t_s, lean), lean))
+        watch = update_monitor(watch, MountingSample(t_s, 0j, turned(deg)(t_s, lean), lean))
     return watch
 
 
@@ -87,16 +87,16 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
     tel = telemetry(
         1.0, position_m=(0.3, 0.1, 1.0), pitch_rad=math.radians(10.0), yaw_rad=math.pi / 2
     )
-    sight = mount_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
+    sight = make_mounting_sample(1.0, tel, np.array([0.5, 0.2, 2.2]))
     assert sight.vehicle_m == pytest.approx(0.3 + 0.1j)
     assert sight.target_m == pytest.approx(0.5 + 0.2j)
-    assert sight.lean_m == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
+    assert sight.axis_offset_m == pytest.approx(1.2j * math.sin(math.radians(10.0)), rel=0.02)
 
 
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountingMonitor(doubts=9, turn_rad=math.pi / 2)
+    watch = MountingMonitor(contradictions=9, turn_rad=math.pi / 2)
     flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
     assert flight.state.row == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
@@ -118,18 +118,18 @@ def test_a_target_that_is_moved_is_no_turned_mounting(
 
 
 @pytest.mark.parametrize(
-    "shift_m",
+    "frame_shift_m",
     [lambda i: 0.2 if i > 30 else 0.0, lambda i: 0.02 * i * FRAME_S],
     ids=["jumps", "drifts by 2 cm/s"],
 )
 def test_a_world_that_moves_under_both_is_no_turned_mounting(
-    shift_m: Callable[[int], float],
+    frame_shift_m: Callable[[int], float],
 ) -> None:
     """The estimate moves: target and vehicle, which follows it, move alike."""
     watch = MountingMonitor()
     for i in range(900):
-        shift = shift_m(i)
-        watch = update_monitor(watch, MountSample(i * FRAME_S, complex(shift), TARGET + shift))
+        shift = frame_shift_m(i)
+        watch = update_monitor(watch, MountingSample(i * FRAME_S, complex(shift), TARGET + shift))
         assert not watch.is_wrong
 
 
@@ -165,7 +165,7 @@ def test_a_right_mounting_flies_on() -> None:
     it = Follows(0.0)
     state = fly(state_in(Phase.ALIGN), it, 3.98).state
     assert state.phase is not Phase.LANDING
-    assert state.belief.mounting.mounting_fits
+    assert state.belief.mounting.is_confirmed
     assert max(it.far_m) > 0.3
     assert it.far_m[15] <= 0.25 * 0.3 + 1e-9
 

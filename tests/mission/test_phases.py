@@ -6,13 +6,13 @@ import pytest
 
 from perchctl.mission import Phase
 from perchctl.mission.phase import (
-    AIRBORNE,
-    BEFORE_CONTACT,
-    BY_CAMERA,
+    AIRBORNE_PHASES,
+    CAMERA_GUIDED_PHASES,
+    FINAL_PHASES,
     FLYING_PHASES,
-    IN_THE_OPEN,
-    SEVEN_PHASES,
-    TERMINALS,
+    FREE_AIR_PHASES,
+    PAPER_PHASES,
+    PRE_CONTACT_PHASES,
 )
 from perchctl.mission.table import PHASES, TABLE
 
@@ -27,7 +27,7 @@ def test_every_phase_is_defined_under_its_own_name() -> None:
     assert all(definition.phase is phase for phase, definition in PHASES.items())
 
 
-@pytest.mark.parametrize("phase", sorted(AIRBORNE, key=lambda p: p.value))
+@pytest.mark.parametrize("phase", sorted(AIRBORNE_PHASES, key=lambda p: p.value))
 def test_no_airborne_phase_lacks_the_gravest_rows(phase: Phase) -> None:
     rows = {row.name for row in TABLE if phase in row.phases}
     assert rows >= GRAVEST
@@ -36,18 +36,20 @@ def test_no_airborne_phase_lacks_the_gravest_rows(phase: Phase) -> None:
 
 def test_what_the_camera_steers_and_what_flies_in_the_open_is_declared_once() -> None:
     """A row asks for the set, the belief for the maneuver: they must mean the same."""
-    assert {p for p, each in PHASES.items() if each.maneuver.by_camera} == BY_CAMERA
-    assert {p for p, each in PHASES.items() if each.maneuver.in_the_open} == IN_THE_OPEN
+    assert {
+        p for p, each in PHASES.items() if each.maneuver.is_camera_guided
+    } == CAMERA_GUIDED_PHASES
+    assert {p for p, each in PHASES.items() if each.maneuver.in_free_air} == FREE_AIR_PHASES
     assert {p for p, each in PHASES.items() if each.maneuver.descends} == {Phase.LANDING}
 
 
 def test_the_sets_are_those_of_the_paper_s_phases() -> None:
     """By name: a phase that is put between others must not push one out."""
-    names = " ".join(phase.value for phase in SEVEN_PHASES)
+    names = " ".join(phase.value for phase in PAPER_PHASES)
     assert names == "APPROACH SEARCH ESTIMATE ALIGN ASCEND PERCH COMPLETE"
-    assert {*SEVEN_PHASES, Phase.RECOVER} <= FLYING_PHASES
-    assert {Phase.COMPLETE} == FLYING_PHASES - BEFORE_CONTACT
-    assert not TERMINALS & AIRBORNE
+    assert {*PAPER_PHASES, Phase.RECOVER} <= FLYING_PHASES
+    assert {Phase.COMPLETE} == FLYING_PHASES - PRE_CONTACT_PHASES
+    assert not FINAL_PHASES & AIRBORNE_PHASES
 
 
 @pytest.mark.parametrize("phase", list(Phase))
@@ -55,4 +57,4 @@ def test_a_phase_owns_its_exits(phase: Phase) -> None:
     """An exit leaves the phase in whose file it is; what is left for ever has none."""
     exits = PHASES[phase].exits
     assert all(phase in row.phases for row in exits)
-    assert bool(exits) is (phase in AIRBORNE)
+    assert bool(exits) is (phase in AIRBORNE_PHASES)

@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import contact_offset
-from perchctl.mission.belief.quality import OTHERWISE_MPS
+from perchctl.mission.belief.quality import MAX_VELOCITY_DISAGREEMENT_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.descent import LEAST_ORDERS
 from perchctl.mission.planner import step_mission
@@ -79,7 +79,7 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
 @pytest.mark.parametrize("lost_s", [0.0, 0.06])
 @pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
 def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
-    """Level, by thrust alone, within a second: long before the estimate itself doubts."""
+    """Level, by thrust alone, within a second: long before the estimate itself contradictions."""
     felt, state, sent = Felt(), remembering(state_in(phase), attempts=1), []
     for i in range(125):
         t_s = BEGIN_S + 0.01 * (i - 24)
@@ -182,7 +182,7 @@ class Hangs(Motors):
 
 
 def at_the_magnet(phase: Phase = Phase.COMPLETE, **changes: Any) -> PlannerState:
-    held = {"contact_z_m": HANG_Z_M, "reach_s": BEGIN_S - 5.0}
+    held = {"contact_z_m": HANG_Z_M, "in_reach_since_s": BEGIN_S - 5.0}
     return remembering(state_in(phase, z_m=HANG_Z_M), **{**held, **changes})  # type: ignore[arg-type]
 
 
@@ -249,7 +249,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = remembering(
         state_in(Phase.LANDING, z_m=1.0), entered_s=8.0, contact_z_m=0.6, released_s=9.0,
-        stopped_s=9.9, stale_s=BEGIN_S, reach_s=8.0,
+        stopped_s=9.9, last_stale_s=BEGIN_S, in_reach_since_s=8.0,
     )  # fmt: skip
     felt = Felt()
     felt(off(BEGIN_S - TICK_S))
@@ -264,7 +264,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
 
 @pytest.mark.parametrize(
     ("contact", "ends"),
-    [({}, Phase.PERCHED), ({"contact_z_m": None, "reach_s": None}, Phase.LANDED)],
+    [({}, Phase.PERCHED), ({"contact_z_m": None, "in_reach_since_s": None}, Phase.LANDED)],
     ids=["contact", "none"],
 )
 def test_what_something_carries_is_put_down_gently_whatever_that_is(
@@ -315,7 +315,9 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
         return at(obs=obs, position_m=body_m)(t_s)
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
-    assert math.hypot(*flight.state.belief.reckoning.stepped_m) == pytest.approx(sigma_m, abs=1e-3)
+    assert math.hypot(*flight.state.belief.reckoning.position_step_sum_m) == pytest.approx(
+        sigma_m, abs=1e-3
+    )
     assert contact_offset(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
 
@@ -435,7 +437,7 @@ def test_positions_that_are_late_swing_it_up_and_down(
 
 
 def gains_beside(
-    state: PlannerState, beside_mps: float, lasts_s: float, **tel: Any
+    state: PlannerState, estimate_only_mps: float, lasts_s: float, **tel: Any
 ) -> tuple[PlannerState, Command]:
     """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
     felt = Felt()
@@ -443,7 +445,7 @@ def gains_beside(
     state = remembering(state, last=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu))
     for t_s in times(lasts_s):
         if not state.belief.diverged:
-            beside = replace(state.belief.reckoning, beside_mps=(0.0, beside_mps))
+            beside = replace(state.belief.reckoning, estimate_only_mps=(0.0, estimate_only_mps))
             state = remembering(state, reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
         obs = at(supervisor=AIRBORNE | HL_ACTIVE, **alive)(t_s)
@@ -451,14 +453,16 @@ def gains_beside(
     return state, command
 
 
-@pytest.mark.parametrize("beside_mps", [0.9 * OTHERWISE_MPS, 1.1 * OTHERWISE_MPS])
+@pytest.mark.parametrize(
+    "estimate_only_mps", [0.9 * MAX_VELOCITY_DISAGREEMENT_MPS, 1.1 * MAX_VELOCITY_DISAGREEMENT_MPS]
+)
 def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
-    beside_mps: float,
+    estimate_only_mps: float,
 ) -> None:
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
     begin = remembering(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
-    state, command = gains_beside(begin, -beside_mps, 0.2)
-    assert state.belief.diverged is (beside_mps > OTHERWISE_MPS)
+    state, command = gains_beside(begin, -estimate_only_mps, 0.2)
+    assert state.belief.diverged is (estimate_only_mps > MAX_VELOCITY_DISAGREEMENT_MPS)
     assert isinstance(command, RawThrust) is state.belief.diverged
 
 

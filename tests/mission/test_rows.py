@@ -22,7 +22,7 @@ from perchctl.mission import (
     Phase,
     planner,
 )
-from perchctl.mission.belief.mounting import SIGHTS_IN_A_ROW, MountingMonitor
+from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMonitor
 from perchctl.mission.phase import FLYING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
@@ -182,7 +182,7 @@ CASES: dict[str, Case] = {
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
-        state={"mounting": MountingMonitor(doubts=SIGHTS_IN_A_ROW)},
+        state={"mounting": MountingMonitor(contradictions=REQUIRED_CONTRADICTIONS)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
@@ -306,7 +306,7 @@ CASES: dict[str, Case] = {
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
             "outcome": O.SAFETY, "stopped_s": BEGIN_S, "contact_z_m": CONTACT_Z_M,
-            "reach_s": BEGIN_S - 1.0,
+            "in_reach_since_s": BEGIN_S - 1.0,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),
@@ -477,10 +477,10 @@ def test_an_error_of_a_row_of_your_own_names_the_row(change: dict[str, Any]) -> 
         planner.step_mission(state_in(P.ALIGN), observation(BEGIN_S), PROFILE, table)
 
 
-@pytest.mark.parametrize("below_m", [0.1, 0.0])
-def test_a_press_off_the_target_is_given_up_before_its_time(below_m: float) -> None:
+@pytest.mark.parametrize("distance_below_m", [0.1, 0.0])
+def test_a_press_off_the_target_is_given_up_before_its_time(distance_below_m: float) -> None:
     """No contact can be proven there; at the target's height one is."""
-    z_m = CONTACT_Z_M - below_m
+    z_m = CONTACT_Z_M - distance_below_m
     press = {"setpoint": PositionSetpoint(0.0, 0.0, z_m + 0.15, 0.0)}
     case = Case(P.PERCH, P.RECOVER, at(z_m, thrust=PRESSED), 1.5, state=press, z_m=z_m)
-    assert case.holds() is (below_m > 0.0)
+    assert case.holds() is (distance_below_m > 0.0)

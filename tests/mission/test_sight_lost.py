@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
-from perchctl.mission.belief.belief import CORRECTED_S, DISPLACED_MPS
+from perchctl.mission.belief.belief import MAX_CORRECTION_AGE_S, MIN_GUST_SPEED_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.level_descent import BRAKE_RAD_PER_MPS, LEVEL_SINK_MPS, MOST_BRAKE_RAD
 from perchctl.mission.phase import Severity
@@ -154,7 +154,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
 ) -> None:
     """For 0.1 s without a sight: sideways the estimate feels none of it."""
     gained_mps = 9.81 * 0.1 * math.hypot(aside_g, ahead_g)
-    assume(abs(gained_mps - DISPLACED_MPS) >= 0.05)
+    assume(abs(gained_mps - MIN_GUST_SPEED_MPS) >= 0.05)
 
     def look(t_s: float) -> Observation:
         passed_s = t_s - BEGIN_S
@@ -163,10 +163,10 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         return unseen(1.0, for_s=max(0.01, passed_s - 0.1), yaw_rad=yaw_rad, **felt)(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
-    assert (flight.state.phase is Phase.LANDING) is (gained_mps > DISPLACED_MPS)
+    assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_GUST_SPEED_MPS)
     if flight.state.phase is Phase.LANDING:
         assert flight.state.row == "position-lost"
-        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + CORRECTED_S
+        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_CORRECTION_AGE_S
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
         assert flight.command.roll_rad * aside_g >= -1e-3
@@ -202,13 +202,13 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     """Knocked off the magnet it is caught by position, and the position mode would tilt it by its
     estimate, which has felt no blow: the setpoint asks for the opposite of what that lacks."""
     unknown_mps = math.hypot(x_mps, y_mps)
-    assume(abs(unknown_mps - DISPLACED_MPS) > 0.01)
+    assume(abs(unknown_mps - MIN_GUST_SPEED_MPS) > 0.01)
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
         state_in(Phase.LANDING, z_m=1.9), contact_z_m=1.9, released_s=BEGIN_S - 1.0,
-        reach_s=BEGIN_S - 6.0, dead_reckoned_s=BEGIN_S - 3.0,
+        in_reach_since_s=BEGIN_S - 6.0, dead_reckoned_s=BEGIN_S - 3.0,
         reckoning=DeadReckoning(
-            imu=imu, velocity_mps=(x_mps, y_mps, -0.5), missed_mps=(x_mps, y_mps)
+            imu=imu, velocity_mps=(x_mps, y_mps, -0.5), imu_only_mps=(x_mps, y_mps)
         ),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
@@ -216,7 +216,7 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     _, command = step_mission(state, obs, PROFILE)
     assert is_setpoint(command, above_m=1.85)
     assert isinstance(command, PositionSetpoint)
-    if unknown_mps > DISPLACED_MPS:
+    if unknown_mps > MIN_GUST_SPEED_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
             braked_mps = max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps))
             assert way_m == pytest.approx(-braked_mps / POSITION_GAIN_PER_S, abs=0.02)
@@ -261,7 +261,7 @@ def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside()
 
 
 def pressed_past_the_sight(
-    aside_m: float = 0.0, sigma_m: float = 1e-3, climb_mps: float = 0.0
+    lateral_offset_m: float = 0.0, sigma_m: float = 1e-3, climb_mps: float = 0.0
 ) -> PlannerState:
     """The last sight was 4.5 cm below the target. From there on the estimate sinks at 0.1 m/s, as
     after an impact, and the accelerometer feels `climb_mps` more each second; it holds."""
@@ -270,7 +270,7 @@ def pressed_past_the_sight(
         i = round((t_s - BEGIN_S) / TICK_S) - 1
         z_m = HANG_Z_M - 0.045 - 0.1 * TICK_S * i
         target = target_at(
-            t_s, (aside_m, 0.0, CEILING_M), (0.0, 0.0, z_m), measured=not i,
+            t_s, (lateral_offset_m, 0.0, CEILING_M), (0.0, 0.0, z_m), measured=not i,
             measured_s=BEGIN_S + TICK_S, sigma_m=np.full(3, sigma_m),
         )  # fmt: skip
         return at(
@@ -291,11 +291,13 @@ def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() ->
     assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
 
 
-@pytest.mark.parametrize(("aside_m", "sigma_m"), [(0.03, 1e-3), (0.02, 0.01), (0.0, math.inf)])
+@pytest.mark.parametrize(
+    ("lateral_offset_m", "sigma_m"), [(0.03, 1e-3), (0.02, 0.01), (0.0, math.inf)]
+)
 def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
-    aside_m: float, sigma_m: float
+    lateral_offset_m: float, sigma_m: float
 ) -> None:
-    state = pressed_past_the_sight(aside_m, sigma_m)
+    state = pressed_past_the_sight(lateral_offset_m, sigma_m)
     assert (state.phase, state.row, state.attempts) == (Phase.RECOVER, "beside-the-magnet", 1)
 
 

@@ -37,14 +37,14 @@ def flown(
     z_m: float = 1.0,
     profile: Profile = PROFILE,
     setpoint_z_m: float | None = None,
-    aside_m: float = 0.0,
+    lateral_offset_m: float = 0.0,
     **tel: Any,
 ) -> PlannerState:
     """For so long in that state of flight, or until the phase changes."""
     for t_s in times(for_s):
         if setpoint_z_m is not None:
             state = remembering(state, setpoint=PositionSetpoint(0.0, 0.0, setpoint_z_m, 0.0))
-        target = target_at(t_s, (aside_m, 0.0, CEILING_M), (0.0, 0.0, z_m))
+        target = target_at(t_s, (lateral_offset_m, 0.0, CEILING_M), (0.0, 0.0, z_m))
         new, _ = planner.step_mission(state, at(z_m, obs={"target": target}, **tel)(t_s), profile)
         if new.phase is not state.phase:
             return new
@@ -125,7 +125,7 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
     hover: float, lasts_s: float, row: str
 ) -> None:
     start = remembering(state_in(Phase.ALIGN), hover_thrust=hover)
-    state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
+    state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, lateral_offset_m=0.2)
     assert state.row == row
     assert row != "too-weak" or "battery too low" in state.reason
 
@@ -151,7 +151,7 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
         obs = at(CONTACT_Z_M, thrust=reads)(t_s)
         state = replace(observing(state, obs, PROFILE), t_s=t_s)
     b = state.belief
-    assert b.thrust_is_known is MAGNET_HOLDS.holds(b) is known
+    assert b.is_thrust_known is MAGNET_HOLDS.holds(b) is known
 
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
@@ -192,7 +192,7 @@ GROUND_Z_M = 0.4
 
 @given(st.floats(-5, 5), st.sampled_from(sorted(FLYING_PHASES | {Phase.LANDING}, key=str)))
 def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
-    state = remembering(state_in(phase), ground_m=(0.0, 0.0, GROUND_Z_M))
+    state = remembering(state_in(phase), takeoff_position_m=(0.0, 0.0, GROUND_Z_M))
     c = context_at(state, observation(10.02), PROFILE)
     lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else GROUND_CLEARANCE_M)
     sent = limit_setpoint(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m

@@ -74,7 +74,7 @@ def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
 def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: Phase) -> None:
     """The integrators that a second of full thrust has wound up hold it there for seconds."""
     pressing = fly(landing(1.0, phase, pressed=True), at(1.0, thrust=65535.0))
-    assert is_setpoint(pressing.command, below_m=0.2)
+    assert is_setpoint(pressing.command, distance_below_m=0.2)
     away = at(0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
     state, command = step_mission(pressing.state, away(10.5), PROFILE)
     assert not state.pressed
@@ -162,11 +162,11 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
             seen.append(look(t_s))
             state, command = step_mission(state, seen[-1], PROFILE)
             assert not isinstance(command, EmergencyStop)
-            assert state.belief.ground_m is not None
-            ground_z_m[t_s] = state.belief.ground_m[2]
+            assert state.belief.takeoff_position_m is not None
+            ground_z_m[t_s] = state.belief.takeoff_position_m[2]
             if isinstance(command, StopMotors):
                 floor = on_the_floor(
-                    seen, ground_z_m, state.entry.position_m[2] - state.belief.ground_m[2]
+                    seen, ground_z_m, state.entry.position_m[2] - state.belief.takeoff_position_m[2]
                 )
                 assert floor or ((begin or state.released_s) and on_the_ceiling(seen))
                 return
@@ -205,7 +205,7 @@ def test_the_supervisors_word_has_no_age(bit: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("below_m", "ends", "words"),
+    ("distance_below_m", "ends", "words"),
     [
         (0.0, Phase.PERCHED, "hanging"),
         (0.08, Phase.PERCHED, "hanging"),  # as far as an old estimate may have drifted
@@ -214,10 +214,10 @@ def test_the_supervisors_word_has_no_age(bit: int) -> None:
     ],
 )
 def test_what_has_not_come_down_hangs_where_the_target_is(
-    below_m: float, ends: Phase, words: str
+    distance_below_m: float, ends: Phase, words: str
 ) -> None:
     """Its own landing ended up there, motors off."""
-    z_m = HANG_Z_M - below_m
+    z_m = HANG_Z_M - distance_below_m
     target = target_at(BEGIN_S, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
     begin = landing(z_m, orders=3, ordered_s=9.9)
     state = fly(begin, at(z_m, obs={"target": target}, **OFF), 2.4).state
@@ -232,17 +232,21 @@ class InAHand(Motors):
     """A hand holds it so far below the target, whatever its motors do."""
 
     def __init__(
-        self, below_m: float, aside_m: float = 0.0, sigma_m: float = 1e-3,
+        self, distance_below_m: float, lateral_offset_m: float = 0.0, sigma_m: float = 1e-3,
         seen_until_s: float = math.inf,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.below_m, self.aside_m, self.sigma_m = below_m, aside_m, sigma_m
+        self.distance_below_m, self.lateral_offset_m, self.sigma_m = (
+            distance_below_m,
+            lateral_offset_m,
+            sigma_m,
+        )
         self.seen_until_s = seen_until_s
 
     def look(self, t_s: float, state: PlannerState) -> Observation:
-        at_m = (self.aside_m, 0.0, HANG_Z_M - self.below_m)
+        at_m = (self.lateral_offset_m, 0.0, HANG_Z_M - self.distance_below_m)
         target = target_at(
-            t_s, body_m=at_m, sigma_m=np.full(3, self.sigma_m), tracked=self.below_m > 0.1
+            t_s, body_m=at_m, sigma_m=np.full(3, self.sigma_m), tracked=self.distance_below_m > 0.1
         )
         unseen_s = max(0.0, t_s - self.seen_until_s)
         if unseen_s:
@@ -280,7 +284,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
 
 
 @pytest.mark.parametrize(
-    ("below_m", "aside_m", "sigma_m", "to"),
+    ("distance_below_m", "lateral_offset_m", "sigma_m", "to"),
     [
         (0.0, 0.0, 0.001, Phase.COMPLETE),
         (0.04, 0.02, 0.001, Phase.COMPLETE),
@@ -291,22 +295,29 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
     ],
 )
 def test_only_what_hangs_at_the_target_is_caught(
-    below_m: float, aside_m: float, sigma_m: float, to: Phase
+    distance_below_m: float, lateral_offset_m: float, sigma_m: float, to: Phase
 ) -> None:
-    begin = landing(HANG_Z_M - below_m, Phase.RECOVER, contact_z_m=HANG_Z_M - below_m)
-    assert fly(begin, InAHand(below_m, aside_m, sigma_m), 2.18, feels=True).state.phase is to
+    begin = landing(
+        HANG_Z_M - distance_below_m, Phase.RECOVER, contact_z_m=HANG_Z_M - distance_below_m
+    )
+    assert (
+        fly(
+            begin, InAHand(distance_below_m, lateral_offset_m, sigma_m), 2.18, feels=True
+        ).state.phase
+        is to
+    )
 
 
 class BacksOff(Motors):
     """Pressed out of sight of the target, and backed off from; what it touched holds it. The
     estimate goes on sliding, by 2 cm/s."""
 
-    def __init__(self, aside_m: float, sigma_m: float) -> None:
+    def __init__(self, lateral_offset_m: float, sigma_m: float) -> None:
         super().__init__(1.2 * HOVER_THRUST)
-        self.aside_m, self.sigma_m = aside_m, sigma_m
+        self.lateral_offset_m, self.sigma_m = lateral_offset_m, sigma_m
 
     def look(self, t_s: float, state: PlannerState) -> Observation:
-        body_m = (self.aside_m + 0.02 * max(0.0, t_s - 10.5), 0.0, HANG_Z_M)
+        body_m = (self.lateral_offset_m + 0.02 * max(0.0, t_s - 10.5), 0.0, HANG_Z_M)
         target = target_at(
             t_s, body_m=body_m, sigma_m=np.full(3, self.sigma_m), measured=False, tracked=False,
             measured_s=10.0,
@@ -319,7 +330,7 @@ class BacksOff(Motors):
 
 
 @pytest.mark.parametrize(
-    ("aside_m", "sigma_m", "row", "ends", "outcome"),
+    ("lateral_offset_m", "sigma_m", "row", "ends", "outcome"),
     [
         (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
         (0.04, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
@@ -338,16 +349,16 @@ class BacksOff(Motors):
     ],
 )
 def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
-    aside_m: float, sigma_m: float, row: str, ends: Phase, outcome: Outcome
+    lateral_offset_m: float, sigma_m: float, row: str, ends: Phase, outcome: Outcome
 ) -> None:
     """Not by where the estimate slides to meanwhile, 4 cm farther aside."""
     begin = landing(HANG_Z_M, Phase.PERCH)
-    flight = fly(begin, BacksOff(aside_m, sigma_m), 16.0, feels=True)
+    flight = fly(begin, BacksOff(lateral_offset_m, sigma_m), 16.0, feels=True)
     assert {"beside-the-magnet", row} <= flight.rows
     assert (flight.state.phase, flight.state.outcome) == (ends, outcome)
     if ends is Phase.PERCHED:
         assert flight.state.belief.contact is not None
-        assert flight.state.belief.contact.aside_m == pytest.approx(aside_m)
+        assert flight.state.belief.contact.lateral_offset_m == pytest.approx(lateral_offset_m)
 
 
 # --- Where it touched, as it is remembered -------------------------------------------------------
@@ -420,7 +431,12 @@ def test_a_completion_whose_telemetry_stands_still_ends(
 ) -> None:
     """The supervisor's word, or the thrust, reads as before the stop. Nothing spins up again."""
     stopped = hanging(
-        Phase.COMPLETE, reach_s=9.0, released_s=9.0, stopped_s=10.0, ordered_s=10.0, orders=1
+        Phase.COMPLETE,
+        in_reach_since_s=9.0,
+        released_s=9.0,
+        stopped_s=10.0,
+        ordered_s=10.0,
+        orders=1,
     )
     flight = fly(stopped, at(HANG_Z_M, **frozen), 50.0, PROFILES[positioning], feels=True)
     assert all(isinstance(command, StopMotors | Idle) for command in flight.commands)
@@ -450,7 +466,7 @@ def test_nothing_is_caught_on_an_old_speed() -> None:
     slipped = landing(HANG_Z_M, Phase.RECOVER, catch_above_m=1.0, setpoint=below)
     late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
     _, command = step_mission(slipped, late(10.08), PROFILE)
-    assert is_setpoint(command, below_m=HANG_Z_M + 0.1)
+    assert is_setpoint(command, distance_below_m=HANG_Z_M + 0.1)
 
 
 # --- A step of the estimate -------------------------------------------------------------
@@ -464,9 +480,9 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
     remembered moves with the estimate."""
     state = landing(1.0, last=telemetry(10.0, 1.0))
     new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
-    assert state.belief.ground_m is not None
-    assert new.belief.ground_m is not None
-    assert new.belief.ground_m[2] - state.belief.ground_m[2] == pytest.approx(
+    assert state.belief.takeoff_position_m is not None
+    assert new.belief.takeoff_position_m is not None
+    assert new.belief.takeoff_position_m[2] - state.belief.takeoff_position_m[2] == pytest.approx(
         -0.98 if moves else 0.0
     )
     assert not moves or new.entry.position_m[2] == pytest.approx(
@@ -484,8 +500,8 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
     slow = at(0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
     state, command = step_mission(state, slow(10.14), PROFILE)
     assert isinstance(command, Land)
-    assert state.belief.ground_m is not None
-    assert command.height_m < state.belief.ground_m[2]
+    assert state.belief.takeoff_position_m is not None
+    assert command.height_m < state.belief.takeoff_position_m[2]
 
 
 # --- Its own landing -----------------------------------------------------------------
@@ -557,5 +573,5 @@ def test_what_stands_still_is_telemetry_that_grows_old(frozen: dict[str, Any]) -
     felt(at()(BEGIN_S))
     flight = fly(landing(1.0, Phase.ALIGN), at(**frozen), 1.4, feels=felt, one_phase=True)
     assert flight.state.row == "telemetry-stale"
-    stale_s = PROFILE.safety.telemetry_land_s
-    assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(stale_s, abs=0.1)
+    last_stale_s = PROFILE.safety.telemetry_land_s
+    assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(last_stale_s, abs=0.1)

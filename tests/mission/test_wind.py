@@ -23,14 +23,17 @@ BRIEFLY = settings(max_examples=5)  # each flies for seconds
 
 
 def blown(
-    aside_m: float, reads_mps: float = 0.0, towards_rad: float = 0.0, flown_mps: float = 0.0
+    lateral_offset_m: float,
+    reads_mps: float = 0.0,
+    towards_rad: float = 0.0,
+    flown_mps: float = 0.0,
 ) -> Look:
     """A vehicle beside its target, or on its way there at `flown_mps`, whose estimated velocity is
     off by `reads_mps`."""
     cos, sin = math.cos(towards_rad), math.sin(towards_rad)
 
     def look(t_s: float) -> Observation:
-        away_m = aside_m - flown_mps * (t_s - BEGIN_S)
+        away_m = lateral_offset_m - flown_mps * (t_s - BEGIN_S)
         speed_mps = reads_mps - flown_mps
         body_m = (away_m * cos, away_m * sin, 1.0)
         sample = telemetry(
@@ -67,16 +70,16 @@ def test_a_motion_that_positions_show_stays_one(flown_mps: float, towards_rad: f
 
 
 @BRIEFLY
-@given(aside_m=st.floats(0.07, 0.35), towards_rad=st.floats(-3.1, 3.1))
+@given(lateral_offset_m=st.floats(0.07, 0.35), towards_rad=st.floats(-3.1, 3.1))
 def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
-    aside_m: float, towards_rad: float
+    lateral_offset_m: float, towards_rad: float
 ) -> None:
     """The setpoint goes on to the other side of the target until the vehicle follows."""
-    flight = fly(state_in(Phase.ALIGN), blown(aside_m, 0.0, towards_rad), 1.5, MOCAP)
+    flight = fly(state_in(Phase.ALIGN), blown(lateral_offset_m, 0.0, towards_rad), 1.5, MOCAP)
     x_m, y_m = flight.state.integral_m
     along_m = x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
     gain = MOCAP.planner.integral_per_s * 1.5
-    assert along_m == pytest.approx(-min(gain * aside_m, MOST_TRIM_M), rel=0.1)
+    assert along_m == pytest.approx(-min(gain * lateral_offset_m, MOST_TRIM_M), rel=0.1)
 
 
 @BRIEFLY
@@ -88,11 +91,13 @@ def test_an_offset_on_the_way_is_not_trimmed(flown_mps: float) -> None:
 
 
 @BRIEFLY
-@given(aside_m=st.floats(-0.25, 0.25), towards_rad=st.floats(-3.1, 3.1))
-def test_what_holds_it_in_the_wind_goes_down_with_it(aside_m: float, towards_rad: float) -> None:
+@given(lateral_offset_m=st.floats(-0.25, 0.25), towards_rad=st.floats(-3.1, 3.1))
+def test_what_holds_it_in_the_wind_goes_down_with_it(
+    lateral_offset_m: float, towards_rad: float
+) -> None:
     """The setpoint of a vehicle that stands 0.25 m beside it is beside it by as much on the way
     down; anchored where the vehicle is, it would go on by another 0.25 m."""
-    look, lands_s = blown(aside_m, 0.0, towards_rad), BEGIN_S + 0.5
+    look, lands_s = blown(lateral_offset_m, 0.0, towards_rad), BEGIN_S + 0.5
 
     def lands(t_s: float) -> Observation:
         operator = Operator.LAND if t_s > lands_s else Operator.NONE
@@ -163,4 +168,4 @@ def test_a_push_that_no_sight_corrects_is_a_motion_and_no_bias(push_g: float) ->
     last = flight.state.belief.reckoning
     assert last.bias_mps2[0] == pytest.approx(first.bias_mps2[0], abs=1e-6)
     way_m = 0.5 * 9.81 * push_g * 0.5**2
-    assert first.aside_m[0] - last.aside_m[0] == pytest.approx(way_m, rel=0.1)
+    assert first.lateral_offset_m[0] - last.lateral_offset_m[0] == pytest.approx(way_m, rel=0.1)

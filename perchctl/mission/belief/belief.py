@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from perchctl.geometry import Array
-from perchctl.mission.belief.battery import EnergyState
+from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.evidence import Condition
-from perchctl.mission.belief.maneuver import Maneuver, Sent
+from perchctl.mission.belief.maneuver import Maneuver, SentOrders
 from perchctl.mission.belief.motion import ZERO, ImuMotion, Vector
 from perchctl.mission.belief.mounting import MountingMonitor
 from perchctl.mission.belief.reckoning import DeadReckoning
@@ -26,20 +26,20 @@ from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
-POSITION_RETURNS_S = 0.5
+POSITION_SETTLING_S = 0.5
 """Time after a gap during which new positions pull the estimate back, s. Smaller: the estimate is
 trusted before it has converged."""
-CORRECTED_S = 0.13
+MAX_CORRECTION_AGE_S = 0.13
 """How much older than the camera's latency the newest position may be while it still corrects the
 estimate, s: three pictures at 30 per second. Larger: `is_displaced` reacts to a blow later."""
-DISPLACED_MPS = 0.2
+MIN_GUST_SPEED_MPS = 0.2
 """Speed gained without a sighting that counts as a blow or gust, m/s; flights without a fault show
 0.06 m/s. Larger: a blow goes unnoticed. Smaller: an attitude error counts as a blow."""
-SWINGS_BY_LATENCY = 2.0
-"""Increase of the `DISPLACED_MPS` threshold, in m/s per second of the latency's standard deviation:
-if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an uncertain latency,
-blows go unnoticed."""
-THRUST_REPORT_S = 0.2
+GUST_SPEED_PER_LATENCY_SIGMA_MPS2 = 2.0
+"""Increase of the `MIN_GUST_SPEED_MPS` threshold, in m/s per second of the latency's standard
+deviation: if pictures are 0.1 s later than assumed, the vehicle oscillates. Larger: with an
+uncertain latency, blows go unnoticed."""
+THRUST_REPORT_DELAY_S = 0.2
 """Time within which the telemetry reports an ordered raw thrust, s. Smaller: late telemetry looks
 like a thrust that the vehicle does not follow."""
 
@@ -49,19 +49,19 @@ class ContactOffset:
     """Distance of the gear from the target's axis at a touch, m, and its standard deviation, m,
     which is infinite if unknown."""
 
-    aside_m: float
+    lateral_offset_m: float
     sigma_m: float
 
     def is_within(self, radius_m: float) -> bool:
         """True if the gear was within `radius_m` of the axis even at one standard deviation."""
-        return self.aside_m + self.sigma_m <= radius_m
+        return self.lateral_offset_m + self.sigma_m <= radius_m
 
     @property
     def text(self) -> str:
         """The offset in words, for example ``1.8 +- 0.6 mm off centre``."""
         if not math.isfinite(self.sigma_m):
             return "at an unknown distance from the centre"
-        return f"{1e3 * self.aside_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
+        return f"{1e3 * self.lateral_offset_m:.1f} +- {1e3 * self.sigma_m:.1f} mm off centre"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -73,15 +73,15 @@ class Belief:
 
     obs: Observation  #: newest observation, on which all properties depend
     profile: Profile
-    sent: Sent = field(default_factory=lambda: Sent(maneuver=Maneuver()))
+    sent: SentOrders = field(default_factory=lambda: SentOrders(maneuver=Maneuver()))
     t_s: float = 0.0  #: time of the last update
     last: Telemetry | None = None  #: newest sample that an update has used
 
     # --- world frame of the state estimate, and how far to trust it ---
-    ground_m: Vector | None = None  #: position where the flight started
-    jump_s: float | None = None  #: first jump of the state estimate
-    shift_m: Vector = ZERO  #: motion of the estimate's world frame in this tick
-    stale_s: float | None = None  #: last time at which the position was stale
+    takeoff_position_m: Vector | None = None  #: position where the flight started
+    first_jump_s: float | None = None  #: first jump of the state estimate
+    frame_shift_m: Vector = ZERO  #: motion of the estimate's world frame in this tick
+    last_stale_s: float | None = None  #: last time at which the position was stale
     #: external positions lead away from the setpoint and count as no evidence from then on
     diverged: bool = False
     #: heading is so wrong that position control would leave its setpoint
@@ -92,33 +92,35 @@ class Belief:
 
     # --- motion, target and contact ---
     reckoning: DeadReckoning = field(default_factory=DeadReckoning)
-    last_target_m: Array | None = None  #: target's world position in its last measured frame
+    last_target_world_m: Array | None = None  #: target's world position in its last measured frame
     target_spread_m: float = 0.0  #: distance between the targets of successive frames
     #: vehicle's velocity from pictures alone
     target_motion: TargetMotion = field(default_factory=TargetMotion)
     mounting: MountingMonitor = field(default_factory=MountingMonitor)
     contact_z_m: float | None = None  #: height of the body where the magnet may hold it
     contact: ContactOffset | None = None  #: offset at the last contact
-    reach_s: float | None = None  #: time since which the gear is within the magnet's reach
+    in_reach_since_s: float | None = None  #: time since which the gear is within the magnet's reach
     #: start time of each true condition
     since: dict[Condition[Any], float] = field(default_factory=dict)
 
     # --- thrust and battery ---
     hover: HoverThrust = field(default_factory=HoverThrust)
     #: thrust that the rotors produce, 0..65535; None before a sample
-    lagged_thrust: float | None = None
+    rotor_thrust: float | None = None
     #: time since which the reported thrust differs from the ordered one
-    unanswered_s: float | None = None
-    #: last tick in which that difference was older than `THRUST_REPORT_S`
-    unread_s: float = -math.inf
-    energy: EnergyState = field(default_factory=EnergyState)  #: state of the battery fit
+    thrust_mismatch_since_s: float | None = None
+    #: last tick in which that difference was older than `THRUST_REPORT_DELAY_S`
+    last_thrust_mismatch_s: float = -math.inf
+    energy: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
     @classmethod
     def on_ground(cls, obs: Observation, profile: Profile) -> Belief:
         """Return the belief about a vehicle that stands at its take-off position."""
-        return cls(obs=obs, profile=profile, t_s=obs.t_s, ground_m=obs.telemetry.position_m)
+        return cls(
+            obs=obs, profile=profile, t_s=obs.t_s, takeoff_position_m=obs.telemetry.position_m
+        )
 
-    def seen(self, obs: Observation, profile: Profile) -> Belief:
+    def with_observation(self, obs: Observation, profile: Profile) -> Belief:
         """Return the same belief with a newer observation that no update has used yet."""
         return replace(self, obs=obs, profile=profile)
 
@@ -145,7 +147,7 @@ class Belief:
         return self.obs.t_s - self.obs.telemetry.t_s
 
     @cached_property
-    def imu_proves(self) -> bool:
+    def is_imu_fresh(self) -> bool:
         """True if attitude, acceleration and thrust are recent enough to count as evidence."""
         return self.attitude_age_s <= self.profile.safety.proof_age_s
 
@@ -154,7 +156,7 @@ class Belief:
         """Age of the oldest part of the telemetry, s; a frozen reading is as old as its first
         sample."""
         tel, imu = self.obs.telemetry, self.obs.imu
-        oldest_s = max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
+        oldest_s = max(tel.behind_s, imu.stuck_attitude_s, imu.stuck_position_s)
         return self.obs.t_s - tel.t_s + oldest_s
 
     @cached_property
@@ -165,7 +167,7 @@ class Belief:
     # --- Reliability of the position ---
 
     @cached_property
-    def by_target(self) -> bool:
+    def is_target_positioned(self) -> bool:
         """True if the positions come from the target itself, without a deck or motion capture."""
         return self.profile.positioning.source.is_target
 
@@ -173,7 +175,7 @@ class Belief:
     def velocity_variance_m2ps2(self) -> float:
         """Variance of the estimated velocity, (m/s)^2; infinite if unknown, 0 if `link.unreported`
         says that the vehicle does not report it."""
-        return self._reported(self.obs.telemetry.velocity_variance_m2ps2)
+        return self._variance_or_default(self.obs.telemetry.velocity_variance_m2ps2)
 
     @cached_property
     def position_variance_m2(self) -> float:
@@ -182,15 +184,17 @@ class Belief:
         vehicle does not report it."""
         tel = self.obs.telemetry
         by_deck = self.profile.positioning.source.is_deck
-        return self._reported(tel.height_variance_m2 if by_deck else tel.position_variance_m2)
+        return self._variance_or_default(
+            tel.height_variance_m2 if by_deck else tel.position_variance_m2
+        )
 
-    def _reported(self, variance: float | None) -> float:
+    def _variance_or_default(self, variance: float | None) -> float:
         if variance is None:
             return 0.0 if "variance" in self.profile.link.unreported else math.inf
         return variance if variance >= 0.0 else math.inf
 
     @cached_property
-    def is_unsure(self) -> bool:
+    def is_variance_too_large(self) -> bool:
         """True if the variance of velocity or position is too large for position control."""
         safety = self.profile.safety
         return (
@@ -207,24 +211,27 @@ class Belief:
         return self.obs.position_age_s
 
     @cached_property
-    def position_is_stale(self) -> bool:
+    def is_position_stale(self) -> bool:
         """True if the position is too old for position control (fault 10)."""
         return self.position_age_s > self.profile.positioning.hold_s
 
     @cached_property
-    def position_trusted(self) -> bool:
+    def is_position_trusted(self) -> bool:
         """True if the estimated position and velocity can be trusted: positions have arrived for
-        `POSITION_RETURNS_S`, have not diverged and, if they come from pictures, agree with the
+        `POSITION_SETTLING_S`, have not diverged and, if they come from pictures, agree with the
         accelerometer."""
-        doubted = self.diverged or (self.by_target and self.obs.mismatch is not None)
-        returns = self.stale_s is not None and self.obs.t_s - self.stale_s <= POSITION_RETURNS_S
-        return not (doubted or self.position_is_stale or returns)
+        doubted = self.diverged or (self.is_target_positioned and self.obs.mismatch is not None)
+        returns = (
+            self.last_stale_s is not None
+            and self.obs.t_s - self.last_stale_s <= POSITION_SETTLING_S
+        )
+        return not (doubted or self.is_position_stale or returns)
 
     @cached_property
-    def position_valid(self) -> bool:
+    def is_position_valid(self) -> bool:
         """True if the position is trusted and the telemetry is recent enough to count as
         evidence."""
-        return self.position_trusted and self.proves
+        return self.is_position_trusted and self.proves
 
     @cached_property
     def latency_s(self) -> float:
@@ -232,60 +239,64 @@ class Belief:
         return self.profile.camera.start_latency_s + self.obs.delay_s
 
     @cached_property
-    def is_corrected(self) -> bool:
+    def is_velocity_corrected(self) -> bool:
         """True while the newest position still corrects the estimated velocity: it is at most
-        `CORRECTED_S` older than the latency."""
-        return self.position_age_s <= self.latency_s + CORRECTED_S
+        `MAX_CORRECTION_AGE_S` older than the latency."""
+        return self.position_age_s <= self.latency_s + MAX_CORRECTION_AGE_S
 
     @cached_property
     def is_displaced(self) -> bool:
         """True after a blow or gust that only the accelerometer has measured, until a sighting
         corrects the estimate. The firmware's estimator ignores lateral forces."""
         is_reckoned = self.reckoning.imu is not None
-        if not (self.by_target and is_reckoned and not self.is_corrected):
+        if not (self.is_target_positioned and is_reckoned and not self.is_velocity_corrected):
             return False
-        least_mps = DISPLACED_MPS + SWINGS_BY_LATENCY * self.obs.delay_sigma_s
-        return math.hypot(*self.reckoning.missed_mps) > least_mps
+        least_mps = MIN_GUST_SPEED_MPS + GUST_SPEED_PER_LATENCY_SIGMA_MPS2 * self.obs.delay_sigma_s
+        return math.hypot(*self.reckoning.imu_only_mps) > least_mps
 
     @cached_property
-    def is_doubtful(self) -> bool:
+    def is_flight_data_unreliable(self) -> bool:
         """True if the height, the telemetry stream or the control loop is unreliable."""
         safety = self.profile.safety
         return (
             self.obs.link_problem is not None
             or self.telemetry_age_s > safety.telemetry_hold_s
-            or self.jump_s is not None
+            or self.first_jump_s is not None
             or self.obs.loop_late_s > safety.loop_late_hold_s
         )
 
     @cached_property
-    def is_sighted(self) -> bool:
+    def can_descend_by_target(self) -> bool:
         """True if the position from the target is good enough for a descent."""
-        return self.position_trusted and not self.is_displaced and not self.is_doubtful
+        return (
+            self.is_position_trusted
+            and not self.is_displaced
+            and not self.is_flight_data_unreliable
+        )
 
     @cached_property
-    def has_lost_its_position(self) -> bool:
+    def has_lost_position(self) -> bool:
         """True if only accelerometer and attitude remain for a descent."""
-        if self.by_target:
-            return not self.is_sighted
-        return not (self.position_trusted or self.diverged)
+        if self.is_target_positioned:
+            return not self.can_descend_by_target
+        return not (self.is_position_trusted or self.diverged)
 
     @cached_property
-    def knows_its_place(self) -> bool:
+    def can_descend_by_position(self) -> bool:
         """True if the vehicle can descend under position control."""
         lost = self.diverged or self.dead_reckoned_s is not None
-        if lost or (self.by_target and not self.is_sighted):
+        if lost or (self.is_target_positioned and not self.can_descend_by_target):
             return False
         # Raw thrust needs a fresh vertical speed. Without one, the firmware's own landing remains.
         heard = self.attitude_age_s <= self.profile.safety.telemetry_hold_s
-        return not (self.heading_lost and (self.by_target or heard))
+        return not (self.heading_lost and (self.is_target_positioned or heard))
 
     # --- Motion ---
 
     @property
     def ground_z_m(self) -> float:
         """Height of the ground at the start of the flight, m; 0 if unknown."""
-        return self.ground_m[2] if self.ground_m else 0.0
+        return self.takeoff_position_m[2] if self.takeoff_position_m else 0.0
 
     @cached_property
     def height_m(self) -> float:
@@ -300,7 +311,7 @@ class Belief:
         return math.acos(max(-1.0, min(1.0, up)))
 
     @cached_property
-    def reads_one_g(self) -> bool:
+    def is_reading_one_g(self) -> bool:
         """True if the accelerometer reads 1 g within `perch.contact_acc_g`, as on any supported
         vehicle."""
         return abs(self.obs.telemetry.acc_z_g - 1.0) <= self.profile.planner.perch.contact_acc_g
@@ -310,7 +321,7 @@ class Belief:
         """Estimated velocity in world axes, m/s. While the position is valid, the bias that wind
         adds to the estimate is subtracted."""
         vx_mps, vy_mps, vz_mps = self.obs.telemetry.velocity_mps
-        if self.position_valid:
+        if self.is_position_valid:
             bias_x_mps, bias_y_mps = self.reckoning.velocity_bias_mps
             vx_mps, vy_mps = vx_mps - bias_x_mps, vy_mps - bias_y_mps
         return vx_mps, vy_mps, vz_mps
@@ -325,7 +336,7 @@ class Belief:
         """Vertical speed, m/s: from the state estimate while it is valid, otherwise from the
         accelerometer."""
         is_reckoned = self.reckoning.imu is not None
-        if is_reckoned and (self.dead_reckoned_s is not None or not self.position_valid):
+        if is_reckoned and (self.dead_reckoned_s is not None or not self.is_position_valid):
             return self.reckoning.velocity_mps[2]
         return self.obs.telemetry.velocity_mps[2]
 
@@ -338,7 +349,7 @@ class Belief:
         if self.climb_mps >= -mps:
             return False
         light_g = 1.0 - self.profile.planner.perch.contact_acc_g
-        return self.position_valid or self.obs.telemetry.acc_z_g < light_g
+        return self.is_position_valid or self.obs.telemetry.acc_z_g < light_g
 
     @property
     def hover_thrust(self) -> float:
@@ -346,9 +357,12 @@ class Belief:
         return self.hover.thrust
 
     @cached_property
-    def thrust_is_known(self) -> bool:
+    def is_thrust_known(self) -> bool:
         """True if the reported thrust follows the ordered thrust."""
-        return self.unanswered_s is None or self.obs.t_s - self.unanswered_s <= THRUST_REPORT_S
+        return (
+            self.thrust_mismatch_since_s is None
+            or self.obs.t_s - self.thrust_mismatch_since_s <= THRUST_REPORT_DELAY_S
+        )
 
     # --- The target ---
 
@@ -366,13 +380,13 @@ class Belief:
     @cached_property
     def sighting_age_s(self) -> float:
         """Seconds since the exposure of the last picture that shows the target."""
-        return max(0.0, self.obs.t_s - self.reckoning.sight_s)
+        return max(0.0, self.obs.t_s - self.reckoning.sighting_s)
 
     @cached_property
-    def camera_is_proven(self) -> bool:
+    def is_camera_consistent(self) -> bool:
         """True if the motion in the pictures agrees with the vehicle's: with its accelerometer if
         the target is the positioning system, otherwise with its state estimate."""
-        if self.by_target:
+        if self.is_target_positioned:
             return self.obs.felt is not None and self.obs.mismatch is None
         return not (self.mounting.is_unconfirmed or self.mounting.is_wrong)
 
@@ -380,4 +394,4 @@ class Belief:
     def is_in_magnet_reach(self) -> bool:
         """True if the magnet may hold the vehicle: after a contact, or once dead reckoning places
         the gear within its reach."""
-        return self.contact_z_m is not None or self.reach_s is not None
+        return self.contact_z_m is not None or self.in_reach_since_s is not None

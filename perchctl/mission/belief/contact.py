@@ -6,12 +6,12 @@ thrust. Thrust far from hover thrust, at 1 g and at rest, is therefore a contact
 the vehicle presses, with less something supports it. The vehicle's position and its maneuver then
 distinguish the magnet from the floor, and both from another object.
 
-One threshold decides whether the thrust exceeds hover thrust (`exceeds_hover_thrust`). A vehicle at
-rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
+One threshold decides whether the thrust exceeds hover thrust (`is_above_hover_thrust`). A vehicle
+at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
 height (`CONTACT`), against an obstacle if its setpoint is above it (`BLOCKED`), and against an
-unknown object without a position (`CARRIED`, which also covers too little thrust). `HANGING`,
-`MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to support the vehicle
-(`is_carried_by_other_than_thrust`).
+unknown object without a position (`SUPPORTED_BY_IMU`, which also covers too little thrust).
+`HANGING`, `MAGNET_HOLDS` and `ON_FLOOR` require a thrust too small to support the vehicle
+(`is_thrust_too_low_to_fly`).
 """
 
 from __future__ import annotations
@@ -19,85 +19,85 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.belief.belief import Belief, ContactOffset
-from perchctl.mission.belief.evidence import Condition, Rests
-from perchctl.mission.belief.thrust import LEAST_POSITION_THRUST
+from perchctl.mission.belief.evidence import Condition, Dependency
+from perchctl.mission.belief.thrust import MIN_POSITION_MODE_THRUST
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
-PRESSING_RATIO = 1.08
+PRESS_THRUST_RATIO = 1.08
 """Multiple of hover thrust above which a vehicle at rest is pressing: more than five standard
 deviations of the hover thrust learned in quiet flight. Larger: a weak press goes undetected.
 Smaller: a gust or a sagging battery looks like a press."""
-PRESS_SATURATED_PART = 0.98
+PRESS_SATURATION_FRACTION = 0.98
 """Share of full thrust above which the motors are saturated, so that the thrust no longer shows how
 much the vehicle needs."""
-MOST_RAW = 60000.0
+MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
-PROVABLE = 0.99
+PRESS_PROOF_FRACTION = 0.99
 """Share of a raw press's ordered thrust that always counts as pressing. Larger: a reading just
 below the ordered thrust goes undetected. Smaller: a heavy vehicle seems to press while it
 hovers."""
-LITTLE_LEFT = 0.93
+MAX_PROVABLE_HOVER_FRACTION = 0.93
 """Hover thrust, as a share of full thrust, above which more thrust is no evidence of a press.
 Smaller: a press is never detected on a heavy vehicle."""
-MOST_HOLDING = 0.8
+MAX_NON_LIFTING_FRACTION = 0.8
 """Share of hover thrust up to which thrust cannot hold the vehicle in the air; above it, the ground
 effect of the ceiling may."""
-STILL_MOTORS_THRUST = 5000
+MAX_MOTORS_STOPPED_THRUST = 5000
 """Largest raw thrust, 0..65535, at which the motors stand still."""
-LEAST_HOVER = 1000
+MIN_HOVER_THRUST = 1000
 """Raw thrust, 0..65535, below which nothing flies."""
 
 # --- motion and position ---
-MOTIONLESS_MPS = 0.05
+MAX_MOTIONLESS_CLIMB_MPS = 0.05
 """Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow sink looks like
 hanging."""
-QUIET_MPS = 0.3
+MAX_HOVER_SPEED_MPS = 0.3
 """Largest speed at which the thrust is hover thrust, m/s."""
-QUIET_CLIMB_MPS = 0.27
+MAX_HOVER_CLIMB_MPS = 0.27
 """Largest vertical speed at which the thrust is hover thrust, m/s."""
-QUIET_G = 0.1
+MAX_HOVER_ACCELERATION_G = 0.1
 """Largest deviation of the specific force from 1 g at which the thrust is hover thrust, g."""
-CARRIED_ON_MPS = 0.1
+PRESS_HEIGHT_DRIFT_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
-PRESSED_M = 0.08
+MIN_PRESS_SETPOINT_HEIGHT_M = 0.08
 """Distance of the setpoint above a motionless vehicle that makes it press, m. Larger: a blocked
 climb is detected late."""
-TOUCHES_M = 0.001
+TOUCH_SIGMA_M = 0.001
 """Distance by which the touch itself moves the gear, m."""
-SHAKEN_M = 0.002
+IMPACT_SIGMA_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
-SLIDES_MPS = 0.01
+DECK_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
-DRIFTED_M = 0.02
+MAX_UPWARD_DRIFT_M = 0.02
 """Upward drift of the estimate in spite of which a slip is still detected, m."""
-DESCENDED_M = 0.1
+MIN_DESCENT_M = 0.1
 """Distance below its start at which a descent counts as under way, m."""
-HELD_WITHIN_M = 0.1
+MAX_HELD_DESCENT_M = 0.1
 """Distance from its start within which a vehicle in a descent may still be held there, m."""
-OFF_FLOOR_M = 0.3
+MAX_FLOOR_SUPPORT_HEIGHT_M = 0.3
 """Height above which the floor cannot be the support, m."""
-OFF_GROUND_M = 0.15
+MIN_BLOCKED_HEIGHT_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
-STANDING_BELOW_M = 0.1
+MAX_STANDING_HEIGHT_M = 0.1
 """Height below which a vehicle may still stand on the ground instead of pressing, m."""
-AT_TARGET_M = 0.15
+MAX_HANGING_ERROR_Z_M = 0.15
 """Largest height difference to the target at which the vehicle may hang on its magnet, m."""
-NEAR_TARGET_M = 0.3
+FLOOR_EXCLUDED_ERROR_Z_M = 0.3
 """Height difference to the target within which the vehicle cannot stand on the floor, m."""
-FALLING_MPS = -0.05
+RELEASED_FALL_MPS = -0.05
 """Vertical speed below which a released vehicle with a low specific force is falling, m/s."""
-SINKING_SLOWLY_MPS = -0.15
+FULL_THRUST_FALL_MPS = -0.15
 """Vertical speed below which a vehicle at full thrust is falling instead of being too weak to
 climb, m/s."""
 
 # --- time ---
-SUPERVISOR_S = 5.0
+MOTORS_OFF_TIMEOUT_S = 5.0
 """Time after a stop order from which the motors count as off, s: the flying bit stays set for 2
 s."""
-HANGING_S = 1.0
+HANGING_DWELL_S = 1.0
 """Time that the proof of a magnet's hold takes, s."""
 
 
@@ -109,10 +109,10 @@ def contact_offset(b: Belief) -> ContactOffset:
     deviation grows after the last sighting because the estimate drifts and the impact on the
     ceiling disturbs it."""
     reckoning = b.reckoning
-    sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
-    if b.profile.positioning.source.is_deck and b.position_valid:
-        sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * b.sighting_age_s)
-    return ContactOffset(math.hypot(*reckoning.aside_m), sigma_m)
+    sigma_m = math.hypot(reckoning.lateral_sigma_m, TOUCH_SIGMA_M, *reckoning.position_step_sum_m)
+    if b.profile.positioning.source.is_deck and b.is_position_valid:
+        sigma_m = math.hypot(sigma_m, IMPACT_SIGMA_M, DECK_SIGMA_GROWTH_MPS * b.sighting_age_s)
+    return ContactOffset(math.hypot(*reckoning.lateral_offset_m), sigma_m)
 
 
 def last_touch_offset(b: Belief) -> ContactOffset | None:
@@ -121,8 +121,8 @@ def last_touch_offset(b: Belief) -> ContactOffset | None:
     if not b.sent.maneuver.retreats or b.contact is None or b.target.is_fresh:
         return None
     x_m, y_m, _ = b.telemetry.position_m
-    away_m = math.hypot(x_m - b.sent.began_m[0], y_m - b.sent.began_m[1])
-    by_capture = b.profile.positioning.source.is_mocap and b.position_valid
+    away_m = math.hypot(x_m - b.sent.maneuver_start_m[0], y_m - b.sent.maneuver_start_m[1])
+    by_capture = b.profile.positioning.source.is_mocap and b.is_position_valid
     if by_capture and away_m > b.profile.planner.perch.contact_xy_m:
         return None
     return b.contact
@@ -142,7 +142,7 @@ def possible_contact_tolerance_m(b: Belief) -> float:
     drift of the estimated height.
     """
     planner = b.profile.planner
-    drift_mps = CARRIED_ON_MPS if b.by_target else planner.landing.drift_mps
+    drift_mps = PRESS_HEIGHT_DRIFT_MPS if b.is_target_positioned else planner.landing.drift_mps
     return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * b.sighting_age_s)
 
 
@@ -163,7 +163,7 @@ def is_at_target(b: Belief) -> bool:
 def max_press_thrust(profile: Profile) -> float:
     """Return the largest thrust that a press can reach, 0..65535."""
     perch = profile.planner.perch
-    return min(float(perch.thrust), MOST_RAW) if perch.mode == "raw" else FULL_THRUST
+    return min(float(perch.thrust), MAX_RAW_THRUST) if perch.mode == "raw" else FULL_THRUST
 
 
 def is_hover_thrust(b: Belief) -> bool:
@@ -173,48 +173,48 @@ def is_hover_thrust(b: Belief) -> bool:
     vz = tel.velocity_mps[2]
     stuck = (
         setpoint is not None
-        and setpoint.z_m - tel.position_m[2] > PRESSED_M
-        and vz < MOTIONLESS_MPS
+        and setpoint.z_m - tel.position_m[2] > MIN_PRESS_SETPOINT_HEIGHT_M
+        and vz < MAX_MOTIONLESS_CLIMB_MPS
     )
     return (
         b.proves
-        and b.position_valid
-        and LEAST_HOVER <= tel.thrust < PRESS_SATURATED_PART * FULL_THRUST
-        and b.speed_mps < QUIET_MPS
-        and abs(vz) < QUIET_CLIMB_MPS
-        and abs(tel.acc_z_g - 1.0) < QUIET_G
+        and b.is_position_valid
+        and MIN_HOVER_THRUST <= tel.thrust < PRESS_SATURATION_FRACTION * FULL_THRUST
+        and b.speed_mps < MAX_HOVER_SPEED_MPS
+        and abs(vz) < MAX_HOVER_CLIMB_MPS
+        and abs(tel.acc_z_g - 1.0) < MAX_HOVER_ACCELERATION_G
         and not stuck
     )
 
 
-def is_carried_by_other_than_thrust(b: Belief) -> bool:
+def is_thrust_too_low_to_fly(b: Belief) -> bool:
     """True if the thrust is too small to support the vehicle.
 
-    The firmware's position mode does not go below `LEAST_POSITION_THRUST`. With strong motors this
-    is more than `hold_ratio` times the hover thrust, and then it is the limit.
+    The firmware's position mode does not go below `MIN_POSITION_MODE_THRUST`. With strong motors
+    this is more than `hold_ratio` times the hover thrust, and then it is the limit.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
-    if MOST_HOLDING * b.hover_thrust >= LEAST_POSITION_THRUST:
-        most = max(most, LEAST_POSITION_THRUST)
-    return b.thrust_is_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
+    if MAX_NON_LIFTING_FRACTION * b.hover_thrust >= MIN_POSITION_MODE_THRUST:
+        most = max(most, MIN_POSITION_MODE_THRUST)
+    return b.is_thrust_known and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
 
-def exceeds_hover_thrust(b: Belief) -> bool:
+def is_above_hover_thrust(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust or is close to its limit. The limit is the ordered
     thrust during a press by raw thrust, otherwise full thrust."""
-    most = PRESS_SATURATED_PART * FULL_THRUST
+    most = PRESS_SATURATION_FRACTION * FULL_THRUST
     if b.sent.maneuver.presses and b.sent.raw_thrust is not None:
-        most = PROVABLE * max_press_thrust(b.profile)
-    least = min(PRESSING_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
+        most = PRESS_PROOF_FRACTION * max_press_thrust(b.profile)
+    least = min(PRESS_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
     return b.telemetry.thrust >= least
 
 
 def is_pressing(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust and the vehicle does not move vertically."""
     return (
-        exceeds_hover_thrust(b)
-        and abs(b.telemetry.velocity_mps[2]) <= MOTIONLESS_MPS
-        and b.height_m >= STANDING_BELOW_M
+        is_above_hover_thrust(b)
+        and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS
+        and b.height_m >= MAX_STANDING_HEIGHT_M
     )
 
 
@@ -227,13 +227,15 @@ def is_slipping(b: Belief) -> bool:
     if b.contact_z_m is None or not b.is_sinking(complete.slip_mps):
         return False
     above_m = tel.position_m[2] - b.contact_z_m
-    return not b.position_valid or above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g
+    return (
+        not b.is_position_valid or above_m < MAX_UPWARD_DRIFT_M or tel.acc_z_g < complete.slip_acc_g
+    )
 
 
 def is_still(b: Belief) -> bool:
     """True if the vehicle is motionless and supported: the accelerometer reads 1 g."""
-    return b.reads_one_g and (
-        abs(b.telemetry.velocity_mps[2]) < MOTIONLESS_MPS or not b.position_valid
+    return b.is_reading_one_g and (
+        abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_MPS or not b.is_position_valid
     )
 
 
@@ -244,24 +246,23 @@ def _is_in_contact(b: Belief) -> bool:
     hover thrust, so the ceiling must take the difference.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
-    steady = abs(tel.velocity_mps[2]) <= MOTIONLESS_MPS and b.position_valid
+    steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_MPS and b.is_position_valid
     felt_s = b.obs.t_s - b.imu.steady_s
     return (
         abs(b.target.error_z_m)
-        <= perch.contact_z_m + (CARRIED_ON_MPS * b.sighting_age_s if b.by_target else 0)
+        <= perch.contact_z_m
+        + (PRESS_HEIGHT_DRIFT_MPS * b.sighting_age_s if b.is_target_positioned else 0)
         and (steady or felt_s >= perch.contact_dwell_s)
-        and b.reads_one_g
+        and b.is_reading_one_g
         and b.hover_thrust > 0
-        and b.thrust_is_known
-        and exceeds_hover_thrust(b)
+        and b.is_thrust_known
+        and is_above_hover_thrust(b)
     )
 
 
-def _magnet_holds(b: Belief) -> bool:
+def _is_magnet_holding(b: Belief) -> bool:
     return (
-        is_carried_by_other_than_thrust(b)
-        and not is_slipping(b)
-        and (b.position_valid or is_still(b))
+        is_thrust_too_low_to_fly(b) and not is_slipping(b) and (b.is_position_valid or is_still(b))
     )
 
 
@@ -269,7 +270,7 @@ def _is_weight_hanging(b: Belief) -> bool:
     """True if the motors stand still and the vehicle hangs where it made contact."""
     return (
         b.sent.released_s is not None
-        and (b.telemetry.thrust <= STILL_MOTORS_THRUST or not b.thrust_is_known)
+        and (b.telemetry.thrust <= MAX_MOTORS_STOPPED_THRUST or not b.is_thrust_known)
         and is_still(b)
         and not is_slipping(b)
     )
@@ -280,105 +281,113 @@ def _is_hanging(b: Belief) -> bool:
     small to support it. Without a position, a magnet cannot be distinguished from the floor; the
     slow release is safe for both."""
     tel, complete = b.telemetry, b.profile.planner.complete
-    if not b.position_valid:
-        return is_carried_by_other_than_thrust(b) and is_still(b)
-    held = is_carried_by_other_than_thrust(b) and b.height_m > OFF_FLOOR_M and is_still(b)
+    if not b.is_position_valid:
+        return is_thrust_too_low_to_fly(b) and is_still(b)
+    held = is_thrust_too_low_to_fly(b) and b.height_m > MAX_FLOOR_SUPPORT_HEIGHT_M and is_still(b)
     if not b.sent.maneuver.descends:
         return held
     at_contact = (
         b.contact_z_m is not None and abs(tel.position_m[2] - b.contact_z_m) <= complete.slip_m
     )
-    at_target = b.obs.target is not None and abs(b.target.error_z_m) <= AT_TARGET_M
-    stayed = b.sent.began_m[2] - tel.position_m[2] < HELD_WITHIN_M and not b.target.is_far_above
+    at_target = b.obs.target is not None and abs(b.target.error_z_m) <= MAX_HANGING_ERROR_Z_M
+    stayed = (
+        b.sent.maneuver_start_m[2] - tel.position_m[2] < MAX_HELD_DESCENT_M
+        and not b.target.is_far_above
+    )
     return held and (at_contact or at_target or stayed)
 
 
-def _is_down(b: Belief) -> bool:
+def _has_stopped_motors(b: Belief) -> bool:
     """True if the motors are off and the supervisor confirms it, or its flying bit is overdue."""
     stopped_s = b.sent.stopped_s
-    long_off = stopped_s is not None and b.obs.t_s - stopped_s > SUPERVISOR_S
+    long_off = stopped_s is not None and b.obs.t_s - stopped_s > MOTORS_OFF_TIMEOUT_S
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
 
 def _is_on_floor(b: Belief) -> bool:
     """True if the vehicle is motionless at a thrust too small to support it, and is low or has come
     down. The height alone is not enough: a drifting estimate may place the floor anywhere."""
-    near_target = b.obs.target is not None and abs(b.target.error_z_m) <= NEAR_TARGET_M
-    came_down_m = b.sent.began_m[2] - b.telemetry.position_m[2]
-    came_down = b.sent.maneuver.descends and came_down_m > DESCENDED_M
+    near_target = b.obs.target is not None and abs(b.target.error_z_m) <= FLOOR_EXCLUDED_ERROR_Z_M
+    came_down_m = b.sent.maneuver_start_m[2] - b.telemetry.position_m[2]
+    came_down = b.sent.maneuver.descends and came_down_m > MIN_DESCENT_M
     handover_m = b.profile.planner.landing.handover_m
     low = b.height_m < handover_m or (came_down and b.contact_z_m is None)
-    return is_carried_by_other_than_thrust(b) and low and not near_target and is_still(b)
+    return is_thrust_too_low_to_fly(b) and low and not near_target and is_still(b)
 
 
 def _is_blocked(b: Belief) -> bool:
     """True if the vehicle presses against an obstacle: the setpoint is above it, the thrust exceeds
     hover thrust or is at its limit, and nothing moves."""
     setpoint, tel = b.sent.setpoint, b.telemetry
-    if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
+    if setpoint is None or setpoint.z_m - tel.position_m[2] < MIN_PRESS_SETPOINT_HEIGHT_M:
         return False
-    strong = b.hover_thrust < LITTLE_LEFT * FULL_THRUST and exceeds_hover_thrust(b)
-    return strong and b.height_m > OFF_GROUND_M and is_still(b)
+    strong = b.hover_thrust < MAX_PROVABLE_HOVER_FRACTION * FULL_THRUST and is_above_hover_thrust(b)
+    return strong and b.height_m > MIN_BLOCKED_HEIGHT_M and is_still(b)
 
 
-def _is_carried_by_feel(b: Belief) -> bool:
+def _is_supported_by_imu(b: Belief) -> bool:
     """True if accelerometer and thrust alone show that something supports or presses the vehicle:
     in the air, thrust this far above or below hover thrust would make it climb or sink."""
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
-        0 < hover < LITTLE_LEFT * FULL_THRUST
-        and b.thrust_is_known
-        and (exceeds_hover_thrust(b) or tel.thrust <= (2.0 - PRESSING_RATIO) * hover)
-        and b.reads_one_g
+        0 < hover < MAX_PROVABLE_HOVER_FRACTION * FULL_THRUST
+        and b.is_thrust_known
+        and (is_above_hover_thrust(b) or tel.thrust <= (2.0 - PRESS_THRUST_RATIO) * hover)
+        and b.is_reading_one_g
         and b.obs.t_s - b.imu.steady_s >= perch.contact_dwell_s
     )
 
 
 def _is_saturated(b: Belief) -> bool:
-    full = b.telemetry.thrust >= PRESS_SATURATED_PART * FULL_THRUST
-    return full and SINKING_SLOWLY_MPS < b.climb_mps < MOTIONLESS_MPS
+    full = b.telemetry.thrust >= PRESS_SATURATION_FRACTION * FULL_THRUST
+    return full and FULL_THRUST_FALL_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_MPS
 
 
-CONTACT = Condition("contact", _is_in_contact, rests_on=Rests.POSITION)
+CONTACT = Condition("contact", _is_in_contact, depends_on=Dependency.POSITION)
 """Contact with the target, proven by position, acceleration and thrust."""
-MAGNET_HOLDS = Condition("magnet holds", _magnet_holds, rests_on=Rests.TELEMETRY)
+MAGNET_HOLDS = Condition("magnet holds", _is_magnet_holding, depends_on=Dependency.TELEMETRY)
 """The magnet holds the vehicle: low thrust, and no slip."""
 SLIPPING = Condition("slipping", is_slipping)
 """The vehicle falls away from the proven contact."""
-WEIGHT_HANGS = Condition("the whole weight hangs", _is_weight_hanging, rests_on=Rests.TELEMETRY)
+FULL_WEIGHT_HANGS = Condition(
+    "the whole weight hangs", _is_weight_hanging, depends_on=Dependency.TELEMETRY
+)
 """The whole weight hangs: the motors stand still, and nothing slips."""
-HANGING = Condition("hanging", _is_hanging, rests_on=Rests.POSITION)
+HANGING = Condition("hanging", _is_hanging, depends_on=Dependency.POSITION)
 """Something holds the vehicle up, off the floor."""
-DOWN = Condition("down", _is_down, rests_on=Rests.TELEMETRY)
+MOTORS_STOPPED = Condition("down", _has_stopped_motors, depends_on=Dependency.TELEMETRY)
 """The motors are off."""
-ON_FLOOR = Condition("on the floor", _is_on_floor, rests_on=Rests.POSITION)
+ON_FLOOR = Condition("on the floor", _is_on_floor, depends_on=Dependency.POSITION)
 """The vehicle stands on the floor."""
 BLOCKED = Condition("blocked", _is_blocked)
 """The vehicle presses against an obstacle below its setpoint."""
-CARRIED = Condition(
-    "carried or pressed, by feel", _is_carried_by_feel, lasts=True, rests_on=Rests.TELEMETRY
+SUPPORTED_BY_IMU = Condition(
+    "carried or pressed, by feel",
+    _is_supported_by_imu,
+    is_phase_independent=True,
+    depends_on=Dependency.TELEMETRY,
 )
 """Something supports or presses the vehicle, proven by accelerometer and thrust alone."""
 SATURATED_THRUST = Condition(
-    "thrust at its limit", _is_saturated, lasts=True, rests_on=Rests.TELEMETRY
+    "thrust at its limit", _is_saturated, is_phase_independent=True, depends_on=Dependency.TELEMETRY
 )
 """The thrust is at its limit, and the vehicle does not climb."""
 SUPPORT_CONDITIONS = (
     CONTACT,
     MAGNET_HOLDS,
     SLIPPING,
-    WEIGHT_HANGS,
+    FULL_WEIGHT_HANGS,
     HANGING,
-    DOWN,
+    MOTORS_STOPPED,
     ON_FLOOR,
     BLOCKED,
-    CARRIED,
+    SUPPORTED_BY_IMU,
     SATURATED_THRUST,
 )
 """All conditions of this module."""
 
 
-def counts(b: Belief, condition: Condition[Belief]) -> bool:
+def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     """True if the data that the condition depends on is fresh in this tick.
 
     With the target alone, the position of the last sighting can prove a press for a while. During a
@@ -388,14 +397,14 @@ def counts(b: Belief, condition: Condition[Belief]) -> bool:
     """
     if condition is HANGING and b.sent.maneuver.descends:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s
-    match condition.rests_on:
-        case Rests.NOTHING:
+    match condition.depends_on:
+        case Dependency.NOTHING:
             return True
-        case Rests.TELEMETRY:
-            return b.imu_proves
-        case Rests.POSITION:
-            reckons = condition is CONTACT and b.by_target and b.sent.maneuver.presses
-            return b.imu_proves and (b.position_valid or reckons)
+        case Dependency.TELEMETRY:
+            return b.is_imu_fresh
+        case Dependency.POSITION:
+            reckons = condition is CONTACT and b.is_target_positioned and b.sent.maneuver.presses
+            return b.is_imu_fresh and (b.is_position_valid or reckons)
 
 
 def has_slipped(b: Belief) -> bool:
@@ -403,6 +412,6 @@ def has_slipped(b: Belief) -> bool:
     fall."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = b.sent.released_s is not None and tel.acc_z_g < complete.slip_acc_g
-    if falls and b.imu_proves and b.climb_mps < FALLING_MPS:
+    if falls and b.is_imu_fresh and b.climb_mps < RELEASED_FALL_MPS:
         return True
     return b.held_s(SLIPPING) >= complete.slip_dwell_s

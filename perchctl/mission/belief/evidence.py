@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeVar
 
-Seen = TypeVar("Seen", contravariant=True)
+Knowledge = TypeVar("Knowledge", contravariant=True)
 
 
-class Rests(Enum):
+class Dependency(Enum):
     """Data that a condition depends on. The condition does not count while that data is old or
     unknown."""
 
@@ -25,22 +25,22 @@ class Rests(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Condition(Generic[Seen]):
+class Condition(Generic[Knowledge]):
     """A predicate on the current knowledge, evaluated once per tick by `holds`.
 
     Attributes:
         name: readable name, for `repr`.
         holds: function that returns True if the condition is true in this tick.
-        lasts: True if the condition describes the vehicle independently of its maneuver: a change
-            of phase or a hold does not reset its start time.
-        rests_on: data that must be fresh for the condition to count. A condition that may stop the
-            motors or end a flight depends at least on fresh telemetry.
+        is_phase_independent: True if the condition describes the vehicle independently of its
+            maneuver: a change of phase or a hold does not reset its start time.
+        depends_on: data that must be fresh for the condition to count. A condition that may stop
+            the motors or end a flight depends at least on fresh telemetry.
     """
 
     name: str
-    holds: Callable[[Seen], bool]
-    lasts: bool = False
-    rests_on: Rests = Rests.NOTHING
+    holds: Callable[[Knowledge], bool]
+    is_phase_independent: bool = False
+    depends_on: Dependency = Dependency.NOTHING
 
     def __repr__(self) -> str:
         return f"<condition: {self.name}>"
@@ -50,13 +50,13 @@ Since = Mapping[Condition, float]  # type: ignore[type-arg]  # conditions of sev
 
 
 def update_since(
-    old: Since, conditions: Iterable[Condition[Seen]], seen: Seen, now_s: float
-) -> dict[Condition[Seen], float]:
+    old: Since, conditions: Iterable[Condition[Knowledge]], seen: Knowledge, now_s: float
+) -> dict[Condition[Knowledge], float]:
     """Return the start time of each condition that is true for `seen`: the time in `old` if the
     condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
     return {each: old.get(each, now_s) for each in conditions if each.holds(seen)}
 
 
-def lasting(since: Since) -> dict[Condition, float]:  # type: ignore[type-arg]
+def keep_independent(since: Since) -> dict[Condition, float]:  # type: ignore[type-arg]
     """Return the entries that survive a change of phase or a hold."""
-    return {each: began_s for each, began_s in since.items() if each.lasts}
+    return {each: began_s for each, began_s in since.items() if each.is_phase_independent}

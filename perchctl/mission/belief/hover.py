@@ -3,9 +3,9 @@
 Hover thrust is the reference for every proof of contact and for a descent by raw thrust. In quiet
 flight, the measurement is the thrust itself (`learn_in_quiet_flight`). In a descent by raw thrust,
 it is the thrust divided by the specific force (`learn_in_descent`). Before either has happened,
-`best_estimate` falls back on the accelerometer, with a larger standard deviation. The estimate is
-wrong while something supports part of the weight undetected, and after a long descent by the scale
-error of the accelerometer.
+`estimate_hover_thrust` falls back on the accelerometer, with a larger standard deviation. The
+estimate is wrong while something supports part of the weight undetected, and after a long descent
+by the scale error of the accelerometer.
 """
 
 from __future__ import annotations
@@ -13,62 +13,66 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.thrust import FELT_SIGMA, LEAST_POSITION_THRUST, HoverThrust
+from perchctl.mission.belief.thrust import (
+    ACCELEROMETER_SIGMA,
+    MIN_POSITION_MODE_THRUST,
+    HoverThrust,
+)
 from perchctl.values import replace
 
-DESCENT_DRIFT = 0.067
+DESCENT_RANDOM_WALK = 0.067
 """Random walk of the hover thrust in a descent by raw thrust, as a share per square root of a
 second. Larger: vibration changes the thrust. Smaller: in wind, the vehicle sinks too fast for
 longer."""
-UNSURE_SIGMA = 0.12
+FALLBACK_SIGMA = 0.12
 """Standard deviation, as a share, of an estimate from the accelerometer alone while the vehicle may
 have been supported. Larger: a descent may correct the estimate further. Smaller: a wrong estimate
 persists."""
-DESCENT_SIGMA = 0.04
+MIN_DESCENT_SIGMA = 0.04
 """Smallest standard deviation, as a share, at the start of a descent. Larger: contact with an
 obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
-MOST_SIGMAS = 3.0
+MAX_DESCENT_CORRECTION_SIGMAS = 3.0
 """Largest correction during a descent, in standard deviations at its start. Larger: contact with an
 obstacle corrupts the estimate. Smaller: with a weak battery, the vehicle sinks too fast."""
-QUIET_WITHIN = 0.2
+MAX_QUIET_DEVIATION = 0.2
 """Largest difference, as a share, between the thrust in quiet flight and the estimate; a larger one
 means that the ceiling or a hand holds the vehicle. Larger: a held vehicle corrupts the estimate.
 Smaller: a real change is rejected."""
 ROTOR_LAG_S = 0.06
 """Time constant with which the rotors follow an ordered thrust, s (docs/firmware.md; 50 to 80 ms in
 real flights). Larger or smaller: a step of the thrust corrupts the hover thrust."""
-LATEST_S = 1.0
+MAX_TELEMETRY_AGE_S = 1.0
 """Age beyond which telemetry says nothing about the present thrust, s."""
-LEAST_FELT_G = 0.7
+MIN_SPECIFIC_FORCE_G = 0.7
 """Smallest specific force at which thrust divided by specific force measures hover thrust, g.
 Smaller: a fall corrupts the estimate."""
-MOST_FELT_G = 1.3
+MAX_SPECIFIC_FORCE_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: a blow corrupts the estimate."""
-LEAST_PROPORTIONAL_PART = 0.5
+MIN_PROPORTIONAL_FRACTION = 0.5
 """Share of the first hover thrust below which thrust is not proportional to force."""
-LEAST_DIVISOR_G = 0.75
+MIN_DIVISOR_G = 0.75
 """Smallest divisor for the thrust of a single sample, g; a lower specific force is raised to it."""
-MOST_DIVISOR_G = 1.5
+MAX_DIVISOR_G = 1.5
 """Largest divisor for the thrust of a single sample, g; a higher specific force is lowered to
 it."""
 
 
-def best_estimate(b: Belief) -> HoverThrust:
+def estimate_hover_thrust(b: Belief) -> HoverThrust:
     """Return the filter's estimate; without one, the accelerometer's mean; without that, the value
-    of the newest sample. The fallbacks have the standard deviation `UNSURE_SIGMA`."""
+    of the newest sample. The fallbacks have the standard deviation `FALLBACK_SIGMA`."""
     if b.hover.thrust > 0.0:
         return b.hover
     tel = b.telemetry
-    divisor_g = min(MOST_DIVISOR_G, max(LEAST_DIVISOR_G, tel.acc_z_g))
-    sample = max(LEAST_POSITION_THRUST, tel.thrust / divisor_g)
-    return HoverThrust(b.imu.hover_thrust or sample, UNSURE_SIGMA)
+    divisor_g = min(MAX_DIVISOR_G, max(MIN_DIVISOR_G, tel.acc_z_g))
+    sample = max(MIN_POSITION_MODE_THRUST, tel.thrust / divisor_g)
+    return HoverThrust(b.imu.hover_thrust or sample, FALLBACK_SIGMA)
 
 
-def lagged_thrust(b: Belief, dt_s: float) -> float:
+def rotor_thrust(b: Belief, dt_s: float) -> float:
     """Return the thrust, 0..65535, that the rotors produce `dt_s` after the previous sample: the
     reported thrust through a first-order lag with the time constant `ROTOR_LAG_S`."""
-    before, read = b.lagged_thrust, b.telemetry.thrust
+    before, read = b.rotor_thrust, b.telemetry.thrust
     if before is None:
         return read
     return before + (1.0 - math.exp(-dt_s / ROTOR_LAG_S)) * (read - before)
@@ -79,10 +83,10 @@ def learn_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
     since the previous sample, 0 if the telemetry has no new one."""
     thrust, old = b.telemetry.thrust, b.hover
     if old.thrust == 0.0:
-        return HoverThrust(b.imu.hover_thrust or thrust, FELT_SIGMA)
-    if abs(thrust / old.thrust - 1.0) > QUIET_WITHIN:
+        return HoverThrust(b.imu.hover_thrust or thrust, ACCELEROMETER_SIGMA)
+    if abs(thrust / old.thrust - 1.0) > MAX_QUIET_DEVIATION:
         return old  # the ceiling or a hand holds the vehicle
-    return old.with_measured(thrust, dt_s)
+    return old.with_measurement(thrust, dt_s)
 
 
 def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
@@ -90,14 +94,17 @@ def learn_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     `learn_in_quiet_flight`. The estimate does not change while the floor or a magnet may support
     part of the weight, or while the telemetry is too old or outside the range in which thrust is
     proportional to force."""
-    tel, old = b.telemetry, best_estimate(b)
-    thrust = tel.thrust if b.lagged_thrust is None else b.lagged_thrust
-    first, sigma = old.first or (old.thrust, max(DESCENT_SIGMA, old.sigma))
+    tel, old = b.telemetry, estimate_hover_thrust(b)
+    thrust = tel.thrust if b.rotor_thrust is None else b.rotor_thrust
+    first, sigma = old.first or (old.thrust, max(MIN_DESCENT_SIGMA, old.sigma))
     old = replace(old, first=(first, sigma))
-    shows = LEAST_FELT_G <= tel.acc_z_g <= MOST_FELT_G and thrust >= LEAST_PROPORTIONAL_PART * first
-    felt_floor = b.sent.floor_felt_s is not None
-    if b.attitude_age_s > LATEST_S or not shows or b.is_in_magnet_reach or felt_floor:
+    shows = (
+        MIN_SPECIFIC_FORCE_G <= tel.acc_z_g <= MAX_SPECIFIC_FORCE_G
+        and thrust >= MIN_PROPORTIONAL_FRACTION * first
+    )
+    felt_floor = b.sent.floor_detected_s is not None
+    if b.attitude_age_s > MAX_TELEMETRY_AGE_S or not shows or b.is_in_magnet_reach or felt_floor:
         return old
-    new = old.after(dt_s, DESCENT_DRIFT).with_measured(thrust / tel.acc_z_g, dt_s)
-    most = MOST_SIGMAS * sigma
+    new = old.propagate(dt_s, DESCENT_RANDOM_WALK).with_measurement(thrust / tel.acc_z_g, dt_s)
+    most = MAX_DESCENT_CORRECTION_SIGMAS * sigma
     return replace(new, thrust=min((1.0 + most) * first, max((1.0 - most) * first, new.thrust)))

@@ -19,14 +19,14 @@ class Maneuver:
     maneuver; the belief knows no phases.
 
     Attributes:
-        in_the_open: nothing but air should touch the vehicle. The belief learns the velocity bias
+        in_free_air: nothing but air should touch the vehicle. The belief learns the velocity bias
             and checks the mounting, and a stale position makes the vehicle hold (`hold_reason`).
-        by_camera: the camera guides the vehicle. Old telemetry, a jump of the estimate, a large
-            variance or a late loop make it hold.
+        is_camera_guided: the camera guides the vehicle. Old telemetry, a jump of the estimate, a
+            large variance or a late loop make it hold.
         needs_pictures: the vehicle must not continue without pictures; an old picture makes it
             hold.
-        learns_hover: the vehicle flies quietly, so that its thrust measures hover thrust.
-        nears_target: the vehicle climbs to the target. Close to the target, hover thrust is not
+        learns_hover_thrust: the vehicle flies quietly, so that its thrust measures hover thrust.
+        climbs_to_target: the vehicle climbs to the target. Close to the target, hover thrust is not
             learned because the ground effect of the ceiling supports part of the weight.
         presses: the vehicle is meant to touch the target. With the target alone, the position of
             the last sighting may prove a contact. No hold applies because a hold would leave the
@@ -37,43 +37,47 @@ class Maneuver:
             distinguishes hanging from standing.
     """
 
-    in_the_open: bool = False
-    by_camera: bool = False
+    in_free_air: bool = False
+    is_camera_guided: bool = False
     needs_pictures: bool = False
-    learns_hover: bool = False
-    nears_target: bool = False
+    learns_hover_thrust: bool = False
+    climbs_to_target: bool = False
     presses: bool = False
     retreats: bool = False
     descends: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sent:
+class SentOrders:
     """The orders that the planner has sent so far; the belief knows no other state of the planner.
 
     Times are on the loop's clock; positions are in the world frame of the state estimate.
     """
 
     maneuver: Maneuver
-    began_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
+    maneuver_start_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
     raw_thrust: int | None = None  # last order; None in position mode
     released_s: float | None = None  # start of the release by raw thrust
     stopped_s: float | None = None  # first order to stop the motors
-    floor_felt_s: float | None = None  # time at which a descent by raw thrust detected the floor
+    floor_detected_s: float | None = (
+        None  # time at which a descent by raw thrust detected the floor
+    )
 
     @property
     def is_level_descent(self) -> bool:
         """True while the vehicle descends by raw thrust with its motors turning."""
-        return self.maneuver.descends and self.raw_thrust is not None and self.is_motor_borne
+        return self.maneuver.descends and self.raw_thrust is not None and self.is_under_power
 
     @property
-    def is_motor_borne(self) -> bool:
+    def is_under_power(self) -> bool:
         """True until the release by raw thrust begins or the motors are stopped."""
         return self.released_s is None and self.stopped_s is None
 
-    def moved(self, setpoint: PositionSetpoint | None, by_m: Vector) -> Sent:
+    def with_frame_shift(self, setpoint: PositionSetpoint | None, by_m: Vector) -> SentOrders:
         """Return the same orders with the start of the maneuver shifted by `by_m`, the motion of
         the estimate's world frame, and with `setpoint` in the new frame."""
-        x, y, z = self.began_m
-        return replace(self, setpoint=setpoint, began_m=(x + by_m[0], y + by_m[1], z + by_m[2]))
+        x, y, z = self.maneuver_start_m
+        return replace(
+            self, setpoint=setpoint, maneuver_start_m=(x + by_m[0], y + by_m[1], z + by_m[2])
+        )

@@ -36,86 +36,87 @@ from perchctl.vehicle import FLYING, FULL_THRUST, Telemetry
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 
-GAP_S = 0.2
+MAX_TELEMETRY_GAP_S = 0.2
 """Time without telemetry that counts as a silence, s. In this time a vehicle falls 20 cm, more than
 is possible for one that still hangs. Larger: a silence can hide a fall. Smaller: two lost packets
 count as a silence."""
-NO_FALL_MPS = 0.25
+MAX_GAP_SPEED_CHANGE_MPS = 0.25
 """Largest speed that noise of the estimate can add to a hanging vehicle across a silence, m/s.
 Larger: a short fall goes undetected."""
-NO_FALL_M = 0.25
+MAX_GAP_UNEXPLAINED_M = 0.25
 """Largest distance across a silence that the speed before it does not explain, m. Larger: a short
 fall goes undetected."""
-SINKS_MPS = -0.3
+GAP_FALL_MPS = -0.3
 """Vertical speed that a hanging vehicle never reaches, m/s; a fall reaches it after 5 cm. Closer to
 0: noise counts as a fall."""
-FROZEN_READING_S = 0.2
+MAX_FROZEN_READING_S = 0.2
 """Time of identical readings that counts as a silence, s. Smaller: coarse readings freeze by
 chance."""
-FALL_G = 0.6
+FREE_FALL_G = 0.6
 """Specific force below which a vehicle falls, g. Larger: the release of a press counts as a
 fall."""
-FALL_S = 0.1
-"""Time for which a falling vehicle reads less than `FALL_G`, s; a rebound is shorter. Larger: a
-fall is detected 5 cm later."""
-IMU_SINK_MPS = -0.25
-"""Downward speed, gained within `SINK_MEMORY_S`, at which the vehicle falls whatever the
+FREE_FALL_S = 0.1
+"""Time for which a falling vehicle reads less than `FREE_FALL_G`, s; a rebound is shorter. Larger:
+a fall is detected 5 cm later."""
+FALL_SINK_MPS = -0.25
+"""Downward speed, gained within `SINK_TIME_CONSTANT_S`, at which the vehicle falls whatever the
 accelerometer's offset, m/s. Closer to 0: vibration counts as a fall."""
-SINK_MEMORY_S = 1.5
+SINK_TIME_CONSTANT_S = 1.5
 """Time constant with which a gained downward speed is forgotten, s. Larger: an offset accumulates
 to a fall."""
-OFFSET_MEMORY_S = 3.0
+OFFSET_TIME_CONSTANT_S = 3.0
 """Time constant with which the vertical offset is learned, s. Smaller: a slow fall is learned as an
 offset."""
-IMPACT_G = -0.3
+CEILING_IMPACT_G = -0.3
 """Vertical acceleration beyond which a downward reading is an impact on the ceiling and not a fall,
 g. Closer to 0: the first samples of a fall are cut off."""
-BLOW_MPS = 0.22
-"""Upward speed gained within `BLOW_S` that only the floor can cause, m/s. Smaller: an increase of
-thrust counts as the floor."""
-BLOW_S = 0.1
+FLOOR_IMPACT_MPS = 0.22
+"""Upward speed gained within `FLOOR_IMPACT_TIME_CONSTANT_S` that only the floor can cause, m/s.
+Smaller: an increase of thrust counts as the floor."""
+FLOOR_IMPACT_TIME_CONSTANT_S = 0.1
 """Time constant with which a gained upward speed is forgotten, s. Larger: thrust accumulates to a
 blow."""
-BEFORE_BLOW_S = 0.05
+MAX_IMPACT_DETECTION_DELAY_S = 0.05
 """Longest delay between the start of a blow and its detection, s; the speed before the blow is
 taken from this far back."""
-BOUNCES_S = 0.5
+BOUNCE_WINDOW_S = 0.5
 """Time after a blow within which a further one is a bounce, s."""
-STEADY_MPS = 0.06
+MAX_STEADY_CLIMB_DEVIATION_MPS = 0.06
 """Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
 counts as standing still."""
-STEADY_ASIDE_MPS = 0.15
-"""Largest difference between the lateral velocity and its mean over `ASIDE_MEMORY_S` that counts as
-constant, m/s; larger than `STEADY_MPS` because the wind shakes the vehicle."""
-ASIDE_MEMORY_S = 0.15
+MAX_STEADY_LATERAL_DEVIATION_MPS = 0.15
+"""Largest difference between the lateral velocity and its mean over `LATERAL_MEAN_TIME_CONSTANT_S`
+that counts as constant, m/s; larger than `MAX_STEADY_CLIMB_DEVIATION_MPS` because the wind shakes
+the vehicle."""
+LATERAL_MEAN_TIME_CONSTANT_S = 0.15
 """Time constant of the mean lateral velocity, s."""
-REST_MEMORY_S = 0.5
+REST_OFFSET_TIME_CONSTANT_S = 0.5
 """Time constant with which the accelerometer's offsets are learned at rest, s. Smaller: vibration
 of the floor is learned."""
-PUSHED_G = 0.06
+MIN_PUSH_G = 0.06
 """Lateral specific force that only a push causes, g. Smaller: drag in flight counts as a push."""
-PUSHED_S = 1.5
+MAX_PUSH_DELAY_S = 1.5
 """Longest delay with which a push shows in the state estimate, s."""
-PUSH_MEMORY_S = 0.05
+PUSH_TIME_CONSTANT_S = 0.05
 """Time constant of the mean lateral force, s: running motors shake single samples as hard as a
 push."""
-CORRECTED_MPS = 0.08
+MIN_ESTIMATE_CORRECTION_MPS = 0.08
 """Lateral speed gained between two samples above which the gain is a correction of the estimate and
 not a motion, m/s."""
-CORRECTED_MPS2 = 5.0
+MIN_ESTIMATE_CORRECTION_MPS2 = 5.0
 """Increase of that threshold for each second between the two samples, m/s^2."""
-CORRECTED_MEMORY_S = 6.0
+TILT_ERROR_TIME_CONSTANT_S = 6.0
 """Time constant with which the firmware's own filter removes a wrong tilt, s."""
-HOVER_MEMORY_S = 0.5
+HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
-LEAST_FLYING = 0.4
+MIN_HOVER_FRACTION = 0.4
 """Share of full thrust below which no vehicle hovers."""
-HOVER_SATURATED_PART = 0.95
+HOVER_SATURATION_FRACTION = 0.95
 """Share of full thrust above which the motors are saturated and the thrust for 1 g is unknown."""
-UNCORRECTED_M2PS2_PER_S = 5e-4
+MIN_VARIANCE_GROWTH_M2PS2_PER_S = 5e-4
 """Least growth of the variance of the vertical speed that shows a missing correction, (m/s)^2 per
 second: half of its growth without any corrections."""
-UNCORRECTED_S = 0.45
+CORRECTION_TIMEOUT_S = 0.45
 """Time of uninterrupted growth after which corrections have certainly stopped, s. Smaller: a pause
 between two range measurements counts."""
 
@@ -131,7 +132,7 @@ class FusionAge:
 
     def age_s(self, now_s: float) -> float:
         """Age of the last correction, s, if corrections have certainly stopped; otherwise 0."""
-        certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
+        certain = self.changed_s - self.none_since_s >= CORRECTION_TIMEOUT_S
         return now_s - self.none_since_s if certain else 0.0
 
     def update(self, sample: Telemetry) -> FusionAge:
@@ -139,7 +140,7 @@ class FusionAge:
         variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
         if variance is None or variance == before:
             return self
-        least = UNCORRECTED_M2PS2_PER_S * (sample.t_s - self.changed_s)
+        least = MIN_VARIANCE_GROWTH_M2PS2_PER_S * (sample.t_s - self.changed_s)
         grows = before is not None and variance - before >= least
         none_since_s = min(self.none_since_s, self.changed_s) if grows else math.inf
         return FusionAge(variance, sample.t_s, none_since_s)
@@ -170,23 +171,23 @@ class FreezeDetector:
     place_frozen_s: float = -math.inf  # time of identical position and velocity readings
 
     @property
-    def attitude_age_s(self) -> float:
+    def stuck_attitude_s(self) -> float:
         """Time, s, for which the attitude has not changed while the accelerometer has."""
         return max(0.0, self.attitude_frozen_s - self.frozen_s)
 
     @property
-    def place_age_s(self) -> float:
+    def stuck_position_s(self) -> float:
         """Time, s, for which position and velocity have not changed while the accelerometer has."""
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
-    def compare(self, last: Telemetry | None, new: Telemetry) -> Self:
+    def update_freeze(self, last: Telemetry | None, new: Telemetry) -> Self:
         """Return the detector after one more sample; the first sample has no predecessor to
         compare."""
         return replace(
             self,
             frozen_s=_frozen_s(self.frozen_s, last, new, _ACCELERATION),
             attitude_frozen_s=_frozen_s(self.attitude_frozen_s, last, new, _ATTITUDE),
-            place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _PLACE),
+            place_frozen_s=_frozen_s(self.place_frozen_s, last, new, _POSITION_AND_VELOCITY),
         )
 
 
@@ -195,32 +196,33 @@ class FallDetector:
     """Time at which the vehicle last fell, or came down and reached the floor.
 
     Let a be the vertical acceleration minus its slowly learned offset, with decelerations harder
-    than `IMPACT_G` cut off. The downward speed gained recently is
+    than `CEILING_IMPACT_G` cut off. The downward speed gained recently is
 
-        sink' = min(0, sink + a dt - sink dt / SINK_MEMORY_S)
+        sink' = min(0, sink + a dt - sink dt / SINK_TIME_CONSTANT_S)
 
-    The vehicle fell if that speed is beyond `IMU_SINK_MPS`, or if the accelerometer has read less
-    than `FALL_G` for longer than a rebound lasts. A sink that is slow enough for the offset to
+    The vehicle fell if that speed is beyond `FALL_SINK_MPS`, or if the accelerometer has read less
+    than `FREE_FALL_G` for longer than a rebound lasts. A sink that is slow enough for the offset to
     learn it goes undetected.
     """
 
     fell_s: float = -math.inf  # last fall, or descent to the floor
-    # time since which the accelerometer has read less than `FALL_G`
+    # time since which the accelerometer has read less than `FREE_FALL_G`
     light_since_s: float = math.inf
     sink_mps: float = 0.0
     offset_mps2: float = 0.0
 
-    def with_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
+    def update_fall(self, t_s: float, up_mps2: float, reads_g: float, dt_s: float) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_mps2`; `reads_g` is the
         specific force along the body's z axis at the end of that time."""
         offset = self.offset_mps2 + (
-            max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2)) - self.offset_mps2
-        ) * min(1.0, dt_s / OFFSET_MEMORY_S)
-        felt_mps2 = max(up_mps2, IMPACT_G * GRAVITY_MPS2) - offset
+            max(CEILING_IMPACT_G * GRAVITY_MPS2, min(-CEILING_IMPACT_G * GRAVITY_MPS2, up_mps2))
+            - self.offset_mps2
+        ) * min(1.0, dt_s / OFFSET_TIME_CONSTANT_S)
+        felt_mps2 = max(up_mps2, CEILING_IMPACT_G * GRAVITY_MPS2) - offset
         sink = self.sink_mps + felt_mps2 * dt_s
-        sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
-        light = min(self.light_since_s, t_s) if reads_g < FALL_G else math.inf
-        fell = sink < IMU_SINK_MPS or t_s - light >= FALL_S
+        sink = min(0.0, sink - sink * dt_s / SINK_TIME_CONSTANT_S)
+        light = min(self.light_since_s, t_s) if reads_g < FREE_FALL_G else math.inf
+        fell = sink < FALL_SINK_MPS or t_s - light >= FREE_FALL_S
         return replace(
             self,
             fell_s=t_s if fell else self.fell_s,
@@ -240,16 +242,18 @@ class ImpactDetector:
     last_moment: tuple[Impact, ...] = ()  # states just before a blow that begins now
     blow: Impact = Impact()  # newest blow from below
 
-    def with_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
+    def update_impact(self, now: Impact, z_m: float, up_mps2: float, dt_s: float) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_mps2`. `now` is the state
         at that time, which a blow may have ended; `z_m` is the height in the state estimate."""
-        gained_mps = max(0.0, self.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
-        recent = (m for m in self.last_moment if now.t_s - m.t_s <= BEFORE_BLOW_S)
+        gained_mps = max(
+            0.0, self.blow_mps * math.exp(-dt_s / FLOOR_IMPACT_TIME_CONSTANT_S) + up_mps2 * dt_s
+        )
+        recent = (m for m in self.last_moment if now.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S)
         last_moment = (*recent, now)
         return replace(
             self,
             blow_mps=gained_mps,
-            blow_s=now.t_s if gained_mps > BLOW_MPS else self.blow_s,
+            blow_s=now.t_s if gained_mps > FLOOR_IMPACT_MPS else self.blow_s,
             last_moment=last_moment,
             blow=_newest_impact(self.blow, now, z_m, last_moment, gained_mps),
         )
@@ -261,8 +265,8 @@ def _newest_impact(
     """Return the newest blow, which has gained `gained_mps` so far, with the hardest peak of its
     bounces. The speeds are minima over the last moment because the onboard estimate already
     includes the whole blow before its second sample arrives."""
-    follows = now.t_s - old.t_s <= BOUNCES_S
-    if gained_mps > BLOW_MPS:
+    follows = now.t_s - old.t_s <= BOUNCE_WINDOW_S
+    if gained_mps > FLOOR_IMPACT_MPS:
         begun = Impact(
             now.t_s,
             min(moment.estimated_mps for moment in last_moment),
@@ -289,18 +293,18 @@ class SteadySpeed:
     steady_s: float = math.inf  # time since which the vertical speed has been constant
     steady_mps: float = 0.0
     steady_aside_s: float = math.inf  # time since which the lateral velocity has been constant
-    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # mean over `ASIDE_MEMORY_S`
+    steady_aside_mps: tuple[float, float] = (0.0, 0.0)  # mean over `LATERAL_MEAN_TIME_CONSTANT_S`
 
-    def with_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
+    def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
         """The detector after `dt_s`, at a velocity in world axes."""
         x, y, z = velocity_mps
         steady_s, steady_mps = self.steady_s, self.steady_mps
-        if abs(z - steady_mps) > STEADY_MPS:
+        if abs(z - steady_mps) > MAX_STEADY_CLIMB_DEVIATION_MPS:
             steady_s, steady_mps = t_s, z
         steady_aside_s, (mean_x, mean_y) = self.steady_aside_s, self.steady_aside_mps
-        keeps = math.exp(-dt_s / ASIDE_MEMORY_S)
+        keeps = math.exp(-dt_s / LATERAL_MEAN_TIME_CONSTANT_S)
         steady_aside_mps = (x + keeps * (mean_x - x), y + keeps * (mean_y - y))
-        if math.dist((x, y), steady_aside_mps) > STEADY_ASIDE_MPS:
+        if math.dist((x, y), steady_aside_mps) > MAX_STEADY_LATERAL_DEVIATION_MPS:
             steady_aside_s = t_s
         return replace(
             self,
@@ -319,16 +323,16 @@ class PushDetector:
     aside_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
     pushed_s: float = -math.inf  # time of the last lateral push
 
-    def with_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
+    def update_push(self, new: Telemetry, offset_g: Vector, dt_s: float) -> Self:
         """Return the detector after `dt_s`; `offset_g` is the accelerometer's offset at rest."""
-        keeps = math.exp(-dt_s / PUSH_MEMORY_S)
+        keeps = math.exp(-dt_s / PUSH_TIME_CONSTANT_S)
         x_g, y_g = new.acc_x_g - offset_g[0], new.acc_y_g - offset_g[1]
         mean_x_g, mean_y_g = self.aside_g
         aside_g = (
             x_g + keeps * (mean_x_g - new.acc_x_g + offset_g[0]),
             y_g + keeps * (mean_y_g - new.acc_y_g + offset_g[1]),
         )
-        pushes = math.hypot(*aside_g) > PUSHED_G
+        pushes = math.hypot(*aside_g) > MIN_PUSH_G
         return replace(self, aside_g=aside_g, pushed_s=new.t_s if pushes else self.pushed_s)
 
 
@@ -360,33 +364,40 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         dt_s = math.inf if last is None else new.t_s - last.t_s
         started_anew = last is not None and new.start != last.start
         motion = replace(
-            self.compare(last, new),
+            self.update_freeze(last, new),
             t_s=new.t_s,
             started_s=new.t_s if started_anew else self.started_s,
             corrections=self.corrections.update(new),
             off_s=min(self.off_s, new.t_s) if new.thrust < 1 else math.inf,
         )
-        if last is None or not 0.0 < dt_s <= GAP_S or motion.frozen_s > FROZEN_READING_S:
-            return _after_silence(motion, last, new)
+        if (
+            last is None
+            or not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S
+            or motion.frozen_s > MAX_FROZEN_READING_S
+        ):
+            return _restart_after_gap(motion, last, new)
         motion, up_mps2 = _integrate(motion, last, new, dt_s)
         now = Impact(new.t_s, new.velocity_mps[2], motion.velocity_mps[2], new.acc_z_g)
         motion = (
-            motion.with_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
-            .with_impact(now, new.position_m[2], up_mps2, dt_s)
-            .with_speed(new.t_s, motion.velocity_mps, dt_s)
-            .with_push(new, motion.offset_g, dt_s)
+            motion.update_fall(new.t_s, up_mps2, new.acc_z_g, dt_s)
+            .update_impact(now, new.position_m[2], up_mps2, dt_s)
+            .update_steady_speed(new.t_s, motion.velocity_mps, dt_s)
+            .update_push(new, motion.offset_g, dt_s)
         )
-        hover_thrust = _hover_thrust(motion.hover_thrust, new, dt_s)
+        hover_thrust = _filter_hover_thrust(motion.hover_thrust, new, dt_s)
         return replace(motion, sunk_m=0.0, hover_thrust=hover_thrust)
 
     @staticmethod
     def acceleration_mps2(
-        sample: Telemetry, offset_g: Vector, tilt_off_rad: tuple[float, float] = (0.0, 0.0)
+        sample: Telemetry, offset_g: Vector, tilt_error_rad: tuple[float, float] = (0.0, 0.0)
     ) -> Vector:
         """Return the acceleration in world axes from the specific force and attitude of a sample,
         corrected for the accelerometer's offset and for the error of roll and pitch,
-        `tilt_off_rad`."""
-        roll_rad, pitch_rad = sample.roll_rad - tilt_off_rad[0], sample.pitch_rad - tilt_off_rad[1]
+        `tilt_error_rad`."""
+        roll_rad, pitch_rad = (
+            sample.roll_rad - tilt_error_rad[0],
+            sample.pitch_rad - tilt_error_rad[1],
+        )
         cr, sr = math.cos(roll_rad), math.sin(roll_rad)
         cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
         cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
@@ -403,7 +414,7 @@ class ImuMotion(FreezeDetector, FallDetector, ImpactDetector, SteadySpeed, PushD
         )
 
 
-def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
+def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """Return the motion after the first sample, or after one that does not continue the previous
     one."""
     motion = replace(
@@ -419,21 +430,21 @@ def _after_silence(motion: ImuMotion, last: Telemetry | None, new: Telemetry) ->
     if last is None:
         return replace(motion, sunk_m=0.0)
     sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
-    alive = 0.0 <= motion.place_frozen_s <= FROZEN_READING_S and new.start == last.start
-    if alive and _shows_no_fall(last, new, sunk_m):
+    alive = 0.0 <= motion.place_frozen_s <= MAX_FROZEN_READING_S and new.start == last.start
+    if alive and _excludes_fall(last, new, sunk_m):
         return replace(motion, silent_s=new.t_s, sunk_m=sunk_m)
     return replace(motion, silent_s=new.t_s, gap_s=new.t_s, sunk_m=0.0)
 
 
-def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
+def _excludes_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     way_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
-    if max(last.behind_s, new.behind_s) > GAP_S:
+    if max(last.behind_s, new.behind_s) > MAX_TELEMETRY_GAP_S:
         return False
-    if 0.0 < dt_s <= GAP_S:
-        return new.velocity_mps[2] > SINKS_MPS and sunk_m > -NO_FALL_M
-    return abs(gained_mps) <= NO_FALL_MPS and abs(way_m) <= NO_FALL_M
+    if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
+        return new.velocity_mps[2] > GAP_FALL_MPS and sunk_m > -MAX_GAP_UNEXPLAINED_M
+    return abs(gained_mps) <= MAX_GAP_SPEED_CHANGE_MPS and abs(way_m) <= MAX_GAP_UNEXPLAINED_M
 
 
 def _integrate(
@@ -444,8 +455,8 @@ def _integrate(
     motors are off and the vehicle does not fly."""
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
-        offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
-    misled_rad, turning_radps = _tilt_by_corrections(motion, last, new, dt_s)
+        offset_g = _filter_rest_offset(offset_g, new, min(1.0, dt_s / REST_OFFSET_TIME_CONSTANT_S))
+    misled_rad, turning_radps = _estimate_tilt_error(motion, last, new, dt_s)
     before = ImuMotion.acceleration_mps2(last, offset_g, motion.misled_rad)
     after = ImuMotion.acceleration_mps2(new, offset_g, misled_rad)
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
@@ -460,7 +471,7 @@ def _integrate(
     return motion, dv[2] / dt_s
 
 
-def _tilt_by_corrections(
+def _estimate_tilt_error(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the errors of roll and pitch due to corrections of the estimate, rad, and the
@@ -469,9 +480,9 @@ def _tilt_by_corrections(
     decays as the firmware removes it."""
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
-    kept = 1.0 - dt_s / CORRECTED_MEMORY_S
+    kept = 1.0 - dt_s / TILT_ERROR_TIME_CONSTANT_S
     (roll, pitch), rates = motion.misled_rad, motion.turning_radps
-    if gained_mps <= CORRECTED_MPS + CORRECTED_MPS2 * dt_s:
+    if gained_mps <= MIN_ESTIMATE_CORRECTION_MPS + MIN_ESTIMATE_CORRECTION_MPS2 * dt_s:
         return (kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s)
     return (
         kept * roll + turned[0] - rates[0] * dt_s,
@@ -481,7 +492,7 @@ def _tilt_by_corrections(
 
 _ACCELERATION = attrgetter("acc_x_g", "acc_y_g", "acc_z_g")
 _ATTITUDE = attrgetter("roll_rad", "pitch_rad", "yaw_rad")
-_PLACE = attrgetter("position_m", "velocity_mps")
+_POSITION_AND_VELOCITY = attrgetter("position_m", "velocity_mps")
 
 
 def _frozen_s(
@@ -492,15 +503,21 @@ def _frozen_s(
     return 0.0 if reading(last) != reading(new) else before_s + max(0.0, new.t_s - last.t_s)
 
 
-def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
-    flies = sample.has_bit(FLYING) and sample.thrust < HOVER_SATURATED_PART * FULL_THRUST
-    if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
+def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
+    flies = sample.has_bit(FLYING) and sample.thrust < HOVER_SATURATION_FRACTION * FULL_THRUST
+    if (
+        not flies
+        or sample.thrust < MIN_HOVER_FRACTION * FULL_THRUST
+        or not 0.8 <= sample.acc_z_g <= 1.2
+    ):
         return old
     felt = sample.thrust / sample.acc_z_g
-    return felt if old == 0.0 else old + (felt - old) * min(1.0, dt_s / HOVER_MEMORY_S)
+    return (
+        felt if old == 0.0 else old + (felt - old) * min(1.0, dt_s / HOVER_THRUST_TIME_CONSTANT_S)
+    )
 
 
-def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:
+def _filter_rest_offset(old: Vector, sample: Telemetry, share: float) -> Vector:
     cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
     cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
     x, y, z = sample.acc_x_g + sp, sample.acc_y_g - cp * sr, sample.acc_z_g - cp * cr

@@ -10,27 +10,27 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 
-KNOCKED_MPS = 0.5
+MAX_DRAUGHT_SPEED_MPS = 0.5
 """Lateral speed that no draught causes, m/s. Larger: a blow during the press is noticed late."""
-OTHERWISE_MPS = 0.15
+MAX_VELOCITY_DISAGREEMENT_MPS = 0.15
 """Velocity gained by the estimate but not by the accelerometer, m/s; correct positions cause at
 most 0.07. Larger: positions in wrong axes displace the vehicle further before they are noticed."""
-BELOW_M = 0.3
+TARGET_BELOW_M = 0.3
 """Distance below the vehicle that excludes a target on the ceiling, m."""
-UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
+NO_CORRECTION_TEXT = "the estimate's variance only grows; is the positioning system gone?"
 
 
-def _moves_otherwise(b: Belief) -> bool:
+def _has_velocity_disagreement(b: Belief) -> bool:
     """True if the estimate follows motion-capture positions that contradict the accelerometer."""
     by_capture = b.profile.positioning.source.is_mocap
-    return by_capture and math.hypot(*b.reckoning.beside_mps) > OTHERWISE_MPS
+    return by_capture and math.hypot(*b.reckoning.estimate_only_mps) > MAX_VELOCITY_DISAGREEMENT_MPS
 
 
 def _is_tilted(b: Belief) -> bool:
-    return b.imu_proves and b.tilt_rad > math.radians(b.profile.safety.max_tilt_deg)
+    return b.is_imu_fresh and b.tilt_rad > math.radians(b.profile.safety.max_tilt_deg)
 
 
-def _battery_is_low(b: Belief) -> bool:
+def _is_battery_low(b: Belief) -> bool:
     """True if the firmware reports low power, or if the measured voltage is below `min_load_v`."""
     tel = b.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
@@ -38,24 +38,35 @@ def _battery_is_low(b: Belief) -> bool:
     return tel.battery_state == LOW_POWER or low
 
 
-TILTED = Condition("tilted", _is_tilted, lasts=True)
+TILTED = Condition("tilted", _is_tilted, is_phase_independent=True)
 """The tilt exceeds `safety.max_tilt_deg`."""
-KNOCKED = Condition[Belief](
+LATERAL_BLOW = Condition[Belief](
     "knocked aside",
-    lambda b: b.position_valid and math.hypot(*b.velocity_mps[:2]) > KNOCKED_MPS,
+    lambda b: b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_DRAUGHT_SPEED_MPS,
 )
 """The vehicle moves laterally faster than any draught moves it."""
-UNSURE = Condition[Belief]("unsure", lambda b: b.is_unsure, lasts=True)
+VARIANCE_TOO_LARGE = Condition[Belief](
+    "unsure", lambda b: b.is_variance_too_large, is_phase_independent=True
+)
 """The variance of the state estimate is too large for position control."""
 TARGET_BELOW = Condition[Belief](
-    "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -BELOW_M
+    "target below", lambda b: b.target.is_fresh and b.target.error_z_m < -TARGET_BELOW_M
 )
 """The target appears below the vehicle, so the mounting must be wrong."""
-BATTERY_LOW = Condition("battery low", _battery_is_low, lasts=True)
+BATTERY_LOW = Condition("battery low", _is_battery_low, is_phase_independent=True)
 """The battery is low under load."""
-MOVES_OTHERWISE = Condition("moves otherwise than its positions", _moves_otherwise, lasts=True)
+VELOCITY_DISAGREES = Condition(
+    "moves otherwise than its positions", _has_velocity_disagreement, is_phase_independent=True
+)
 """The estimate follows positions that contradict the accelerometer."""
-QUALITY_CONDITIONS = (TILTED, KNOCKED, UNSURE, TARGET_BELOW, BATTERY_LOW, MOVES_OTHERWISE)
+QUALITY_CONDITIONS = (
+    TILTED,
+    LATERAL_BLOW,
+    VARIANCE_TOO_LARGE,
+    TARGET_BELOW,
+    BATTERY_LOW,
+    VELOCITY_DISAGREES,
+)
 """All conditions of this module."""
 
 
@@ -63,16 +74,16 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
     """Return why the vehicle must hold its position in this tick of the maneuver, or an empty
     string."""
     safety = b.profile.safety
-    if maneuver.in_the_open and b.position_is_stale:
+    if maneuver.in_free_air and b.is_position_stale:
         return position_loss_text(b)
-    if not maneuver.by_camera:
+    if not maneuver.is_camera_guided:
         return ""
     if b.telemetry_age_s > safety.telemetry_hold_s:
         return f"telemetry is {b.telemetry_age_s:.1f} s old"
-    if b.jump_s is not None:
+    if b.first_jump_s is not None:
         return "the state estimate jumped"
-    if b.is_unsure:
-        return f"the state estimate is unsure ({unsure_text(b)})"
+    if b.is_variance_too_large:
+        return f"the state estimate is unsure ({variance_text(b)})"
     if b.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {b.obs.loop_late_s:.1f} s late"
     if maneuver.needs_pictures and b.obs.camera_age_s > safety.camera_hold_s:
@@ -86,14 +97,14 @@ def position_loss_text(b: Belief) -> str:
         return "pushed aside while the target was not seen"
     age_s, why = b.position_age_s, b.obs.position_problem
     if b.profile.positioning.source.is_deck:
-        why = why or UNCORRECTED
+        why = why or NO_CORRECTION_TEXT
     if b.obs.position_beside_m > 0.0:
         why = f"by the target the vehicle is {b.obs.position_beside_m:.2f} m beside its estimate"
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
     return f"{text}: {why}" if why else text
 
 
-def unsure_text(b: Belief) -> str:
+def variance_text(b: Belief) -> str:
     """Return which variance is too large, and the limit."""
     safety = b.profile.safety
     what, variance, unit = "velocity", b.velocity_variance_m2ps2, "(m/s)^2"

@@ -4,8 +4,8 @@ While positions correct the state estimate, the reckoned velocity v is drawn to 
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
     v += (dv_imu - b dt)                          each sample
-    v += (e - v) dt / SPEED_MEMORY_S              while e is believed
-    b += (dv_imu - de - b dt) / BIAS_MEMORY_S     while e is believed
+    v += (e - v) dt / VELOCITY_TIME_CONSTANT_S              while e is believed
+    b += (dv_imu - de - b dt) / BIAS_TIME_CONSTANT_S     while e is believed
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
@@ -22,10 +22,10 @@ from dataclasses import dataclass
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
-    FROZEN_READING_S,
-    GAP_S,
-    PUSHED_S,
-    REST_MEMORY_S,
+    MAX_FROZEN_READING_S,
+    MAX_PUSH_DELAY_S,
+    MAX_TELEMETRY_GAP_S,
+    REST_OFFSET_TIME_CONSTANT_S,
     ZERO,
     ImuMotion,
     Vector,
@@ -33,66 +33,67 @@ from perchctl.mission.belief.motion import (
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-SPEED_MEMORY_S = 3.0
+VELOCITY_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a believed estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
-BIAS_MEMORY_S = 4.0
+BIAS_TIME_CONSTANT_S = 4.0
 """Time constant with which the bias is learned, s. Larger: a change of the wind is followed late.
 Smaller: a gust is learned as a bias."""
-MOST_BIAS_MPS2 = 1.5
+MAX_BIAS_MPS2 = 1.5
 """Largest bias, m/s^2; a wind of 4 m/s, which the firmware takes for a tilt, causes 1.2. Larger:
 wrong positions can add a bias that no attitude error has."""
-MOST_WRONG_MPS2 = 2.0
+MAX_BIAS_INNOVATION_MPS2 = 2.0
 """Largest difference in one sample from which the bias is learned, m/s^2; a larger one is a blow or
 a correction of the estimate. Larger: a kick of 40 ms is learned. Smaller: a gust is not learned."""
-CLIMB_SPARE_MPS = 0.1
+CLIMB_MARGIN_MPS = 0.1
 """Margin by which the vehicle may climb faster than reckoned, m/s. Larger: the magnet seems to be
 in reach too early."""
-MOST_CLIMB_MPS = 1.0
+MAX_SILENT_CLIMB_MPS = 1.0
 """Largest climb rate during a silence, m/s: the limit of the position mode."""
 MAGNET_REACH_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
-BOUNCE_WITHIN_M = 0.1
+MAX_BOUNCE_DISTANCE_M = 0.1
 """Distance below the target within which the reckoned vertical speed follows the estimate, m: a
 bounce off the ceiling falls between two telemetry samples, but the firmware integrates it at 1 kHz.
 Larger: errors of the estimate due to late pictures are adopted. Smaller: a bounce is missed by up
 to 0.3 m/s."""
-MISSED_MEMORY_S = 1.0
+MISSED_VELOCITY_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like a blow. Smaller: a blow just
 before the last sighting is forgotten."""
-MOST_VELOCITY_BIAS_MPS = 0.6
+MAX_VELOCITY_BIAS_MPS = 0.6
 """Largest bias of the estimated velocity, m/s; a wind of 4 m/s causes 0.4. Larger: a moving vehicle
 counts as still while its position creeps. Smaller: the vehicle is never steady in wind."""
-VELOCITY_MEMORY_S = 2.0
+VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 of the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
-BESIDE_MEMORY_S = 0.5
+UNMEASURED_VELOCITY_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
-STEP_M = 0.005
+MIN_POSITION_STEP_M = 0.005
 """Motion of the estimated position beyond its velocity that counts as a step, m. Smaller: noise
 counts as a step."""
-STEP_MPS = 0.2
+MIN_POSITION_STEP_MPS = 0.2
 """Increase of that threshold for each second between two samples, m/s."""
-UNSEEN_S = 0.15
+MAX_STEP_INTERVAL_S = 0.15
 """Longest time between two samples for a step, s; after a longer one, the step may be the vehicle's
 motion."""
-CARRIED_S = 0.05
+MAX_CURRENT_POSITION_LAG_S = 0.05
 """Longest time for which the position in a sample is regarded as current, s."""
 BIAS_SIGMA_MPS2 = 0.06
 """Standard deviation of the bias for a reckoned position, m/s^2. Smaller: the offset of a contact
 is claimed too precisely."""
-SPEED_SIGMA_MPS = 0.01
+VELOCITY_SIGMA_MPS = 0.01
 """Standard deviation of the velocity at the last sighting, m/s. Smaller: the offset of a contact is
 claimed too precisely."""
-BLOW_SHARE = 0.3
+DISTANCE_SIGMA_FRACTION = 0.3
 """Share of the distance flown without a sighting that adds to the standard deviation of a reckoned
 position."""
-LED_PER_S = 1.5
-"""Apparent acceleration, m/s^2, that positions in wrong axes cause per m/s of `beside_mps`."""
-MOST_SILENT_MOVE_S = 0.5
+WRONG_POSITION_GAIN_PER_S = 1.5
+"""Apparent acceleration, m/s^2, that positions in wrong axes cause per m/s of
+`estimate_only_mps`."""
+MAX_HEIGHT_STEP_S = 0.5
 """Longest integration step of the reckoned height, s; a longer one is a silence."""
 
 
@@ -107,21 +108,26 @@ class DeadReckoning:
     mean_lateral_mps2: tuple[float, float] = (0.0, 0.0)  # mean lateral reading of the accelerometer
     estimated_mps: Vector = ZERO
     # lateral velocity gained recently by the state estimate alone
-    beside_mps: tuple[float, float] = (0.0, 0.0)
+    estimate_only_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
-    missed_mps: tuple[float, float] = (0.0, 0.0)
-    below_m: float = math.inf  # distance of the gear below the target; inf if unseen or fallen
-    # lower bound of `below_m`: allows for climbs in silences, and falls only add to it
-    nearest_m: float = math.inf
+    imu_only_mps: tuple[float, float] = (0.0, 0.0)
+    distance_below_m: float = (
+        math.inf
+    )  # distance of the gear below the target; inf if unseen or fallen
+    # lower bound of `distance_below_m`: allows for climbs in silences, and falls only add to it
+    min_distance_below_m: float = math.inf
     # end of the newest silence after which the magnet may hold the vehicle
-    unsure_s: float = -math.inf
-    aside_m: tuple[float, float] = (0.0, 0.0)  # lateral offset from the gear to the target's axis
-    aside_sigma_m: float = math.inf  # standard deviation of `aside_m`; inf if unknown
-    sight_s: float = -math.inf  # exposure of the sighting from which the offset is integrated
+    doubtful_gap_s: float = -math.inf
+    lateral_offset_m: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # lateral offset from the gear to the target's axis
+    lateral_sigma_m: float = math.inf  # standard deviation of `lateral_offset_m`; inf if unknown
+    sighting_s: float = -math.inf  # exposure of the sighting from which the offset is integrated
     # sum of the steps of the estimated position since that sighting
-    stepped_m: tuple[float, float] = (0.0, 0.0)
-    stepped_s: float = -math.inf  # time of the newest step
-    struck_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
+    position_step_sum_m: tuple[float, float] = (0.0, 0.0)
+    last_position_step_s: float = -math.inf  # time of the newest step
+    impact_mps: float = 0.0  # vertical speed just before `ImuMotion.blow`
     velocity_bias_mps: tuple[float, float] = (0.0, 0.0)  # lateral bias of the estimated velocity
     mean_velocity_mps: tuple[float, float] = (0.0, 0.0)  # low-passed estimated velocity
     mean_position_m: tuple[float, float] | None = None  # low-passed estimated position
@@ -149,16 +155,16 @@ def advance_reckoning(
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
         carried = not old.imu.t_s < imu.silent_s <= blow.t_s
         carried_mps = old.velocity_mps[2] + blow.felt_mps - old.imu.velocity_mps[2]
-        old = replace(old, struck_mps=carried_mps if carried else blow.estimated_mps)
-    frozen = imu.attitude_frozen_s > FROZEN_READING_S
+        old = replace(old, impact_mps=carried_mps if carried else blow.estimated_mps)
+    frozen = imu.attitude_frozen_s > MAX_FROZEN_READING_S
     if old.imu is None or imu.silent_s > old.imu.t_s or frozen:
-        return _begin_anew(old, imu, estimated, believed=believed, diverged=diverged)
-    return _carry_on(
+        return _restart(old, imu, estimated, believed=believed, diverged=diverged)
+    return _integrate_sample(
         old, old.imu, imu, sample, believed=believed, corrected=corrected, pushed=pushed
     )
 
 
-def _begin_anew(
+def _restart(
     old: DeadReckoning, imu: ImuMotion, estimated: Vector, *, believed: bool, diverged: bool
 ) -> DeadReckoning:
     """Return the reckoning at the first sample, after a silence, or while the attitude is frozen.
@@ -181,8 +187,8 @@ def _begin_anew(
         imu=imu,
         velocity_mps=velocity_mps,
         estimated_mps=estimated,
-        beside_mps=(0.0, 0.0),
-        missed_mps=(0.0, 0.0),
+        estimate_only_mps=(0.0, 0.0),
+        imu_only_mps=(0.0, 0.0),
     )
     if old.imu is None:
         return unknown
@@ -191,22 +197,22 @@ def _begin_anew(
         # climbed under power.
         off = old.imu.off_s <= old.imu.t_s and imu.off_s <= imu.t_s
         flew = not (off or imu.started_s > old.imu.t_s)
-        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
+        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_MARGIN_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
-            climb_m = MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
-        nearest_m = old.nearest_m - climb_m
-        near = nearest_m < MAGNET_REACH_M
+            climb_m = MAX_SILENT_CLIMB_MPS * (imu.t_s - old.imu.t_s)
+        min_distance_below_m = old.min_distance_below_m - climb_m
+        near = min_distance_below_m < MAGNET_REACH_M
         unknown = replace(
             unknown,
-            nearest_m=nearest_m,
-            unsure_s=imu.t_s if near else old.unsure_s,
-            below_m=old.below_m if near or flew else math.inf,
+            min_distance_below_m=min_distance_below_m,
+            doubtful_gap_s=imu.t_s if near else old.doubtful_gap_s,
+            distance_below_m=old.distance_below_m if near or flew else math.inf,
         )
-    return replace(unknown, aside_sigma_m=math.inf)
+    return replace(unknown, lateral_sigma_m=math.inf)
 
 
-def _carry_on(
+def _integrate_sample(
     old: DeadReckoning,
     before: ImuMotion,
     imu: ImuMotion,
@@ -221,9 +227,9 @@ def _carry_on(
     if not dt_s > 0.0:
         return old
     velocity, bias, beside, missed = [], [], [0.0, 0.0], [0.0, 0.0]
-    remembers = math.exp(-dt_s / MISSED_MEMORY_S) if corrected else 1.0
-    keeps = math.exp(-dt_s / BESIDE_MEMORY_S)
-    calm = believed and imu.t_s - imu.pushed_s > PUSHED_S
+    remembers = math.exp(-dt_s / MISSED_VELOCITY_TIME_CONSTANT_S) if corrected else 1.0
+    keeps = math.exp(-dt_s / UNMEASURED_VELOCITY_TIME_CONSTANT_S)
+    calm = believed and imu.t_s - imu.pushed_s > MAX_PUSH_DELAY_S
     cos, sin = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
     ahead_g, left_g = imu.aside_g
     reads_mps2 = (
@@ -233,31 +239,33 @@ def _carry_on(
     mean_lateral_mps2 = [*old.mean_lateral_mps2]
     for i in range(3):
         gained = imu.velocity_mps[i] - before.velocity_mps[i]
-        if i == 2 and believed and old.below_m < BOUNCE_WITHIN_M:
+        if i == 2 and believed and old.distance_below_m < MAX_BOUNCE_DISTANCE_M:
             gained = estimated[2] - old.estimated_mps[2] + old.bias_mps2[2] * dt_s
         v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
         if i < 2:
             alone = gained - b * dt_s - (estimated[i] - old.estimated_mps[i])
-            missed[i] = remembers * old.missed_mps[i] + alone
+            missed[i] = remembers * old.imu_only_mps[i] + alone
         if believed and (i == 2 or not pushed):
-            v += (estimated[i] - v) * min(1.0, dt_s / SPEED_MEMORY_S)
+            v += (estimated[i] - v) * min(1.0, dt_s / VELOCITY_TIME_CONSTANT_S)
             wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
             if calm and i < 2:
                 more = estimated[i] - old.estimated_mps[i] - gained + b * dt_s
-                beside[i] = keeps * old.beside_mps[i] + more
-            if abs(wrong) <= MOST_WRONG_MPS2:
-                share = min(1.0, dt_s / BIAS_MEMORY_S)
-                b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b + share * (wrong - b)))
+                beside[i] = keeps * old.estimate_only_mps[i] + more
+            if abs(wrong) <= MAX_BIAS_INNOVATION_MPS2:
+                share = min(1.0, dt_s / BIAS_TIME_CONSTANT_S)
+                b = max(-MAX_BIAS_MPS2, min(MAX_BIAS_MPS2, b + share * (wrong - b)))
                 if i < 2:
                     mean_lateral_mps2[i] += share * (reads_mps2[i] - mean_lateral_mps2[i])
         velocity.append(v)
         bias.append(b)
     vx, vy, vz = velocity
-    unseen_s = max(0.0, imu.t_s - old.sight_s)
-    fell = imu.fell_s > max(before.fell_s, old.sight_s)
+    unseen_s = max(0.0, imu.t_s - old.sighting_s)
+    fell = imu.fell_s > max(before.fell_s, old.sighting_s)
     step_m = math.hypot(vx, vy) * dt_s
-    growth_m = (SPEED_SIGMA_MPS + BIAS_SIGMA_MPS2 * unseen_s) * dt_s + BLOW_SHARE * step_m
-    ex, ey = old.aside_m
+    growth_m = (
+        VELOCITY_SIGMA_MPS + BIAS_SIGMA_MPS2 * unseen_s
+    ) * dt_s + DISTANCE_SIGMA_FRACTION * step_m
+    ex, ey = old.lateral_offset_m
     return replace(
         old,
         imu=imu,
@@ -265,12 +273,14 @@ def _carry_on(
         bias_mps2=(bias[0], bias[1], bias[2]),
         mean_lateral_mps2=(mean_lateral_mps2[0], mean_lateral_mps2[1]),
         estimated_mps=estimated,
-        beside_mps=(beside[0], beside[1]),
-        missed_mps=(missed[0], missed[1]),
-        below_m=math.inf if fell else old.below_m - (vz + CLIMB_SPARE_MPS) * dt_s,
-        nearest_m=old.nearest_m - vz * dt_s,
-        aside_m=(ex - vx * dt_s, ey - vy * dt_s),
-        aside_sigma_m=old.aside_sigma_m + growth_m,
+        estimate_only_mps=(beside[0], beside[1]),
+        imu_only_mps=(missed[0], missed[1]),
+        distance_below_m=math.inf
+        if fell
+        else old.distance_below_m - (vz + CLIMB_MARGIN_MPS) * dt_s,
+        min_distance_below_m=old.min_distance_below_m - vz * dt_s,
+        lateral_offset_m=(ex - vx * dt_s, ey - vy * dt_s),
+        lateral_sigma_m=old.lateral_sigma_m + growth_m,
     )
 
 
@@ -281,21 +291,21 @@ def learn_velocity_bias(old: DeadReckoning, last: Telemetry, new: Telemetry) -> 
     In a steady wind, the firmware takes the drag of the air for a tilt, and its estimate reads up
     to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
     velocity of the estimated position, both through the same low-pass filter. It is wrong for about
-    `VELOCITY_MEMORY_S` after a change of the wind.
+    `VELOCITY_BIAS_TIME_CONSTANT_S` after a change of the wind.
     """
     dt_s = new.t_s - last.t_s
-    if not 0.0 < dt_s <= GAP_S:
-        return forget_means(old)
-    share = 1.0 - math.exp(-dt_s / VELOCITY_MEMORY_S)
+    if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
+        return reset_means(old)
+    share = 1.0 - math.exp(-dt_s / VELOCITY_BIAS_TIME_CONSTANT_S)
     before_m = old.mean_position_m or new.position_m[:2]
     before_mps = old.velocity_bias_mps if old.mean_position_m is None else old.mean_velocity_mps
     velocity, position, bias = [], [], []
     for i in range(2):
         velocity.append(before_mps[i] + share * (new.velocity_mps[i] - before_mps[i]))
         position.append(before_m[i] + share * (new.position_m[i] - before_m[i]))
-        bias.append(velocity[i] - (new.position_m[i] - position[i]) / VELOCITY_MEMORY_S)
+        bias.append(velocity[i] - (new.position_m[i] - position[i]) / VELOCITY_BIAS_TIME_CONSTANT_S)
     size_mps = math.hypot(*bias)
-    part = 1.0 if size_mps <= MOST_VELOCITY_BIAS_MPS else MOST_VELOCITY_BIAS_MPS / size_mps
+    part = 1.0 if size_mps <= MAX_VELOCITY_BIAS_MPS else MAX_VELOCITY_BIAS_MPS / size_mps
     return replace(
         old,
         velocity_bias_mps=(part * bias[0], part * bias[1]),
@@ -311,34 +321,45 @@ def learn_bias_at_rest(
     """Return the reckoning for a vehicle that is held still: all lateral acceleration between the
     two motions is bias. The attitude error, and the bias with it, changes within a second after the
     contact, since the wind that the estimate has taken for a tilt no longer moves the vehicle."""
-    if before is None or not 0.0 < now.t_s - before.t_s <= GAP_S or now.silent_s > before.t_s:
+    if (
+        before is None
+        or not 0.0 < now.t_s - before.t_s <= MAX_TELEMETRY_GAP_S
+        or now.silent_s > before.t_s
+    ):
         return old
     dt_s = now.t_s - before.t_s
-    share = 1.0 - math.exp(-dt_s / REST_MEMORY_S)
+    share = 1.0 - math.exp(-dt_s / REST_OFFSET_TIME_CONSTANT_S)
     x_mps2, y_mps2 = ((now.velocity_mps[i] - before.velocity_mps[i]) / dt_s for i in range(2))
     bx, by, bz = old.bias_mps2
     bias = bx + share * (x_mps2 - bx), by + share * (y_mps2 - by)
     return replace(old, bias_mps2=(*bias, bz))
 
 
-def forget_means(old: DeadReckoning) -> DeadReckoning:
+def reset_means(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning after an interruption of the velocity-bias learning: the bias is kept,
     and the low-pass filters restart."""
     return old if old.mean_position_m is None else replace(old, mean_position_m=None)
 
 
-def discount_wrong_positions(old: DeadReckoning) -> DeadReckoning:
+def correct_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
     """Return the reckoning with its bias corrected for the tilt error due to wrong positions."""
-    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
-    return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
+    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.estimate_only_mps
+    return replace(
+        old,
+        bias_mps2=(
+            bx + WRONG_POSITION_GAIN_PER_S * x_mps,
+            by + WRONG_POSITION_GAIN_PER_S * y_mps,
+            bz,
+        ),
+    )
 
 
 def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) -> DeadReckoning:
     """Return the reckoning with one more step of the estimated position: the part of its motion
     between two samples that the velocity does not explain. After a gap in the samples, no step is
     added."""
-    dt_s = _position_s(sample) - _position_s(last)
-    if not 0.0 < dt_s <= UNSEEN_S:
+    dt_s = _position_time_s(sample) - _position_time_s(last)
+    if not 0.0 < dt_s <= MAX_STEP_INTERVAL_S:
         return old
     x_m, y_m = (
         sample.position_m[i]
@@ -346,22 +367,35 @@ def add_position_step(old: DeadReckoning, last: Telemetry, sample: Telemetry) ->
         - 0.5 * (last.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
         for i in range(2)
     )
-    if math.hypot(x_m, y_m) <= STEP_M + STEP_MPS * dt_s:
+    if math.hypot(x_m, y_m) <= MIN_POSITION_STEP_M + MIN_POSITION_STEP_MPS * dt_s:
         return old
-    sx_m, sy_m = old.stepped_m
-    return replace(old, stepped_m=(sx_m + x_m, sy_m + y_m), stepped_s=sample.t_s)
+    sx_m, sy_m = old.position_step_sum_m
+    return replace(
+        old, position_step_sum_m=(sx_m + x_m, sy_m + y_m), last_position_step_s=sample.t_s
+    )
 
 
-def _position_s(sample: Telemetry) -> float:
-    """Return the time of the sample's position; a lag of up to `CARRIED_S` counts as none."""
-    return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
+def _position_time_s(sample: Telemetry) -> float:
+    """Return the time of the sample's position; a lag of up to `MAX_CURRENT_POSITION_LAG_S` counts
+    as none."""
+    return sample.t_s - max(0.0, sample.behind_s - MAX_CURRENT_POSITION_LAG_S)
 
 
 def add_sighting(
-    old: DeadReckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
+    old: DeadReckoning,
+    t_s: float,
+    lateral_offset_m: tuple[float, float],
+    distance_below_m: float,
+    sigma_m: float,
 ) -> DeadReckoning:
-    """Return the reckoning restarted at a sighting: `aside_m` (world x, y) with the standard
-    deviation `sigma_m`, and `below_m`, are the offset from the gear to the target."""
+    """Return the reckoning restarted at a sighting: `lateral_offset_m` (world x, y) with the
+    standard deviation `sigma_m`, and `distance_below_m`, are the offset from the gear to the
+    target."""
     return replace(
-        old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
+        old,
+        sighting_s=t_s,
+        lateral_offset_m=lateral_offset_m,
+        distance_below_m=distance_below_m,
+        min_distance_below_m=distance_below_m,
+        lateral_sigma_m=sigma_m,
     )

@@ -11,20 +11,20 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vision import TargetEstimate
 
-FAR_BELOW_M = 0.5
+MIN_FAR_ABOVE_M = 0.5
 """Height above the gear beyond which the target cannot hold the vehicle, m. Larger: a vehicle that
 has fallen off seems to hang. Smaller: a magnet on a sheet below an unseen ceiling seems not to
 hold."""
-SEEN_MEMORY_S = 0.1
+CAMERA_VELOCITY_TIME_CONSTANT_S = 0.1
 """Time constant of the low-pass filter on the velocity from pictures, s. Larger: a descent with
 that velocity oscillates. Smaller: the noise of single detections moves the vehicle."""
-SEEN_GAP_S = 1.0
+MAX_DETECTION_GAP_S = 1.0
 """Longest time between two detections from which a velocity is computed, s. Larger: a motion that
 has ended still counts. Smaller: a few lost pictures leave the velocity unknown."""
-LEAST_SEEN_S = 0.3
+MIN_DETECTED_S = 0.3
 """Time for which the target must be detected before the velocity is used, s. Smaller: the low-pass
 filter has not settled."""
-MOST_SEEN_MPS = 1.5
+MAX_CAMERA_VELOCITY_MPS = 1.5
 """Largest velocity between two detections, m/s; a larger one is a step of the pose. Larger: a step
 counts as motion. Smaller: a fast motion is ignored."""
 
@@ -38,11 +38,12 @@ class TargetBelief:
             None while unknown.
         error_xy_m, error_z_m, error_yaw_rad: offset from the gear to the target in the level frame;
             infinite while unknown.
-        contact_goal_z_m: height of the body at which the gear touches the target.
+        contact_body_z_m: height of the body at which the gear touches the target.
         age_s: time since the exposure of the last frame that measured the target.
         is_tracked: the target is visible, or the filter coasts for at most n_max frames.
         is_fresh: the last measurement is as recent as the latency allows.
-        is_small_fresh: the last measurement of the small marker is as recent as the latency allows.
+        is_small_marker_fresh: the last measurement of the small marker is as recent as the latency
+            allows.
     """
 
     world_m: Array | None = None
@@ -50,16 +51,16 @@ class TargetBelief:
     error_xy_m: float = math.inf
     error_z_m: float = math.inf
     error_yaw_rad: float = math.inf
-    contact_goal_z_m: float = math.inf
+    contact_body_z_m: float = math.inf
     age_s: float = math.inf
     is_tracked: bool = False
     is_fresh: bool = False
-    is_small_fresh: bool = False
+    is_small_marker_fresh: bool = False
 
     @property
     def is_far_above(self) -> bool:
         """True if the camera sees the target so far above that it cannot hold the vehicle."""
-        return self.world_m is not None and self.error_z_m > FAR_BELOW_M
+        return self.world_m is not None and self.error_z_m > MIN_FAR_ABOVE_M
 
     @classmethod
     def of(
@@ -80,11 +81,11 @@ class TargetBelief:
             error_xy_m=math.hypot(target.e_m[0], target.e_m[1]),
             error_z_m=float(target.e_m[2]),
             error_yaw_rad=target.e_yaw_rad,
-            contact_goal_z_m=goal_z_m,
+            contact_body_z_m=goal_z_m,
             age_s=age_s,
             is_tracked=target.tracked,
             is_fresh=target.tracked and age_s <= limit_s,
-            is_small_fresh=t_s - target.small_measured_s <= limit_s,
+            is_small_marker_fresh=t_s - target.small_measured_s <= limit_s,
         )
 
 
@@ -113,7 +114,7 @@ class TargetMotion:
     @property
     def is_known(self) -> bool:
         """True if the target was detected for long enough to determine the velocity."""
-        return self.t_s - self.since_s >= LEAST_SEEN_S
+        return self.t_s - self.since_s >= MIN_DETECTED_S
 
     def with_detection(self, target: TargetEstimate) -> TargetMotion:
         """Return the motion after a frame that measured the target."""
@@ -122,12 +123,12 @@ class TargetMotion:
         dt_s = t_s - self.t_s
         if dt_s <= 0.0:
             return self
-        if dt_s > SEEN_GAP_S:
+        if dt_s > MAX_DETECTION_GAP_S:
             return TargetMotion(t_s, t_s, e_m)
         moved_mps = [(before - now) / dt_s for before, now in zip(self.e_m, e_m, strict=True)]
-        if math.hypot(*moved_mps) > MOST_SEEN_MPS:
+        if math.hypot(*moved_mps) > MAX_CAMERA_VELOCITY_MPS:
             return replace(self, t_s=t_s, e_m=e_m)
-        share = 1.0 - math.exp(-dt_s / SEEN_MEMORY_S)
+        share = 1.0 - math.exp(-dt_s / CAMERA_VELOCITY_TIME_CONSTANT_S)
         ahead, left, up = (
             old + share * (new - old) for old, new in zip(self.velocity_mps, moved_mps, strict=True)
         )

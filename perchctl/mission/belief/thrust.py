@@ -15,19 +15,19 @@ from dataclasses import dataclass
 
 from perchctl.values import replace
 
-LEAST_POSITION_THRUST = 20000
+MIN_POSITION_MODE_THRUST = 20000
 """Smallest thrust of the firmware's position mode, 0..65535 (docs/firmware.md)."""
-THRUST_NOISE = 0.02
+THRUST_SIGMA = 0.02
 """Standard deviation, as a share, of measurements averaged over one second; position control varies
 the thrust by 1 to 2 % for half a second. Larger: the filter follows a sagging battery late.
 Smaller: the filter learns these variations."""
-OPEN_DRIFT = 0.01
+QUIET_RANDOM_WALK = 0.01
 """Random walk of the hover thrust in quiet flight, as a share per square root of a second. Larger:
 the filter learns a lasting push. Smaller: it follows a sagging battery late."""
-FELT_SIGMA = 0.03
+ACCELEROMETER_SIGMA = 0.03
 """Standard deviation, as a share, of an estimate from the accelerometer in flight, due to its scale
 error. Larger: early quiet flight, just after take-off, has more weight. Smaller: it has less."""
-ROUGH_SIGMA = 0.05
+MAX_PRECISE_SIGMA = 0.05
 """Standard deviation, as a share, above which the estimate is too rough for a descent without
 telemetry. Larger: the vehicle descends too fast. Smaller: it waits in the air for longer."""
 
@@ -47,27 +47,27 @@ class HoverThrust:
     first: tuple[float, float] | None = None
 
     @property
-    def is_rough(self) -> bool:
+    def is_imprecise(self) -> bool:
         """True if neither quiet flight nor a descent has measured the hover thrust well enough."""
-        return self.sigma > ROUGH_SIGMA
+        return self.sigma > MAX_PRECISE_SIGMA
 
-    def after(self, dt_s: float, drift: float) -> HoverThrust:
+    def propagate(self, dt_s: float, drift: float) -> HoverThrust:
         """Return the estimate `dt_s` later, with a random walk of `drift` in between."""
         return replace(self, sigma=math.sqrt(self.sigma**2 + drift**2 * dt_s))
 
-    def aged(self, dt_s: float) -> HoverThrust:
+    def propagate_unmeasured(self, dt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later without a measurement. Its standard deviation grows at
         most to that of the accelerometer's estimate, which is always available in flight."""
-        sigma = self.after(dt_s, OPEN_DRIFT).sigma
-        return replace(self, sigma=min(sigma, max(self.sigma, FELT_SIGMA)))
+        sigma = self.propagate(dt_s, QUIET_RANDOM_WALK).sigma
+        return replace(self, sigma=min(sigma, max(self.sigma, ACCELEROMETER_SIGMA)))
 
-    def with_measured(self, thrust: float, dt_s: float) -> HoverThrust:
+    def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
         """Return the estimate after a measurement of weight `dt_s`, in seconds; unchanged for 0."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma):
-            return replace(self, thrust=thrust, sigma=THRUST_NOISE / math.sqrt(dt_s))
+            return replace(self, thrust=thrust, sigma=THRUST_SIGMA / math.sqrt(dt_s))
         variance = self.sigma**2
-        gain = variance / (variance + THRUST_NOISE**2 / dt_s)
+        gain = variance / (variance + THRUST_SIGMA**2 / dt_s)
         corrected = self.thrust + gain * (thrust - self.thrust)
         return replace(self, thrust=corrected, sigma=math.sqrt((1.0 - gain) * variance))

@@ -44,7 +44,9 @@ def lacks_charge_to_begin(c: Context) -> bool:
 
 ALIGN = PhaseDefinition(
     phase=Phase.ALIGN,
-    maneuver=Maneuver(in_the_open=True, by_camera=True, needs_pictures=True, learns_hover=True),
+    maneuver=Maneuver(
+        in_free_air=True, is_camera_guided=True, needs_pictures=True, learns_hover_thrust=True
+    ),
     act=act,
     conditions=(ALIGNED,),
     exits=(

@@ -38,8 +38,8 @@ AT_TAKEOFF_HEIGHT = Condition[Context](
 def act(c: Context) -> Action:
     """Climb on position setpoints, so that the firmware levels the vehicle out if they stop."""
     planner, state, b = c.planner, c.state, c.belief
-    assert b.ground_m is not None
-    x, y, z = b.ground_m
+    assert b.takeoff_position_m is not None
+    x, y, z = b.takeoff_position_m
     start = state.setpoint or PositionSetpoint(x, y, z, state.entry.yaw_rad)
     if planner.approach_xy_m is not None and b.height_m > APPROACH_PART * planner.takeoff_height_m:
         x, y = planner.approach_xy_m
@@ -50,7 +50,7 @@ def act(c: Context) -> Action:
 
 APPROACH = PhaseDefinition(
     phase=Phase.APPROACH,
-    maneuver=Maneuver(in_the_open=True),
+    maneuver=Maneuver(in_free_air=True),
     act=act,
     conditions=(AT_TAKEOFF_HEIGHT,),
     exits=(

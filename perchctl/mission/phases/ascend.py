@@ -43,7 +43,7 @@ def _is_settled(c: Context) -> bool:
     ascend, target = c.planner.ascend, c.belief.target
     return (
         target.is_fresh
-        and target.is_small_fresh
+        and target.is_small_marker_fresh
         and is_near_standoff(c)
         and target.error_xy_m <= ascend.settle_xy_m
         and abs(target.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
@@ -70,7 +70,7 @@ def act(c: Context) -> Action:
     """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
-    goal_z = target.contact_goal_z_m - ascend.standoff_m
+    goal_z = target.contact_body_z_m - ascend.standoff_m
     may_climb = target.is_fresh and target.error_xy_m < CLIMB_WITHIN * cone_m(c)
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps
@@ -81,11 +81,11 @@ def act(c: Context) -> Action:
 ASCEND = PhaseDefinition(
     phase=Phase.ASCEND,
     maneuver=Maneuver(
-        in_the_open=True,
-        by_camera=True,
+        in_free_air=True,
+        is_camera_guided=True,
         needs_pictures=True,
-        learns_hover=True,
-        nears_target=True,
+        learns_hover_thrust=True,
+        climbs_to_target=True,
     ),
     enter=enter,
     act=act,

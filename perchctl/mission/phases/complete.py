@@ -4,8 +4,8 @@ vehicle."""
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import (
-    DOWN,
     MAGNET_HOLDS,
+    MOTORS_STOPPED,
     has_slipped,
     newest_contact_offset,
 )
@@ -53,7 +53,7 @@ def stopped_for_s(c: Context) -> float:
 
 def release_monitored(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
-    return stopped_for_s(c) >= c.planner.complete.watch_s and c.held_s(DOWN) >= OFF_S
+    return stopped_for_s(c) >= c.planner.complete.watch_s and c.held_s(MOTORS_STOPPED) >= OFF_S
 
 
 COMPLETE = PhaseDefinition(

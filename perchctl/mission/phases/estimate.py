@@ -29,7 +29,9 @@ def act(c: Context) -> Action:
 
 ESTIMATE = PhaseDefinition(
     phase=Phase.ESTIMATE,
-    maneuver=Maneuver(in_the_open=True, by_camera=True, needs_pictures=True, learns_hover=True),
+    maneuver=Maneuver(
+        in_free_air=True, is_camera_guided=True, needs_pictures=True, learns_hover_thrust=True
+    ),
     act=act,
     conditions=(UNTRACKED, ESTIMATED),
     exits=(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import DOWN
-from perchctl.mission.belief.reckoning import discount_wrong_positions
+from perchctl.mission.belief.contact import MOTORS_STOPPED
+from perchctl.mission.belief.reckoning import correct_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.descent import MANEUVER, act, enter_landing
@@ -28,7 +28,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     # then accelerate the landing until the vehicle tips over.
     capture = b.profile.positioning.source.is_mocap and b.mounting.is_wrong
     if Claim.POSITIONS_WRONG in claims or (Claim.MOUNTING_WRONG in claims and capture):
-        reckoning = b.reckoning if b.diverged else discount_wrong_positions(b.reckoning)
+        reckoning = b.reckoning if b.diverged else correct_bias_for_wrong_positions(b.reckoning)
         b = replace(b, diverged=True, reckoning=reckoning)
     if before.state.phase is Phase.RECOVER and Claim.HANGS not in claims:
         b = replace(b, contact=None)  # no evidence of a support at that position
@@ -39,7 +39,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
 
 def rests_as(rest: RestState) -> Predicate:
     """Return the predicate that the motors are off and the vehicle is in the rest state `rest`."""
-    return lambda c: c.held_s(DOWN) >= OFF_S and find_rest_state(c) is rest
+    return lambda c: c.held_s(MOTORS_STOPPED) >= OFF_S and find_rest_state(c) is rest
 
 
 def unconfirmed_reason(c: Context) -> str:
@@ -97,7 +97,7 @@ LANDING = PhaseDefinition(
         ),
         give_up_row(
             "hangs-or-stands",
-            lambda c: c.held_s(DOWN) >= LOOKED_S,
+            lambda c: c.held_s(MOTORS_STOPPED) >= LOOKED_S,
             "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
             "whether it hangs or stands: look before you touch it",
         ),

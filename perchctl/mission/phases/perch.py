@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from perchctl.mission.belief.contact import CONTACT, contact_offset
 from perchctl.mission.belief.maneuver import Maneuver
-from perchctl.mission.belief.quality import KNOCKED, position_loss_text
+from perchctl.mission.belief.quality import LATERAL_BLOW, position_loss_text
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Phase
@@ -28,7 +28,7 @@ from perchctl.mission.setpoints import (
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
-KNOCKED_S = 0.04
+LATERAL_BLOW_DWELL_S = 0.04
 """Time for which the vehicle must move laterally, s: more than one telemetry sample."""
 BLIND_PRESS_S = 1.25
 """Longest press after the last sighting, s, since the last centimetres are flown without the target
@@ -48,7 +48,7 @@ def act(c: Context) -> Action:
     old = c.state.setpoint or hold_here(c)
     if target.world_m is None:
         return fly_to(c, old, lift=False)
-    goal = setpoint_under_target(c, target.contact_goal_z_m + perch.press_m)
+    goal = setpoint_under_target(c, target.contact_body_z_m + perch.press_m)
     setpoint = step_towards(c, old, goal, up_mps=perch.climb_mps, down_mps=0.0)
     return fly_to(c, setpoint, lift=False)
 
@@ -61,7 +61,7 @@ def is_in_contact(c: Context) -> bool:
 def contact_reason(c: Context) -> str:
     """Return what proves the contact, and its offset."""
     by = "position, acceleration and thrust"
-    if not c.belief.position_valid:
+    if not c.belief.is_position_valid:
         by = f"acceleration and thrust, {position_loss_text(c.belief)}"
     return f"contact proven by {by}; {contact_offset(c.belief).text}"
 
@@ -84,7 +84,7 @@ PERCH = PhaseDefinition(
         back_off_row(
             "pressed-blindly",
             {Phase.PERCH},
-            lambda c: c.belief.by_target and c.belief.position_age_s > BLIND_PRESS_S,
+            lambda c: c.belief.is_target_positioned and c.belief.position_age_s > BLIND_PRESS_S,
             lambda c: (
                 f"no contact {c.belief.position_age_s:.1f} s after the last sight of the target"
             ),
@@ -92,7 +92,7 @@ PERCH = PhaseDefinition(
         back_off_row(
             "knocked-aside",
             {Phase.PERCH},
-            lambda c: c.held_s(KNOCKED) >= KNOCKED_S,
+            lambda c: c.held_s(LATERAL_BLOW) >= LATERAL_BLOW_DWELL_S,
             "pushed aside under the target",
         ),
         back_off_row(

@@ -6,8 +6,8 @@ import math
 
 from perchctl.mission.belief.belief import ContactOffset
 from perchctl.mission.belief.contact import (
-    CARRIED,
     CONTACT,
+    SUPPORTED_BY_IMU,
     contact_offset,
     is_at_contact_height,
 )
@@ -81,7 +81,9 @@ def _touched(before: Context, claims: Claim) -> ContactOffset | None:
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
         return b.contact if b.contact_z_m is not None else None
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
-    carried = proven or b.held_s(CARRIED) >= 0.0  # `CARRIED` includes that dwell time
+    carried = (
+        proven or b.held_s(SUPPORTED_BY_IMU) >= 0.0
+    )  # `SUPPORTED_BY_IMU` includes that dwell time
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
         return contact_offset(b)
     return None
@@ -125,10 +127,10 @@ def unsteady_reason(c: Context) -> str:
     """Return which observations kept the vehicle from being steady; their cause is unknown."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"it moves at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
-    if b.position_valid and setpoint is not None:
+    if b.is_position_valid and setpoint is not None:
         x_m, y_m, _ = c.telemetry.position_m
-        aside_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
-        seen.append(f"it is {aside_m:.2f} m beside its setpoint")
+        lateral_offset_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
+        seen.append(f"it is {lateral_offset_m:.2f} m beside its setpoint")
     if b.contact_z_m is not None:
         seen.append("it has not come away from its contact")
     text = f"not steady {c.planner.recover.timeout_s:g} s after the attempt"
@@ -137,7 +139,7 @@ def unsteady_reason(c: Context) -> str:
 
 RECOVER = PhaseDefinition(
     phase=Phase.RECOVER,
-    maneuver=Maneuver(in_the_open=True, by_camera=True, retreats=True),
+    maneuver=Maneuver(in_free_air=True, is_camera_guided=True, retreats=True),
     enter=enter,
     act=act,
     conditions=(STEADY,),

@@ -35,8 +35,8 @@ def act(c: Context) -> Action:
     """Wait, climb one step, turn one step and wait again, never above the height limit. Search for
     a target that was seen before from below its position."""
     search, state, b = c.planner.search, c.state, c.belief
-    ground_m = b.ground_m
-    assert ground_m is not None
+    takeoff_position_m = b.takeoff_position_m
+    assert takeoff_position_m is not None
     if c.t_s - state.search_step_s > search.wait_s:
         state = replace(state, searched_places=state.searched_places + 1, search_step_s=c.t_s)
         c = Context(state)
@@ -45,9 +45,9 @@ def act(c: Context) -> Action:
         there = body_xy_under_target(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_unconfirmed
         x, y = _not_far(b.mounting, (x, y), there) if unconfirmed else there
-        height = min(z, b.target.contact_goal_z_m - c.planner.ascend.near_m)
+        height = min(z, b.target.contact_body_z_m - c.planner.ascend.near_m)
     else:
-        top = max(z, ground_m[2] + search.max_height_m)
+        top = max(z, takeoff_position_m[2] + search.max_height_m)
         if state.blocked_z_m is not None:
             top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
         height = min(z + search.step_m * state.searched_places, top)
@@ -62,8 +62,8 @@ def _not_far(
 ) -> tuple[float, float]:
     """Return the goal, world x and y (m), limited to `WARY_M` from the last sighting, else from
     `start`."""
-    if mount.sights:
-        start = (mount.sights[-1].vehicle_m.real, mount.sights[-1].vehicle_m.imag)
+    if mount.sightings:
+        start = (mount.sightings[-1].vehicle_m.real, mount.sightings[-1].vehicle_m.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]
     part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
@@ -78,7 +78,7 @@ def not_found_reason(c: Context) -> str:
 
 SEARCH = PhaseDefinition(
     phase=Phase.SEARCH,
-    maneuver=Maneuver(in_the_open=True, by_camera=True, needs_pictures=True),
+    maneuver=Maneuver(in_free_air=True, is_camera_guided=True, needs_pictures=True),
     enter=enter,
     act=act,
     exits=(
