@@ -40,16 +40,16 @@ from perchctl.mission.belief.update import (
 )
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
-    LEAST_ORDERED_PART,
-    PEELED_M,
+    MAGNET_RELEASED_BELOW_M,
+    MIN_THRUST_FRACTION,
     descend_level,
-    waits_for_its_own_estimate,
+    should_wait_for_climb_rate,
 )
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Claim, Phase, Severity
 from perchctl.mission.release import (
-    catch_goal_above_m,
+    catch_setpoint_above_m,
     catch_slip,
     clear_contact_below,
     leave_press,
@@ -58,9 +58,9 @@ from perchctl.mission.release import (
 )
 from perchctl.mission.setpoints import (
     Action,
-    anchor_in_wind,
     hold_here,
     limit_setpoint,
+    move_setpoint_to_vehicle,
     step_towards,
 )
 from perchctl.mission.state import PlannerState
@@ -72,43 +72,43 @@ MANEUVER = Maneuver(descends=True)
 """Maneuver of a descent, for all of its policies."""
 
 # --- by setpoints, and off the magnet ---
-PEEL_BELOW_M = 0.35
+MAX_PEEL_SETPOINT_BELOW_M = 0.35
 """Largest distance of a setpoint below the vehicle, m. Larger: a vehicle that comes off the magnet
 falls."""
-PEEL_S = 4.0
+PEEL_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
 weight to it, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go late."""
-DROPPING_MPS = -0.35
+PEEL_FALL_MPS = -0.35
 """Vertical speed below which a vehicle is falling off the magnet while it peels off, m/s."""
-STOP_BELOW_M = 0.05
+MAX_LANDED_HEIGHT_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
-RESTS_MPS = 0.1
+MAX_RESTING_CLIMB_MPS = 0.1
 """Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
 still climbs or sinks."""
-ON_FLOOR_S = 0.5
+FLOOR_DWELL_S = 0.5
 """Time for which a vehicle must stand still before its motors are stopped, s."""
 
 # --- by the firmware's own landing ---
-REPEAT_ORDER_S = 0.3
+LANDING_ORDER_PERIOD_S = 0.3
 """Time between landing orders, s. Without its notify message, the firmware does not execute an
 order (docs/firmware.md, "Order without notify")."""
-LEAST_ORDERS = 3
+MIN_LANDING_ORDERS = 3
 """Number of landing orders before the telemetry can confirm that the vehicle lands."""
-MAX_ORDERS = 6
+MAX_LANDING_ORDERS = 6
 """Largest number of landing orders."""
-PLANNED_MPS = 0.35
+ONBOARD_LANDING_MEAN_MPS = 0.35
 """Mean speed of the quintic landing trajectory, m/s."""
-LANDING_MARGIN_S = 1.8
+ONBOARD_LANDING_MARGIN_S = 1.8
 """Time added to the quintic's duration, s."""
-PEAK_OF_MEAN = 1.875
+QUINTIC_PEAK_TO_MEAN_SPEED = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
-MOST_DRIFT_M = 1.0
+MAX_HEIGHT_DRIFT_M = 1.0
 """Largest assumed drift of the height, m."""
-FALLING_G = 0.5
+UNSUPPORTED_G = 0.5
 """Specific force below which the vehicle falls, g: no floor supports it."""
-FALLEN_MPS = 1.0
+MAX_DROP_SPEED_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
-FALLEN_BELOW_M = 0.4
+MIN_MIDAIR_CUT_HEIGHT_M = 0.4
 """Height above which stopped motors mean a cut in the air and not a landing, m."""
 
 
@@ -120,16 +120,16 @@ def step_landing(
     state = state or PlannerState.on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = observe(begin_landing(state), obs, profile, MANEUVER)
-    return remember_command(*act(Context(state)))
+    return record_command(*act(Context(state)))
 
 
-def remember_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
+def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
     """Return the state at the end of a tick that has decided on `command`, and the command."""
-    order = state.raw_order
+    order = state.raw_thrust_order
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
     belief = update_after_command(state.belief, command)
-    return replace(state, belief=belief, raw_order=order, t_s=belief.obs.t_s), command
+    return replace(state, belief=belief, raw_thrust_order=order, t_s=belief.obs.t_s), command
 
 
 def begin_landing(state: PlannerState) -> PlannerState:
@@ -145,18 +145,18 @@ def begin_landing(state: PlannerState) -> PlannerState:
         since={},
         belief=reset_evidence(b),
         pressed=state.catch_above_m is None and is_pressing(b),
-        ordered_s=None,
-        orders=0,
+        last_order_s=None,
+        order_count=0,
     )
-    return enter_landing(new, state)
+    return enter_descent(new, state)
 
 
-def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
+def enter_descent(state: PlannerState, before: PlannerState) -> PlannerState:
     """Return the state at the start of a landing; `before` is the state before the transition."""
     b, tel, old = state.belief, state.belief.telemetry, before.belief
     heard = b.attitude_age_s <= b.profile.safety.proof_age_s
     if heard and tel.has_bit(HL_ACTIVE) and not b.is_target_positioned and not b.diverged:
-        state = replace(state, orders=LEAST_ORDERS, ordered_s=b.obs.t_s)
+        state = replace(state, order_count=MIN_LANDING_ORDERS, last_order_s=b.obs.t_s)
     elif heard and tel.thrust < 1 and before.stopped_s is None:
         # The motors were stopped or never ran; no order may start them again.
         state = replace(state, stopped_s=b.obs.t_s)
@@ -167,7 +167,7 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
         # ceiling. It counts as free only after a sighting from below.
         contact_z_m = tel.position_m[2]
     # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
-    state = anchor_in_wind(Context(state))
+    state = move_setpoint_to_vehicle(Context(state))
     within = contact_z_m is not None or b.reckoning.distance_below_m < MAGNET_REACH_M
     lost = b.has_lost_position
     b = replace(
@@ -184,20 +184,20 @@ def enter_landing(state: PlannerState, before: PlannerState) -> PlannerState:
 def act(c: Context) -> Action:
     """Return the landing's new state and command: catch a fall, stop on the floor, or descend."""
     state = c.state
-    if _falls_free(c):
-        return _caught_again(c)
+    if _is_falling_free(c):
+        return _restart_with_catch(c)
     if state.stopped_s is None and state.catch_above_m is not None:
-        if (caught := _catch(c)) is not None:
+        if (caught := _catch_fall(c)) is not None:
             return caught
         c = Context(replace(state, catch_above_m=None))
-    if c.state.stopped_s is not None or _stands(c):
+    if c.state.stopped_s is not None or _is_standing(c):
         return stop_motors(c)
     if c.state.released_s is not None:
-        return _weight_on_magnet(c)
+        return _complete_weight_transfer(c)
     # changing to another policy during the firmware's own landing would cost height
-    if c.state.orders:
-        return _own_landing(c)
-    return _release(c) if c.held_s(HANGING) >= HANGING_DWELL_S else descend(c)
+    if c.state.order_count:
+        return _order_onboard_landing(c)
+    return _transfer_weight(c) if c.held_s(HANGING) >= HANGING_DWELL_S else descend(c)
 
 
 def descend(c: Context) -> Action:
@@ -213,7 +213,7 @@ def descend(c: Context) -> Action:
     """
     b = c.belief
     if not b.can_descend_by_position:
-        return _level(c)
+        return _descend_by_thrust(c)
     landing, in_reach, doubtful = (
         c.planner.landing,
         b.is_in_magnet_reach,
@@ -226,12 +226,12 @@ def descend(c: Context) -> Action:
         c = Context(state)
     low = b.height_m <= landing.handover_m
     if in_reach:
-        gives_up = c.in_phase_s > PEEL_S and (b.is_imu_fresh or not doubtful)
-        return _release(c) if gives_up else _by_setpoints(c)
+        gives_up = c.in_phase_s > PEEL_TIMEOUT_S and (b.is_imu_fresh or not doubtful)
+        return _transfer_weight(c) if gives_up else _descend_by_setpoints(c)
     if b.is_target_positioned:
-        return _level(c) if c.state.descent.thrust or low else _by_setpoints(c)
+        return _descend_by_thrust(c) if c.state.descent.thrust or low else _descend_by_setpoints(c)
     overdue = c.in_phase_s > landing.setpoint_time_s
-    return _own_landing(c) if doubtful or overdue or low else _by_setpoints(c)
+    return _order_onboard_landing(c) if doubtful or overdue or low else _descend_by_setpoints(c)
 
 
 def is_landing_over(c: Context) -> bool:
@@ -242,35 +242,37 @@ def is_landing_over(c: Context) -> bool:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
         if low and Claim.UNCONFIRMED in c.state.entry.claims:
             return True
-    return 0.0 < c.state.descent.thrust <= LEAST_ORDERED_PART * c.belief.hover_thrust + 1.0
+    return 0.0 < c.state.descent.thrust <= MIN_THRUST_FRACTION * c.belief.hover_thrust + 1.0
 
 
 # --- Falls, and proof of standing ---
 
 
-def _falls_free(c: Context) -> bool:
+def _is_falling_free(c: Context) -> bool:
     b, state = c.belief, c.state
     if not b.is_imu_fresh:
         return False
     if not state.is_under_power:
         return b.is_in_magnet_reach and has_slipped(b)
-    if state.orders:
+    if state.order_count:
         return False
     caught = state.catch_above_m is None
-    return b.contact_z_m is not None and caught and b.is_sinking(-DROPPING_MPS)
+    return b.contact_z_m is not None and caught and b.is_sinking(-PEEL_FALL_MPS)
 
 
-def _stands(c: Context) -> bool:
+def _is_standing(c: Context) -> bool:
     """True if the vehicle is proven to stand on the floor."""
     b = c.belief
-    if b.proves and c.held_s(ON_FLOOR) >= ON_FLOOR_S:
+    if b.proves and c.held_s(ON_FLOOR) >= FLOOR_DWELL_S:
         return True
     placed = b.is_target_positioned and b.is_position_valid and b.dead_reckoned_s is None
-    low = b.height_m < STOP_BELOW_M and not b.is_in_magnet_reach
-    return placed and c.state.descent.thrust > 0.0 and low and abs(b.climb_mps) < RESTS_MPS
+    low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_in_magnet_reach
+    return (
+        placed and c.state.descent.thrust > 0.0 and low and abs(b.climb_mps) < MAX_RESTING_CLIMB_MPS
+    )
 
 
-def _caught_again(c: Context) -> Action:
+def _restart_with_catch(c: Context) -> Action:
     """Restart the landing at the present height, with a catch."""
     tel, b = c.telemetry, c.belief
     belief = replace(
@@ -285,18 +287,18 @@ def _caught_again(c: Context) -> Action:
         released_s=None,
         stopped_s=None,
         pressed=False,
-        catch_above_m=catch_goal_above_m(b.hover_thrust, tel.thrust),
+        catch_above_m=catch_setpoint_above_m(b.hover_thrust, tel.thrust),
         setpoint=None,
-        ordered_s=None,
-        orders=0,
+        last_order_s=None,
+        order_count=0,
         descent=replace(c.state.descent, thrust=0.0),
         entry=replace(c.state.entry, t_s=c.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
     )
     c = Context(state)
-    return _catch(c) or descend(c)
+    return _catch_fall(c) or descend(c)
 
 
-def _catch(c: Context) -> Action | None:
+def _catch_fall(c: Context) -> Action | None:
     """Catch the fall by position; None without a heading or with diverged positions."""
     return None if c.belief.heading_lost or c.belief.diverged else catch_slip(c)
 
@@ -304,7 +306,7 @@ def _catch(c: Context) -> Action | None:
 # --- The four policies ---
 
 
-def _by_setpoints(c: Context) -> Action:
+def _descend_by_setpoints(c: Context) -> Action:
     """Sink straight down from the start of the landing, at the landing's speed."""
     landing, state, b = c.planner.landing, c.state, c.belief
     here = hold_here(c)
@@ -316,66 +318,76 @@ def _by_setpoints(c: Context) -> Action:
     goal = replace(start, x_m=x, y_m=y, z_m=b.ground_z_m + 0.5 * landing.handover_m)
     setpoint = step_towards(c, start, goal, down_mps=landing.speed_mps, turns=False)
     if b.telemetry_age_s <= c.safety.telemetry_hold_s:
-        setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
-    state = clear_contact_below(state, PEELED_M)
+        setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_SETPOINT_BELOW_M))
+    state = clear_contact_below(state, MAGNET_RELEASED_BELOW_M)
     state = replace(state, setpoint=setpoint, catch_above_m=None)
     dx, dy = state.integral_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
     return state, limit_setpoint(c, sent)
 
 
-def _level(c: Context) -> Action:
+def _descend_by_thrust(c: Context) -> Action:
     """Sink level by raw thrust; by setpoints for a while if no thrust for the descent is known."""
-    return _by_setpoints(c) if waits_for_its_own_estimate(c) else descend_level(c)
+    return _descend_by_setpoints(c) if should_wait_for_climb_rate(c) else descend_level(c)
 
 
-def onboard_landing(planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float) -> Land:
+def make_onboard_landing(
+    planner: PlannerConfig, ground_z_m: float, flown_s: float, z_m: float
+) -> Land:
     """Return the order for the firmware's own landing from height `z_m`, a quintic from rest to
     rest.
 
     The goal is below the ground, by a drift that grows with the flight time `flown_s`, and never
     above the vehicle: the motors stop at the end of the trajectory.
     """
-    drifted_m = min(MOST_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
+    drifted_m = min(MAX_HEIGHT_DRIFT_M, planner.landing.drift_mps * max(0.0, flown_s))
     axis_intersection_m = min(ground_z_m, z_m) - (planner.landing.undershoot_m + drifted_m)
     return Land(
         axis_intersection_m,
-        LANDING_MARGIN_S + PEAK_OF_MEAN * (z_m - axis_intersection_m) / PLANNED_MPS,
+        ONBOARD_LANDING_MARGIN_S
+        + QUINTIC_PEAK_TO_MEAN_SPEED * (z_m - axis_intersection_m) / ONBOARD_LANDING_MEAN_MPS,
     )
 
 
-def _own_landing(c: Context) -> Action:
+def _order_onboard_landing(c: Context) -> Action:
     """Order the firmware's own landing until the telemetry shows that the vehicle executes it."""
     tel, b = c.telemetry, c.belief
     state, away = leave_press(c)
-    if away is not None and not b.is_flight_data_unreliable and not state.orders:
+    if away is not None and not b.is_flight_data_unreliable and not state.order_count:
         return state, away
-    ends = state.orders >= LEAST_ORDERS and not (
-        b.is_position_valid and b.height_m >= FALLEN_BELOW_M
+    ends = state.order_count >= MIN_LANDING_ORDERS and not (
+        b.is_position_valid and b.height_m >= MIN_MIDAIR_CUT_HEIGHT_M
     )
-    carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
-    if b.is_imu_fresh and tel.thrust < 1 and carried and (state.orders or not tel.has_bit(FLYING)):
+    carried = tel.acc_z_g > UNSUPPORTED_G or (ends and tel.velocity_mps[2] > -MAX_DROP_SPEED_MPS)
+    if (
+        b.is_imu_fresh
+        and tel.thrust < 1
+        and carried
+        and (state.order_count or not tel.has_bit(FLYING))
+    ):
         return state, Idle()  # on the floor, another order would start the motors again
-    waited = math.inf if state.ordered_s is None else c.t_s - state.ordered_s
-    seen = state.orders >= LEAST_ORDERS and b.is_imu_fresh and tel.has_bit(HL_ACTIVE)
-    if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
+    waited = math.inf if state.last_order_s is None else c.t_s - state.last_order_s
+    seen = state.order_count >= MIN_LANDING_ORDERS and b.is_imu_fresh and tel.has_bit(HL_ACTIVE)
+    if not seen and waited > LANDING_ORDER_PERIOD_S and state.order_count < MAX_LANDING_ORDERS:
         flown_s = c.t_s - state.started_s
-        order = onboard_landing(c.planner, b.ground_z_m, flown_s, tel.position_m[2])
-        return replace(state, ordered_s=c.t_s, orders=state.orders + 1, setpoint=None), order
+        order = make_onboard_landing(c.planner, b.ground_z_m, flown_s, tel.position_m[2])
+        return replace(
+            state, last_order_s=c.t_s, order_count=state.order_count + 1, setpoint=None
+        ), order
     return state, Idle()
 
 
-def _release(c: Context) -> Action:
+def _transfer_weight(c: Context) -> Action:
     """Transfer the weight to the magnet, and accept older telemetry than a perch does."""
     return release_by_thrust(c, late_s=c.safety.telemetry_hold_s)
 
 
-def _weight_on_magnet(c: Context) -> Action:
+def _complete_weight_transfer(c: Context) -> Action:
     """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, order a
     thrust that carries most of the weight: a hanging vehicle stays, and a fallen one does not
     climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
-        return _release(c)
-    part = LEAST_ORDERED_PART * c.belief.hover_thrust
+        return _transfer_weight(c)
+    part = MIN_THRUST_FRACTION * c.belief.hover_thrust
     thrust = int(max(KEEPALIVE_THRUST, min(MIN_POSITION_MODE_THRUST, part)))
     return replace(c.state, released_s=c.t_s), RawThrust(thrust)

@@ -20,34 +20,36 @@ from perchctl.mission.state import BatteryOutlook
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
-UNKNOWN_S = 5.0
+MAX_READING_GAP_S = 5.0
 """Time without a reading after which the charge is unknown, s."""
 STANDOFF_SETTLING_S = 3.0
 """Time that settling at the stand-off takes, s, as measured in simulated flights."""
-TOUCHING_S = 1.0
+TOUCH_DURATION_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
-LANDING_S = 3.0
+LANDING_END_DURATION_S = 3.0
 """Time that the end of a landing takes beyond the descent, s, as measured in simulated flights."""
-PRESS_DIP_V = 0.3
+MAX_PRESS_VOLTAGE_DIP_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
-BACK_OFF_S = 3.0
+BACK_OFF_DURATION_S = 3.0
 """Time after an attempt until the vehicle is steady and sees the target again, s."""
 
 
-def battery_outlook(c: Context) -> BatteryOutlook:
+def compute_battery_outlook(c: Context) -> BatteryOutlook:
     """Return how long the battery lasts, and for how many attempts. An unknown charge counts for at
     most the time that a vehicle without a reading may fly (fault 7)."""
     energy = c.belief.energy
     used_mah = energy.counted_discharge * c.profile.vehicle.battery_mah
     load = (c.belief.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
-    counted_s = hover_left_s(energy, c.profile, load, identify_drive(c.telemetry))
-    seconds = None if energy.no_reading_s > UNKNOWN_S else counted_s
+    counted_s = predict_hover_time_s(energy, c.profile, load, identify_drive(c.telemetry))
+    seconds = None if energy.no_reading_s > MAX_READING_GAP_S else counted_s
     if c.belief.target.world_m is None:
         return BatteryOutlook(seconds, None, used_mah, energy.rest_v)
-    enough_s, (attempt_s, again_s, landing_s) = seconds, attempt_retry_landing_s(c)
+    enough_s, (attempt_s, again_s, landing_s) = seconds, predict_durations_s(c)
     if enough_s is None:
-        enough_s = _grace_s(c) if counted_s is None else min(counted_s, _grace_s(c))
+        enough_s = (
+            _no_reading_grace_s(c) if counted_s is None else min(counted_s, _no_reading_grace_s(c))
+        )
     spare_s = enough_s - c.safety.energy_reserve_s - landing_s - attempt_s
     left = c.planner.attempts - c.state.attempts
     attempts = 0  # also for values that are NaN
@@ -56,7 +58,9 @@ def battery_outlook(c: Context) -> BatteryOutlook:
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used_mah, energy.rest_v)
 
 
-def hover_left_s(state: BatteryFit, profile: Profile, load: float, drive: Drive) -> float | None:
+def predict_hover_time_s(
+    state: BatteryFit, profile: Profile, load: float, drive: Drive
+) -> float | None:
     """Return the hover time, s, at `load` (share of full thrust) until `battery-low` fires; None if
     unknown."""
     if state.rest_v is None or state.loaded_s < MIN_LOADED_S or not load > 0.0:
@@ -65,8 +69,8 @@ def hover_left_s(state: BatteryFit, profile: Profile, load: float, drive: Drive)
     hover_v = max(
         float(profile.link.parameters.get("pm.lowVoltage", drive.low_power_v)), safety.min_load_v
     )
-    lasts = TOUCHING_S + perch.contact_dwell_s > safety.battery_debounce_s
-    press_v = safety.min_load_v - (0.0 if lasts else PRESS_DIP_V)
+    lasts = TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
+    press_v = safety.min_load_v - (0.0 if lasts else MAX_PRESS_VOLTAGE_DIP_V)
     press_load = max(load, max_press_thrust(profile) / FULL_THRUST)
     sag_v, discharge_factor = fit_sag_model(state)
     end_v = max(hover_v + sag_v * load, press_v + sag_v * press_load)
@@ -76,36 +80,38 @@ def hover_left_s(state: BatteryFit, profile: Profile, load: float, drive: Drive)
     )
 
 
-def attempt_retry_landing_s(c: Context) -> tuple[float, float, float]:
+def predict_durations_s(c: Context) -> tuple[float, float, float]:
     """Return the times, s, that this attempt, each retry and the landing take, in this order, from
     the height of the known target."""
     planner = c.planner
     up_m = max(0.0, c.belief.target.contact_body_z_m - c.telemetry.position_m[2])
-    touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
+    touch_s = STANDOFF_SETTLING_S + planner.ascend.settle_dwell_s + TOUCH_DURATION_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
     if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
-        aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
+        aligned_s = (
+            BACK_OFF_DURATION_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_DURATION_S
+        )
     again_m = planner.recover.descend_m + planner.ascend.standoff_m
-    attempt_s = aligned_s + _climb_s(c.profile, up_m) + touch_s
-    again_s = 2.0 * BACK_OFF_S + _climb_s(c.profile, again_m) + touch_s
+    attempt_s = aligned_s + _climb_duration_s(c.profile, up_m) + touch_s
+    again_s = 2.0 * BACK_OFF_DURATION_S + _climb_duration_s(c.profile, again_m) + touch_s
     return (
         attempt_s,
         again_s,
-        max(0.0, c.belief.height_m + up_m) / planner.landing.speed_mps + LANDING_S,
+        max(0.0, c.belief.height_m + up_m) / planner.landing.speed_mps + LANDING_END_DURATION_S,
     )
 
 
-def is_short_of_charge(c: Context) -> bool:
+def is_charge_too_low(c: Context) -> bool:
     """True if the charge is too low for an attempt at a known target."""
     gated = c.safety.energy_gate and c.belief.target.world_m is not None
     return gated and not c.state.battery.attempts
 
 
-def battery_shortfall(c: Context) -> str:
+def battery_shortfall_text(c: Context) -> str:
     """Return the remaining time, and the times that an attempt, the landing and the reserve
     take."""
-    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, attempt_retry_landing_s(c)
+    seconds, (attempt_s, _, landing_s) = c.state.battery.remaining_s, predict_durations_s(c)
     has = "what the battery has left is not known"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"
@@ -115,12 +121,12 @@ def battery_shortfall(c: Context) -> str:
     )
 
 
-def _grace_s(c: Context) -> float:
+def _no_reading_grace_s(c: Context) -> float:
     """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
     return c.safety.battery_stale_s - max(c.belief.energy.no_reading_s, c.obs.battery_age_s)
 
 
-def _climb_s(profile: Profile, up_m: float) -> float:
+def _climb_duration_s(profile: Profile, up_m: float) -> float:
     ascend = profile.planner.ascend
     near_m = min(up_m, ascend.near_m)
     return (up_m - near_m) / ascend.speed_mps + near_m / ascend.near_speed_mps

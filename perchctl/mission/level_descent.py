@@ -1,15 +1,15 @@
 """Descend level by raw thrust, controlled by the vertical speed alone, without a position.
 
 Let T_h be the hover thrust, v the climb rate (from the accelerometer if no position measures it), u
-the climb rate that recent orders have caused but no sample shows yet, and s the sink rate setpoint.
-Then
+the climb rate that recent orders have caused but no sample shows yet, and s the sink rate
+setpoint. Then
 
     T = T_h (1 - k (v + u + s)) / cos(tilt)
 
 is a proportional rate controller. The gain k falls with the age of v, otherwise the vehicle would
 oscillate. With old telemetry and the target in view, v is the climb rate from pictures. A vehicle
 that does not sink gets less and less thrust until it sinks, the magnet lets go, or the floor is
-detected. Laterally, the vehicle leans against the wind and brakes (`_braking`).
+detected. Laterally, the vehicle leans against the wind and brakes (`_compute_braking_attitude`).
 """
 
 from __future__ import annotations
@@ -28,102 +28,102 @@ from perchctl.mission.state import PlannerState
 from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
-LEVEL_SINK_MPS = 0.7
+SINK_SETPOINT_MPS = 0.7
 """Sink rate setpoint, m/s. The gyroscope's offset moves the vehicle 2 m laterally in 4 s. Larger:
 the vehicle lands harder if the floor is not detected. Smaller: it lands further from the target's
 axis."""
-LOW_SINK_MPS = 0.4
+NEAR_FLOOR_SINK_SETPOINT_MPS = 0.4
 """Sink rate setpoint near the floor, m/s."""
-SLOW_BELOW_M = 0.6
-"""Height below which the vehicle sinks at `LOW_SINK_MPS`, m."""
-MOST_GAIN_S_PER_M = 0.5
+NEAR_FLOOR_HEIGHT_M = 0.6
+"""Height below which the vehicle sinks at `NEAR_FLOOR_SINK_SETPOINT_MPS`, m."""
+MAX_GAIN_S_PER_M = 0.5
 """Largest gain, in shares of the hover thrust per m/s. Larger: the vehicle oscillates."""
-LEAST_GAIN_S_PER_M = 0.2
+MIN_GAIN_S_PER_M = 0.2
 """Smallest gain, with old telemetry, in shares of the hover thrust per m/s."""
-GAIN_AGE_S2_PER_M = 0.06
+GAIN_TIMES_AGE_S2_PER_M = 0.06
 """Product of gain and age of the vertical speed, between the smallest and the largest gain."""
-UNHEARD_PART = 0.98
+UNMEASURED_THRUST_FACTOR = 0.98
 """Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
-SEEN_SINK_MPS = 0.4
+CAMERA_SINK_SETPOINT_MPS = 0.4
 """Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
 vehicle lands harder. Smaller: it drifts for longer."""
-SEEN_LEAST_SINK_MPS = 0.2
+MIN_CAMERA_SINK_MPS = 0.2
 """Sink rate from pictures below which the vehicle does not sink, m/s; the error of single
 detections is half of it."""
-BRAKE_BY_TARGET_RAD_PER_MPS = 0.15
+CAMERA_BRAKE_GAIN_RAD_PER_MPS = 0.15
 """Lean per lateral speed from pictures. Larger: the vehicle oscillates, since the lean itself looks
 like a motion. Smaller: it drifts further."""
-ON_THE_SPOT_S = 0.6
+SETPOINT_SETTLING_S = 0.6
 """Time at a constant setpoint after which no speed remains, s."""
-RAMP_PER_S = 0.25
+THRUST_RAMP_PER_S = 0.25
 """Rate at which the thrust of a vehicle that does not sink is reduced, in shares of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
-SEEN_RAMP_PER_S = 0.1
+CAMERA_THRUST_RAMP_PER_S = 0.1
 """Rate of that reduction with pictures, which show a sink only after a quarter of a second. Larger:
 the vehicle falls at first. Smaller: it stands on the floor for longer with running motors."""
-LEAST_SINK_MPS = 0.05
+MIN_SINK_MPS = 0.05
 """Sink rate below which the vehicle does not sink, m/s."""
-LEAST_ORDERED_PART = 0.4
+MIN_THRUST_FRACTION = 0.4
 """Smallest ordered thrust, as a share of the hover thrust."""
-LEAST_COSINE = 0.8
+MIN_TILT_COSINE = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
-BRAKE_RAD_PER_MPS = 0.25
+BRAKE_GAIN_RAD_PER_MPS = 0.25
 """Lean per lateral speed."""
-SEEN_BRAKED_S = 0.5
+MAX_CAMERA_SPEED_AGE_S = 0.5
 """Oldest lateral speed from pictures that the vehicle brakes, s. Larger: after the last picture it
 keeps leaning against a speed that is gone. Smaller: a few lost pictures end the braking."""
-MOST_BRAKE_RAD = 0.22
+MAX_BRAKE_TILT_RAD = 0.22
 """Largest lean due to the lateral speed, rad; it costs 2.5 % of the thrust."""
-MOST_LEAN_RAD = 0.2
+MAX_WIND_TILT_RAD = 0.2
 """Largest lean against the wind, rad: a wind of 6 m/s. Larger: a blow or a wrong bias moves the
 vehicle far off."""
-BRAKED_AGE_S = 0.2
+MAX_FULL_BRAKE_AGE_S = 0.2
 """Age of the speed above which it is braked less, s; otherwise the vehicle would oscillate."""
-UNSURE_MPS = 0.05
+INITIAL_LATERAL_SIGMA_MPS = 0.05
 """Uncertainty of the lateral speed when the position is lost, m/s."""
-UNSURE_MPS2 = 0.1
+LATERAL_SIGMA_GROWTH_MPS2 = 0.1
 """Growth of that uncertainty, m/s per second: an attitude error of 0.01 rad adds 0.1."""
-MOST_UNSURE_MPS = 0.3
+MAX_LATERAL_SIGMA_MPS = 0.3
 """Largest uncertainty of the lateral speed, m/s."""
-LEVEL_FELT_S = 6.0
+MAX_ATTITUDE_ERROR_AGE_S = 6.0
 """Time after which the attitude error that pictures have shown no longer applies, s."""
-CARRIED_G = 0.95
+MIN_SUPPORTED_G = 0.95
 """Above this specific force, g, a vehicle at low thrust must be resting on something."""
-CARRIED_PART = 0.88
+MAX_SUPPORTED_THRUST_FRACTION = 0.88
 """Largest thrust that counts as low, as a share of the hover thrust."""
-AIRBORNE_G = 0.85
+MAX_AIRBORNE_G = 0.85
 """Specific force below which the vehicle is in the air, g, even if the descent is overdue."""
-TOUCH_PART = 0.5
+TOUCHDOWN_THRUST_FRACTION = 0.5
 """Thrust right after the floor was detected, as a share of the hover thrust."""
-TOUCH_S = 0.25
+TOUCHDOWN_DURATION_S = 0.25
 """Time for which that thrust lasts, s; a blow within this time belongs to the touchdown."""
-TOUCH_BELOW_M = 0.7
+MAX_FLOOR_IMPACT_HEIGHT_M = 0.7
 """Height below which a blow from below is the floor's, m."""
-LEVEL_SPARE_S = 2.0
+DESCENT_MARGIN_S = 2.0
 """Time beyond the expected duration after which the vehicle has landed or hangs, s."""
-UNHEARD_SPARE_S = 0.8
+UNMEASURED_DESCENT_MARGIN_S = 0.8
 """The same margin without a measured vertical speed, s."""
-OWN_ESTIMATE_S = 1.5
+MAX_SETPOINT_DESCENT_S = 1.5
 """Time for which a vehicle with old telemetry and a rough hover thrust descends by setpoints, on
 its own estimate, s."""
-LEVEL_MEAN_MPS = 0.35
+MIN_MEAN_SINK_MPS = 0.35
 """Least mean speed of the descent, m/s."""
-PEELED_M = 0.1
+MAGNET_RELEASED_BELOW_M = 0.1
 """Distance below the contact at which the magnet has let go, m. Larger: a vehicle that has come off
 still seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
-SEEN_BELOW_M = 0.2
+CAMERA_MAGNET_RELEASED_BELOW_M = 0.2
 """The same distance from pictures with an old attitude, m. Larger: the vehicle drifts for longer
 before it brakes. Smaller: a target seen at an angle seems to be above."""
-SEEN_STANDING_PART = 0.75
+CAMERA_STANDING_THRUST_FRACTION = 0.75
 """Share of the hover thrust at which a vehicle without motion in the pictures stands on the floor:
 in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the floor.
 Smaller: the motors run on the floor for longer."""
-MOST_STEP_S = 0.1
+MAX_RAMP_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
 
-def _seen_motion(c: Context) -> TargetMotion | None:
+def _camera_motion(c: Context) -> TargetMotion | None:
     """Return the motion from pictures if the telemetry is old and the pictures are newer; else
     None."""
     b, seen = c.belief, c.belief.target_motion
@@ -131,7 +131,7 @@ def _seen_motion(c: Context) -> TargetMotion | None:
     return seen if old and seen.is_known and seen.t_s > b.telemetry.t_s else None
 
 
-def _is_seen_again(c: Context) -> bool:
+def _is_target_redetected(c: Context) -> bool:
     """True if the telemetry is old and the target is detected again, but not yet for long enough to
     determine the motion."""
     b, seen = c.belief, c.belief.target_motion
@@ -139,72 +139,74 @@ def _is_seen_again(c: Context) -> bool:
     return old and not seen.is_known and seen.t_s > max(b.telemetry.t_s, c.state.entry.t_s)
 
 
-def _measured_s(c: Context) -> float:
+def _climb_measured_at_s(c: Context) -> float:
     """Return the time at which telemetry or pictures measured the vertical speed."""
-    seen = _seen_motion(c)
+    seen = _camera_motion(c)
     return c.telemetry.t_s if seen is None else seen.t_s - CAMERA_VELOCITY_TIME_CONSTANT_S
 
 
-def _is_unmeasured(c: Context) -> bool:
+def _is_climb_unknown(c: Context) -> bool:
     """True if telemetry and pictures are too old to determine the vertical speed."""
-    return _age_s(c) > hover.MAX_TELEMETRY_AGE_S
+    return _climb_age_s(c) > hover.MAX_TELEMETRY_AGE_S
 
 
-def _step_s(c: Context) -> float:
-    """Return the time since the previous tick, s, at most `MOST_STEP_S`."""
-    return max(0.0, min(MOST_STEP_S, c.t_s - c.state.t_s))
+def _tick_duration_s(c: Context) -> float:
+    """Return the time since the previous tick, s, at most `MAX_RAMP_STEP_S`."""
+    return max(0.0, min(MAX_RAMP_STEP_S, c.t_s - c.state.t_s))
 
 
-def _age_s(c: Context) -> float:
+def _climb_age_s(c: Context) -> float:
     """Return the age of the vertical speed, s: at least one tick."""
-    return max(1e-3, _step_s(c), c.t_s - _measured_s(c))
+    return max(1e-3, _tick_duration_s(c), c.t_s - _climb_measured_at_s(c))
 
 
-def waits_for_its_own_estimate(c: Context) -> bool:
+def should_wait_for_climb_rate(c: Context) -> bool:
     """True if the vertical speed is unknown and the hover thrust is rough: setpoints are better for
     a while."""
     begins_rough = c.state.descent.thrust == 0.0 and c.belief.hover.is_imprecise
-    return _is_unmeasured(c) and begins_rough and c.in_phase_s < OWN_ESTIMATE_S
+    return _is_climb_unknown(c) and begins_rough and c.in_phase_s < MAX_SETPOINT_DESCENT_S
 
 
 def descend_level(c: Context) -> Action:
     """Sink level by raw thrust controlled by the vertical speed, tilted against the lateral
     speed."""
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
-    dt_s, age_s, measured_s = _step_s(c), _age_s(c), _measured_s(c)
+    dt_s, age_s, measured_s = _tick_duration_s(c), _climb_age_s(c), _climb_measured_at_s(c)
     measured_mps = _measured_climb_mps(c)
-    climb_mps = measured_mps + descent.under_way_mps
-    sinks, ramp_per_s = climb_mps <= -LEAST_SINK_MPS, RAMP_PER_S
-    if _seen_motion(c) is not None:  # on the floor, recent orders cause no climb
-        sinks, ramp_per_s = measured_mps <= -SEEN_LEAST_SINK_MPS, SEEN_RAMP_PER_S
+    climb_mps = measured_mps + descent.pending_climb_mps
+    sinks, ramp_per_s = climb_mps <= -MIN_SINK_MPS, THRUST_RAMP_PER_S
+    if _camera_motion(c) is not None:  # on the floor, recent orders cause no climb
+        sinks, ramp_per_s = measured_mps <= -MIN_CAMERA_SINK_MPS, CAMERA_THRUST_RAMP_PER_S
     hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoned_s is None else b.reckoned_height_m
     height_m += min(0.0, climb_mps) * age_s
-    thrust = _rate_thrust(c, hover_thrust, climb_mps, height_m)
+    thrust = _sink_rate_thrust(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_S:
-        thrust *= UNHEARD_PART
-    floor_detected_s = _floor_detected_s(c, hover_thrust, height_m, sinks=sinks)
+        thrust *= UNMEASURED_THRUST_FACTOR
+    floor_detected_s = _find_floor_detection_s(c, hover_thrust, height_m, sinks=sinks)
     touched_s = math.inf if floor_detected_s is None else c.t_s - floor_detected_s
     # In the air, the accelerometer reads the thrust; on the floor, it reads 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
-    if touched_s >= TOUCH_S and falls:
+    if touched_s >= TOUCHDOWN_DURATION_S and falls:
         floor_detected_s = None  # the vehicle falls at low thrust, so it did not touch the floor
     carried = (
-        b.is_imu_fresh and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover_thrust
+        b.is_imu_fresh
+        and tel.acc_z_g > MIN_SUPPORTED_G
+        and tel.thrust < MAX_SUPPORTED_THRUST_FRACTION * hover_thrust
     )
-    overdue = _is_overdue(c) and not (b.is_imu_fresh and tel.acc_z_g < AIRBORNE_G)
+    overdue = _is_overdue(c) and not (b.is_imu_fresh and tel.acc_z_g < MAX_AIRBORNE_G)
     before = descent.thrust or hover_thrust
-    if touched_s < TOUCH_S:
-        thrust = TOUCH_PART * hover_thrust
-    elif _is_seen_again(c):
+    if touched_s < TOUCHDOWN_DURATION_S:
+        thrust = TOUCHDOWN_THRUST_FRACTION * hover_thrust
+    elif _is_target_redetected(c):
         thrust = before
     elif floor_detected_s is not None or carried or not sinks or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
-    thrust = max(LEAST_ORDERED_PART * hover_thrust, min(MAX_RAW_THRUST, thrust))
+    thrust = max(MIN_THRUST_FRACTION * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the orders since the newest sample have caused.
-    shown_s = 0.0 if b.last is None else max(0.0, measured_s - descent.sample_s)
+    shown_s = 0.0 if b.last is None else max(0.0, measured_s - descent.climb_measured_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
-    under_way_mps = descent.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
+    pending_climb_mps = descent.pending_climb_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
     state = _clear_contact_after_fall(c)
     state = replace(
         state,
@@ -212,64 +214,68 @@ def descend_level(c: Context) -> Action:
             descent,
             thrust=thrust,
             floor_detected_s=floor_detected_s,
-            under_way_mps=under_way_mps,
-            sample_s=measured_s,
+            pending_climb_mps=pending_climb_mps,
+            climb_measured_s=measured_s,
         ),
         setpoint=None,
-        orders=0,
+        order_count=0,
         catch_above_m=None,
     )
-    roll_rad, pitch_rad = (0.0, 0.0) if floor_detected_s is not None else _braking(c)
+    roll_rad, pitch_rad = (
+        (0.0, 0.0) if floor_detected_s is not None else _compute_braking_attitude(c)
+    )
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
 
 
 def _measured_climb_mps(c: Context) -> float:
     """Return the last measured vertical speed, from telemetry or pictures; 0 if setpoints have held
     the vehicle in place since the last telemetry."""
-    seen = _seen_motion(c)
+    seen = _camera_motion(c)
     if seen is not None:
         return seen.velocity_mps[2]
-    held = c.telemetry.t_s < c.state.entry.t_s - ON_THE_SPOT_S
+    held = c.telemetry.t_s < c.state.entry.t_s - SETPOINT_SETTLING_S
     return 0.0 if held else c.belief.climb_mps
 
 
-def _floor_detected_s(
+def _find_floor_detection_s(
     c: Context, hover_thrust: float, height_m: float, *, sinks: bool
 ) -> float | None:
     """Return when the floor was first detected: by a blow from below during a sink, or by pictures
     of a motionless vehicle at a thrust too low to carry it."""
-    descent, b, seen = c.state.descent, c.belief, _seen_motion(c)
+    descent, b, seen = c.state.descent, c.belief, _camera_motion(c)
     if descent.floor_detected_s is not None:
         return descent.floor_detected_s
-    struck = c.t_s - b.imu.blow_s < TOUCH_S and b.reckoning.impact_mps < 0.0
-    weak = 0.0 < descent.thrust < SEEN_STANDING_PART * hover_thrust
-    stands = seen is not None and seen.e_m[2] > SEEN_BELOW_M and weak and not sinks
-    return c.t_s if stands or (struck and height_m < TOUCH_BELOW_M) else None
+    struck = c.t_s - b.imu.blow_s < TOUCHDOWN_DURATION_S and b.reckoning.impact_mps < 0.0
+    weak = 0.0 < descent.thrust < CAMERA_STANDING_THRUST_FRACTION * hover_thrust
+    stands = (
+        seen is not None and seen.e_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M and weak and not sinks
+    )
+    return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 
 
-def _rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: float) -> float:
+def _sink_rate_thrust(c: Context, hover_thrust: float, climb_mps: float, height_m: float) -> float:
     """Return the rate controller's thrust, by the equation in the module docstring."""
     b = c.belief
     # Late pictures may place the floor half a metre too low.
-    low = height_m <= SLOW_BELOW_M or b.mismatch.later_s != 0.0
-    sink_mps = LOW_SINK_MPS if low else LEVEL_SINK_MPS
-    if _seen_motion(c) is not None:
-        sink_mps = SEEN_SINK_MPS
-    gain = GAIN_AGE_S2_PER_M / max(1e-3, c.t_s - _measured_s(c))
-    gain = max(LEAST_GAIN_S_PER_M, min(MOST_GAIN_S_PER_M, gain))
-    tilt = max(LEAST_COSINE, math.cos(b.tilt_rad))
+    low = height_m <= NEAR_FLOOR_HEIGHT_M or b.mismatch.later_s != 0.0
+    sink_mps = NEAR_FLOOR_SINK_SETPOINT_MPS if low else SINK_SETPOINT_MPS
+    if _camera_motion(c) is not None:
+        sink_mps = CAMERA_SINK_SETPOINT_MPS
+    gain = GAIN_TIMES_AGE_S2_PER_M / max(1e-3, c.t_s - _climb_measured_at_s(c))
+    gain = max(MIN_GAIN_S_PER_M, min(MAX_GAIN_S_PER_M, gain))
+    tilt = max(MIN_TILT_COSINE, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
 
 def _clear_contact_after_fall(c: Context) -> PlannerState:
     """Return the state, without its contact once a position or pictures show the vehicle lower, or
     after a fall."""
-    state, b, seen = c.state, c.belief, _seen_motion(c)
+    state, b, seen = c.state, c.belief, _camera_motion(c)
     if b.is_position_valid and b.dead_reckoned_s is None:
-        return clear_contact_below(state, PEELED_M)
+        return clear_contact_below(state, MAGNET_RELEASED_BELOW_M)
     in_reach_since_s = b.in_reach_since_s
     fell = in_reach_since_s is not None and b.imu.fell_s > max(in_reach_since_s, state.entry.t_s)
-    seen_below = seen is not None and seen.e_m[2] > SEEN_BELOW_M
+    seen_below = seen is not None and seen.e_m[2] > CAMERA_MAGNET_RELEASED_BELOW_M
     if fell or (b.is_in_magnet_reach and seen_below):
         belief = replace(
             b,
@@ -290,14 +296,14 @@ def _is_overdue(c: Context) -> bool:
         return False
     way_m = max(0.0, state.entry.position_m[2] - b.ground_z_m)
     began_s = max(b.dead_reckoned_s or 0.0, state.entry.t_s)
-    measured = c.t_s - _measured_s(c) <= hover.MAX_TELEMETRY_AGE_S
-    spare_s = LEVEL_SPARE_S if measured else UNHEARD_SPARE_S
+    measured = c.t_s - _climb_measured_at_s(c) <= hover.MAX_TELEMETRY_AGE_S
+    spare_s = DESCENT_MARGIN_S if measured else UNMEASURED_DESCENT_MARGIN_S
     if not measured and b.hover.is_imprecise:
-        spare_s += OWN_ESTIMATE_S
-    return c.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
+        spare_s += MAX_SETPOINT_DESCENT_S
+    return c.t_s - began_s > spare_s + way_m / MIN_MEAN_SINK_MPS
 
 
-def _braking(c: Context) -> tuple[float, float]:
+def _compute_braking_attitude(c: Context) -> tuple[float, float]:
     """Return roll and pitch that balance the wind and brake the lateral speed; level without a
     heading.
 
@@ -318,40 +324,43 @@ def _braking(c: Context) -> tuple[float, float]:
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if b.dead_reckoned_s is None else c.t_s - b.dead_reckoned_s
     felt_s = math.inf if c.obs.felt is None else c.t_s - c.obs.felt.t_s
-    unsure_mps = min(MOST_UNSURE_MPS, UNSURE_MPS + UNSURE_MPS2 * min(blind_s, felt_s))
+    unsure_mps = min(
+        MAX_LATERAL_SIGMA_MPS,
+        INITIAL_LATERAL_SIGMA_MPS + LATERAL_SIGMA_GROWTH_MPS2 * min(blind_s, felt_s),
+    )
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
-    part *= min(1.0, BRAKED_AGE_S / max(1e-3, b.attitude_age_s))
-    ahead_mps, left_mps = _in_heading(part * x_mps, part * y_mps, yaw_rad)
-    seen, gain = _seen_motion(c), BRAKE_RAD_PER_MPS
+    part *= min(1.0, MAX_FULL_BRAKE_AGE_S / max(1e-3, b.attitude_age_s))
+    ahead_mps, left_mps = _rotate_to_heading(part * x_mps, part * y_mps, yaw_rad)
+    seen, gain = _camera_motion(c), BRAKE_GAIN_RAD_PER_MPS
     if seen is not None and b.is_camera_consistent:
-        ahead_mps, left_mps, gain = 0.0, 0.0, BRAKE_BY_TARGET_RAD_PER_MPS
-        if c.t_s - seen.t_s <= SEEN_BRAKED_S:
+        ahead_mps, left_mps, gain = 0.0, 0.0, CAMERA_BRAKE_GAIN_RAD_PER_MPS
+        if c.t_s - seen.t_s <= MAX_CAMERA_SPEED_AGE_S:
             ahead_mps, left_mps, _ = seen.velocity_mps
     (bias_x_mps2, bias_y_mps2, _), (x_mps2, y_mps2) = (
         reckoning.bias_mps2,
         reckoning.mean_lateral_mps2,
     )
     known = 0.0 if b.diverged else min(1.0, reckoning.held_s / BIAS_TIME_CONSTANT_S)
-    counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / LEVEL_FELT_S)
-    ahead_mps2, left_mps2 = _in_heading(
+    counts = known + (1.0 - known) * max(0.0, 1.0 - felt_s / MAX_ATTITUDE_ERROR_AGE_S)
+    ahead_mps2, left_mps2 = _rotate_to_heading(
         counts * bias_x_mps2 - known * x_mps2, counts * bias_y_mps2 - known * y_mps2, yaw_rad
     )
     roll_rad, pitch_rad = c.obs.imu.misled_rad
     return (
-        _against(-left_mps, gain) - _lean_rad(left_mps2) + roll_rad,
-        _against(ahead_mps, gain) + _lean_rad(ahead_mps2) + pitch_rad,
+        _brake_tilt_rad(-left_mps, gain) - _wind_tilt_rad(left_mps2) + roll_rad,
+        _brake_tilt_rad(ahead_mps, gain) + _wind_tilt_rad(ahead_mps2) + pitch_rad,
     )
 
 
-def _in_heading(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
+def _rotate_to_heading(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
     """Return world x and y as ahead and left of a vehicle with this heading."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 
 
-def _lean_rad(mps2: float) -> float:
-    return max(-MOST_LEAN_RAD, min(MOST_LEAN_RAD, math.atan(mps2 / GRAVITY_MPS2)))
+def _wind_tilt_rad(mps2: float) -> float:
+    return max(-MAX_WIND_TILT_RAD, min(MAX_WIND_TILT_RAD, math.atan(mps2 / GRAVITY_MPS2)))
 
 
-def _against(mps: float, rad_per_mps: float) -> float:
-    return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -rad_per_mps * mps))
+def _brake_tilt_rad(mps: float, rad_per_mps: float) -> float:
+    return max(-MAX_BRAKE_TILT_RAD, min(MAX_BRAKE_TILT_RAD, -rad_per_mps * mps))

@@ -6,7 +6,7 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.update import has_gap, update_belief
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Phase
-from perchctl.mission.release import CATCH_STILL_ABOVE_M
+from perchctl.mission.release import CATCH_ABOVE_MOTORS_OFF_M
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -24,20 +24,20 @@ def observe(
     known = state.belief.last is not None
     belief = update_belief(state.belief, obs, state.sent(maneuver), profile)
     state = replace(state, belief=belief)
-    return _moved_with_estimate(state) if obs.jumped and known else state
+    return _apply_frame_shift(state) if obs.jumped and known else state
 
 
-def _moved_with_estimate(state: PlannerState) -> PlannerState:
+def _apply_frame_shift(state: PlannerState) -> PlannerState:
     """Return the state after a jump of the estimate. The firmware's own landing follows a
     trajectory in the old frame, so the vehicle is caught and the landing ordered again."""
     b, blocked_z_m = state.belief, state.blocked_z_m
-    if state.phase is Phase.LANDING and state.orders and b.telemetry.thrust >= 1:
+    if state.phase is Phase.LANDING and state.order_count and b.telemetry.thrust >= 1:
         state = replace(
             state,
             entry=replace(state.entry, t_s=b.obs.t_s),
-            orders=0,
-            ordered_s=None,
-            catch_above_m=CATCH_STILL_ABOVE_M,
+            order_count=0,
+            last_order_s=None,
+            catch_above_m=CATCH_ABOVE_MOTORS_OFF_M,
         )
     return replace(
         state,

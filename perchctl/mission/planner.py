@@ -17,13 +17,13 @@ from perchctl.mission.belief.evidence import update_since
 from perchctl.mission.belief.quality import hold_reason
 from perchctl.mission.belief.update import reset_evidence
 from perchctl.mission.context import Context
-from perchctl.mission.descent import remember_command
-from perchctl.mission.endurance import battery_outlook
+from perchctl.mission.descent import record_command
+from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import LIFT_ABOVE_M
-from perchctl.mission.setpoints import Action, fly_to, sink_setpoint
+from perchctl.mission.phases.approach import MIN_HEIGHT_CONTROL_M
+from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
 from perchctl.mission.table import CONDITIONS, PHASES, TABLE, first_transition
 from perchctl.mission.transition import Transition
@@ -39,37 +39,41 @@ def step_mission(
     table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the mission; `state` is None in the first tick, on the ground."""
-    state = _believe(state or PlannerState.on_ground(obs, profile), obs, profile)
+    state = _update_before_decision(state or PlannerState.on_ground(obs, profile), obs, profile)
     c = Context(state)
     row = first_transition(c, table)
     if row is None:
-        state = replace(state, waits="")
-    elif row.waits_in(state.phase):
+        state = replace(state, waiting_reason="")
+    elif row.is_waiting_row_of(state.phase):
         waited_s = state.waited_s + obs.t_s - state.t_s
-        state = replace(state, waits=row.reason_text(c), waited_s=waited_s)
+        state = replace(state, waiting_reason=row.reason_text(c), waited_s=waited_s)
     else:
-        state = _enter(c, row)
+        state = _enter_phase(c, row)
         hold = hold_reason(state.belief, PHASES[state.phase].maneuver)
         state = replace(state, hold=hold)
-    return remember_command(*act(Context(state)))
+    return record_command(*act(Context(state)))
 
 
-def _believe(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """Return the state updated with the observation: belief, number of confirmed frames, conditions
-    of the phase, hold, and battery outlook."""
+def _update_before_decision(
+    state: PlannerState, obs: Observation, profile: Profile
+) -> PlannerState:
+    """Return the state updated with the observation: belief, number of confirmed frames,
+    conditions of the phase, hold, and battery outlook."""
     maneuver = PHASES[state.phase].maneuver
     state = observe(state, obs, profile, maneuver)
-    confirmed, target = state.confirmed, obs.target
+    confirmed_frames, target = state.confirmed_frames, obs.target
     if obs.new_frame:
         measured = target is not None and target.measured and target.world_m is not None
-        confirmed = confirmed + 1 if measured else 0
+        confirmed_frames = confirmed_frames + 1 if measured else 0
     hold = hold_reason(state.belief, maneuver)
     since = update_since(state.since, CONDITIONS, Context(state), obs.t_s)
-    state = replace(state, confirmed=confirmed, hold=hold, since={} if hold else since)
-    return replace(state, battery=battery_outlook(Context(state)))
+    state = replace(
+        state, confirmed_frames=confirmed_frames, hold=hold, since={} if hold else since
+    )
+    return replace(state, battery=compute_battery_outlook(Context(state)))
 
 
-def _enter(c: Context, row: Transition) -> PlannerState:
+def _enter_phase(c: Context, row: Transition) -> PlannerState:
     """Return the state after the transition of `row` into the next phase."""
     state = c.state
     # An ordered press has wound up the integrators, whatever thrust is reported. A fall that is
@@ -90,16 +94,16 @@ def _enter(c: Context, row: Transition) -> PlannerState:
             stop=row.stop,
         ),
         severity=state.severity.escalate(row.severity),
-        outcome=row.new_outcome(state.outcome),
+        outcome=row.outcome_after(state.outcome),
         since={},
         attempts=state.attempts + int(row.severity is Severity.BACK_OFF),
-        waits="",
+        waiting_reason="",
         waited_s=0.0,
         search_step_s=c.t_s,
-        confirmed=0,
+        confirmed_frames=0,
         pressed=ends and state.catch_above_m is None and presses,
-        ordered_s=None,
-        orders=0,
+        last_order_s=None,
+        order_count=0,
     )
     return PHASES[row.to].enter(new, c)
 
@@ -111,6 +115,6 @@ def act(c: Context) -> Action:
     # vehicle.
     leaves = state.phase is Phase.RECOVER and (state.pressed or state.catch_above_m is not None)
     if state.hold and state.setpoint is not None and not leaves:
-        lift = state.phase is not Phase.APPROACH or c.belief.height_m > LIFT_ABOVE_M
-        return fly_to(c, sink_setpoint(c, state.setpoint), lift=lift)
+        lift = state.phase is not Phase.APPROACH or c.belief.height_m > MIN_HEIGHT_CONTROL_M
+        return fly_to(c, lower_held_setpoint(c, state.setpoint), lift=lift)
     return PHASES[state.phase].act(c)

@@ -22,50 +22,50 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- end of a press ---
-CONTACT_LEFT_M = 0.08
+PRESS_END_BELOW_M = 0.08
 """Distance below the contact at which the vehicle has left it, m."""
-PULLED_MPS = -0.3
+PRESS_END_FALL_MPS = -0.3
 """Vertical speed below which the vehicle is falling off, m/s; the setpoint then stays at the
 vehicle."""
-UNWIND_M = 1.0
+UNWIND_PRESSED_BELOW_M = 1.0
 """Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
 integrators. Smaller: unwinding takes seconds."""
-UNWIND_AWAY_M = 0.25
+UNWIND_FREE_BELOW_M = 0.25
 """The same distance once the vehicle has left the contact, m. Larger: the vehicle falls."""
-UNPRESS_LIMIT_S = 4.0
+PRESS_END_TIMEOUT_S = 4.0
 """Time after which `leave_press` ends, whether or not the vehicle has come off, s."""
 
 # --- release ---
-LOWEST_PART = 0.9
+MIN_HOLDING_THRUST_FRACTION = 0.9
 """Share of the holding thrust down to which the raw thrust of a press is lowered."""
-UNREAD_S = 1.5
+UNCONFIRMED_THRUST_EXTRA_S = 1.5
 """Additional hang time if the reported thrust does not follow the ordered one, s."""
 
 # --- stop ---
-STOPS = 5
+STOP_ORDER_COUNT = 5
 """Number of stop orders: a single lost notify message would lock a hanging vehicle."""
 STOP_PERIOD_S = 0.1
 """Time between stop orders, s."""
-STOP_AGAIN_S = 0.5
+STOP_RETRY_PERIOD_S = 0.5
 """Time after which one more stop order is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
-CATCH_STILL_ABOVE_M = 1.0
+CATCH_ABOVE_MOTORS_OFF_M = 1.0
 """Height of the setpoint above a falling vehicle whose motors stand still, m."""
-CATCH_TURNING_ABOVE_M = 0.2
+CATCH_ABOVE_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
 the ceiling."""
-TURNING_PART = 0.5
+MOTORS_ON_THRUST_FRACTION = 0.5
 """Share of hover thrust above which the motors count as running."""
-CATCH_LEAST_S = 0.1
+MIN_CATCH_DURATION_S = 0.1
 """Shortest duration of a catch, s."""
-CATCH_LIMIT_S = 2.0
+MAX_CATCH_DURATION_S = 2.0
 """Longest duration of a catch, s."""
-CATCH_END_MPS = -0.1
+CATCH_END_CLIMB_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
-MOST_BRAKED_MPS = 1.0
+MAX_BRAKED_SPEED_MPS = 1.0
 """Largest lateral speed that is braked, m/s; no blow that the vehicle survives leaves more."""
-POSITION_GAIN_PER_S = 2.0
+ONBOARD_POSITION_GAIN_PER_S = 2.0
 """Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
 
 
@@ -78,14 +78,14 @@ def leave_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
         return state, None
     away_m = z - tel.position_m[2]
     calm = (
-        away_m > CONTACT_LEFT_M
+        away_m > PRESS_END_BELOW_M
         and not is_above_hover_thrust(c.belief)
-        and tel.velocity_mps[2] > PULLED_MPS
+        and tel.velocity_mps[2] > PRESS_END_FALL_MPS
     )
-    if calm or c.in_phase_s > UNPRESS_LIMIT_S:
+    if calm or c.in_phase_s > PRESS_END_TIMEOUT_S:
         return replace(state, pressed=False), None
-    distance_below_m = UNWIND_M if away_m < CONTACT_LEFT_M else UNWIND_AWAY_M
-    if tel.velocity_mps[2] < PULLED_MPS:
+    distance_below_m = UNWIND_PRESSED_BELOW_M if away_m < PRESS_END_BELOW_M else UNWIND_FREE_BELOW_M
+    if tel.velocity_mps[2] < PRESS_END_FALL_MPS:
         distance_below_m = 0.0
     dx, dy = state.integral_m
     setpoint = PositionSetpoint(
@@ -101,8 +101,8 @@ def lower_thrust(c: Context) -> Action:
     part = step / complete.steps
     if perch.mode == "raw":
         if not b.is_imu_fresh:
-            return hold_by_position(c)
-        lowest = LOWEST_PART * complete.hold_ratio * b.hover_thrust
+            return hold_contact_by_position(c)
+        lowest = MIN_HOLDING_THRUST_FRACTION * complete.hold_ratio * b.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or hold_here(c)
     assert b.contact_z_m is not None
@@ -120,14 +120,16 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
     than `late_s` restarts the stage."""
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.is_imu_fresh and b.attitude_age_s > late_s:
-        return hold_by_position(c)
+        return hold_contact_by_position(c)
     released_s = state.released_s
     if released_s is None:
         released_s, z_m = c.t_s, c.telemetry.position_m[2]
         b = replace(b, contact_z_m=z_m if b.contact_z_m is None else b.contact_z_m)
         state = replace(state, released_s=released_s, belief=b)
     hung_s = c.held_s(FULL_WEIGHT_HANGS)
-    last_thrust_mismatch_s = UNREAD_S if b.last_thrust_mismatch_s >= c.t_s - hung_s else 0.0
+    last_thrust_mismatch_s = (
+        UNCONFIRMED_THRUST_EXTRA_S if b.last_thrust_mismatch_s >= c.t_s - hung_s else 0.0
+    )
     if hung_s >= complete.hang_s + last_thrust_mismatch_s:
         return stop_motors(c)
     part = min(1.0, (c.t_s - released_s) / complete.ramp_s)
@@ -136,40 +138,40 @@ def release_by_thrust(c: Context, *, late_s: float = 0.0) -> Action:
     return state, RawThrust(int(start + part * (KEEPALIVE_THRUST - start)))
 
 
-def hold_by_position(c: Context) -> Action:
+def hold_contact_by_position(c: Context) -> Action:
     """Hold by position while the telemetry is old, to stay in contact or to catch an undetected
     fall."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
     if b.contact_z_m is not None and b.is_position_valid:
         z_m = b.contact_z_m
-    setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
+    setpoint = PositionSetpoint(x, y, z_m + CATCH_ABOVE_MOTORS_ON_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, released_s=None), limit_setpoint(c, setpoint)
 
 
-def motors_are_still(c: Context) -> bool:
+def has_ramped_down(c: Context) -> bool:
     """True if raw thrust has brought the motors to rest."""
     released_s = c.state.released_s
     return released_s is not None and c.t_s - released_s > c.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Action:
-    """Send stop and notify `STOPS` times because one lost notify would lock a hanging vehicle; send
-    more while the telemetry shows thrust."""
+    """Send stop and notify `STOP_ORDER_COUNT` times because one lost notify would lock a hanging
+    vehicle; send more while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.stopped_s is None:
-        return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
-    waited_s = now_s - (state.ordered_s if state.ordered_s is not None else state.stopped_s)
-    still_to_send = state.orders < STOPS and waited_s >= STOP_PERIOD_S
-    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= STOP_AGAIN_S):
-        return replace(state, ordered_s=now_s, orders=state.orders + 1), StopMotors()
+        return replace(state, stopped_s=now_s, last_order_s=now_s, order_count=1), StopMotors()
+    waited_s = now_s - (state.last_order_s if state.last_order_s is not None else state.stopped_s)
+    still_to_send = state.order_count < STOP_ORDER_COUNT and waited_s >= STOP_PERIOD_S
+    if still_to_send or (c.telemetry.thrust >= 1 and waited_s >= STOP_RETRY_PERIOD_S):
+        return replace(state, last_order_s=now_s, order_count=state.order_count + 1), StopMotors()
     return state, Idle()
 
 
-def catch_goal_above_m(hover_thrust: float, thrust: float) -> float:
+def catch_setpoint_above_m(hover_thrust: float, thrust: float) -> float:
     """Return the height of the setpoint above a falling vehicle, m, for its present `thrust`."""
-    turning = thrust > TURNING_PART * hover_thrust
-    return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
+    turning = thrust > MOTORS_ON_THRUST_FRACTION * hover_thrust
+    return CATCH_ABOVE_MOTORS_ON_M if turning else CATCH_ABOVE_MOTORS_OFF_M
 
 
 def catch_slip(c: Context) -> Action | None:
@@ -178,9 +180,9 @@ def catch_slip(c: Context) -> Action | None:
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_above_m is None or not b.is_imu_fresh:
         return None
-    begun = c.in_phase_s < CATCH_LEAST_S
-    if begun or (b.climb_mps < CATCH_END_MPS and c.in_phase_s < CATCH_LIMIT_S):
-        x, y = _braked_place_m(c) if b.is_displaced else state.entry.position_m[:2]
+    begun = c.in_phase_s < MIN_CATCH_DURATION_S
+    if begun or (b.climb_mps < CATCH_END_CLIMB_MPS and c.in_phase_s < MAX_CATCH_DURATION_S):
+        x, y = _braking_setpoint_m(c) if b.is_displaced else state.entry.position_m[:2]
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_above_m, state.entry.yaw_rad
         )
@@ -188,13 +190,15 @@ def catch_slip(c: Context) -> Action | None:
     return None
 
 
-def _braked_place_m(c: Context) -> tuple[float, float]:
+def _braking_setpoint_m(c: Context) -> tuple[float, float]:
     """Return the x and y of a setpoint that brakes a lateral speed missing from the estimate."""
     tel, reckoned_mps = c.telemetry, c.belief.reckoning.velocity_mps
     imu_only_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
-    x_mps, y_mps = (max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps)) for mps in imu_only_mps)
+    x_mps, y_mps = (
+        max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps)) for mps in imu_only_mps
+    )
     x_m, y_m, _ = tel.position_m
-    return x_m - x_mps / POSITION_GAIN_PER_S, y_m - y_mps / POSITION_GAIN_PER_S
+    return x_m - x_mps / ONBOARD_POSITION_GAIN_PER_S, y_m - y_mps / ONBOARD_POSITION_GAIN_PER_S
 
 
 def clear_contact_below(state: PlannerState, distance_below_m: float) -> PlannerState:

@@ -20,18 +20,18 @@ from perchctl.values import replace
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraErrors
 
-HARD_MPS = 0.6
+HARD_TOUCHDOWN_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
-TOUCHDOWN_WITHIN_S = 5.0
+MAX_TOUCHDOWN_AGE_S = 5.0
 """Longest time from a touchdown to the stop of the motors, s; an earlier blow was not the floor."""
-SAME_HEIGHT_M = 0.3
+MAX_TOUCHDOWN_HEIGHT_M = 0.3
 """Largest height of a blow above the final position for it to be a touchdown, m."""
-SURE = 1.96
+SIGMAS_FOR_95_PERCENT = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 LATENCY_GATE_S = 0.02
 """Latency error above which the report gives advice, s: an error of 30 ms makes the alignment
 oscillate by centimetres."""
-TURN_GATE_DEG = 2.0
+ROTATION_GATE_DEG = 2.0
 """Rotation error above which the report gives advice, deg: 35 mm at 1 m, more than the cone of an
 ascent allows."""
 
@@ -52,8 +52,8 @@ class Touchdown:
 
     @property
     def is_hard(self) -> bool:
-        """True if the vehicle touched down faster than `HARD_MPS`."""
-        return self.speed_mps > HARD_MPS
+        """True if the vehicle touched down faster than `HARD_TOUCHDOWN_MPS`."""
+        return self.speed_mps > HARD_TOUCHDOWN_MPS
 
     @property
     def text(self) -> str:
@@ -70,8 +70,8 @@ class Findings:
 
     latency_s: float
     latency_sigma_s: float
-    turn_deg: tuple[float, float, float]
-    turn_sigma_deg: tuple[float, float, float]
+    rotation_deg: tuple[float, float, float]
+    rotation_sigma_deg: tuple[float, float, float]
     advice: tuple[str, ...] = ()
 
     @classmethod
@@ -85,13 +85,13 @@ class Findings:
         if simulated:
             return found
         set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
-        if set_here and _is_off(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
+        if set_here and _is_significant(seen.delay_s, LATENCY_GATE_S, seen.delay_sigma_s):
             advice.append(
                 f"latency {found.latency_text}, profile says {camera.start_latency_s * 1e3:.0f}: "
                 f"set camera.latency_s to {max(0.0, latency_s):.3f}"
             )
-        turns = zip(found.turn_deg, found.turn_sigma_deg, strict=True)
-        if any(_is_off(turn, TURN_GATE_DEG, sigma) for turn, sigma in turns):
+        turns = zip(found.rotation_deg, found.rotation_sigma_deg, strict=True)
+        if any(_is_significant(turn, ROTATION_GATE_DEG, sigma) for turn, sigma in turns):
             advice.append(
                 f"the camera is turned by {found.turn_text} from what the profile says: measure it "
                 f"with `perchctl calibrate mount`"
@@ -101,19 +101,23 @@ class Findings:
     @property
     def latency_text(self) -> str:
         """The latency with its 95 % interval, for example ``92 +- 6 ms``."""
-        return f"{self.latency_s * 1e3:.0f} +- {SURE * self.latency_sigma_s * 1e3:.0f} ms"
+        margin_s = SIGMAS_FOR_95_PERCENT * self.latency_sigma_s
+        return f"{self.latency_s * 1e3:.0f} +- {margin_s * 1e3:.0f} ms"
 
     @property
     def turn_text(self) -> str:
         """The rotation about x, y and z with 95 % intervals, for example ``0.2 +- 0.6, -0.1 +- 0.6,
         0.4 +- 1.8 deg``."""
-        each = zip(self.turn_deg, self.turn_sigma_deg, strict=True)
-        return ", ".join(f"{turn:.1f} +- {SURE * sigma:.1f}" for turn, sigma in each) + " deg"
+        each = zip(self.rotation_deg, self.rotation_sigma_deg, strict=True)
+        return (
+            ", ".join(f"{turn:.1f} +- {SIGMAS_FOR_95_PERCENT * sigma:.1f}" for turn, sigma in each)
+            + " deg"
+        )
 
 
-def _is_off(off: float, gate: float, sigma: float) -> bool:
+def _is_significant(off: float, gate: float, sigma: float) -> bool:
     """True if the error exceeds the gate and the width of its 95 % interval."""
-    return abs(off) > max(gate, 2.0 * SURE * sigma)
+    return abs(off) > max(gate, 2.0 * SIGMAS_FOR_95_PERCENT * sigma)
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class FlightReport:
     detached: tuple[str, ...] = ()  # one sentence for each watcher detached after an exception
 
     @property
-    def blames_profile(self) -> bool:
+    def is_profile_suspect(self) -> bool:
         """True if a row that claims a wrong profile fired during the flight."""
         return any(Claim.PROFILE_SUSPECT in event.claims for event in self.history)
 
@@ -207,9 +211,9 @@ def find_touchdown(c: Context) -> Touchdown | None:
     b = c.belief
     tel, imu, reckoning = c.telemetry, b.imu, b.reckoning
     blow = imu.blow
-    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > TOUCHDOWN_WITHIN_S:
+    if c.state.phase is Phase.PERCHED or min(tel.t_s, imu.off_s) - blow.t_s > MAX_TOUCHDOWN_AGE_S:
         return None
-    higher = blow.z_m - tel.position_m[2] > SAME_HEIGHT_M
+    higher = blow.z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_M
     if b.is_position_valid and b.dead_reckoned_s is None and higher:
         return None
     reckoned = b.dead_reckoned_s is not None or b.diverged

@@ -11,15 +11,15 @@ from perchctl.mission.belief.target import MIN_FAR_ABOVE_M
 from perchctl.mission.context import Context
 from perchctl.mission.phase import Claim, Phase
 
-HUNG_WITHIN_M = 0.3
+MAX_HANGING_DRIFT_M = 0.3
 """Distance below its contact at which a vehicle still hangs, m; allows for drift of the
 estimate."""
-HIGH_M = 0.45
+MIN_HANGING_HEIGHT_M = 0.45
 """Height at the start of a descent above which the height distinguishes hanging from standing,
 m."""
-STANDS_BELOW_M = 0.3
+MAX_REST_ON_FLOOR_M = 0.3
 """Height below which the vehicle stands, m."""
-STAYED_M = 0.15
+MAX_STAYED_DESCENT_M = 0.15
 """Descent below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
 table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
 
@@ -43,12 +43,12 @@ def find_rest_state(c: Context) -> RestState:
     if b.is_target_positioned or not b.is_position_valid:
         if b.target.is_tracked and b.target.is_far_above:
             return RestState.STANDS
-        return _by_falls(c)
-    high = state.entry.position_m[2] - b.ground_z_m > HIGH_M
+        return _find_rest_state_by_falls(c)
+    high = state.entry.position_m[2] - b.ground_z_m > MIN_HANGING_HEIGHT_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
-    stayed = high and not b.target.is_far_above and came_down_m < STAYED_M
+    stayed = high and not b.target.is_far_above and came_down_m < MAX_STAYED_DESCENT_M
     at_contact = b.contact_z_m is not None and not b.target.is_far_above
-    if stayed or (b.height_m > STANDS_BELOW_M and at_contact):
+    if stayed or (b.height_m > MAX_REST_ON_FLOOR_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
 
@@ -57,7 +57,10 @@ def _is_held_elsewhere(c: Context) -> bool:
     b, state = c.belief, c.state
     if state.phase is not Phase.LANDING:
         return False
-    if b.is_position_valid and state.entry.position_m[2] - b.telemetry.position_m[2] >= STAYED_M:
+    if (
+        b.is_position_valid
+        and state.entry.position_m[2] - b.telemetry.position_m[2] >= MAX_STAYED_DESCENT_M
+    ):
         return False
     if Claim.HELD_BY_OTHER in state.entry.claims:
         return b.imu.fell_s <= state.entry.t_s
@@ -69,12 +72,12 @@ def _is_held_elsewhere(c: Context) -> bool:
         b.is_position_valid
         and not b.is_target_positioned
         and b.first_jump_s is None
-        and b.height_m > HIGH_M
+        and b.height_m > MIN_HANGING_HEIGHT_M
     )
     return below and (b.target.is_fresh or by_position)
 
 
-def _by_falls(c: Context) -> RestState:
+def _find_rest_state_by_falls(c: Context) -> RestState:
     """Return the rest state from the falls since the vehicle came within the magnet's reach, if
     ever, and from silences that could hide a fall."""
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_reach_since_s
@@ -94,14 +97,16 @@ def is_still_hanging(c: Context) -> bool:
     b, tel = c.belief, c.telemetry
     if not b.is_target_positioned and b.is_position_valid and b.contact_z_m is not None:
         falls = tel.velocity_mps[2] < -c.planner.complete.slip_mps
-        if not falls and b.contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M:
+        if not falls and b.contact_z_m - tel.position_m[2] <= MAX_HANGING_DRIFT_M:
             return True
-    return _by_falls(c) is RestState.HANGS
+    return _find_rest_state_by_falls(c) is RestState.HANGS
 
 
-def hangs_with_motors_off(c: Context) -> bool:
+def is_hanging_with_motors_off(c: Context) -> bool:
     """True if the motors were stopped while the vehicle hung, and it still hangs."""
     stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
-    if stopped_s is None or (landing and stopped_s >= c.state.entry.t_s and c.state.orders == 0):
+    if stopped_s is None or (
+        landing and stopped_s >= c.state.entry.t_s and c.state.order_count == 0
+    ):
         return False
     return is_still_hanging(c)

@@ -47,7 +47,7 @@ from perchctl.mission.phase import (
     Phase,
 )
 from perchctl.mission.phases.ascend import NEAR_STANDOFF
-from perchctl.mission.rest import hangs_with_motors_off
+from perchctl.mission.rest import is_hanging_with_motors_off
 from perchctl.mission.transition import (
     Transition,
     back_off_row,
@@ -58,43 +58,43 @@ from perchctl.mission.transition import (
 from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
-TAKEOFF_LIFTED_M = 0.05
-"""Height below which the lateral limit of a take-off is `SIDEWAYS_M`, m."""
-SIDEWAYS_M = 0.12
+LIFTOFF_HEIGHT_M = 0.05
+"""Height below which the lateral limit of a take-off is `MAX_GROUND_DISPLACEMENT_M`, m."""
+MAX_GROUND_DISPLACEMENT_M = 0.12
 """Largest lateral motion before the vehicle has lifted off, m. Larger: a wrong mounting tips it
 over."""
-DIVERGED_BELOW_M = 0.3
+DIVERGED_LOW_HEIGHT_M = 0.3
 """Height below which positions in wrong axes may lead the vehicle into the floor, m."""
-DIVERGED_LOW_M = 0.22
-"""Lateral distance from the setpoint at which positions have diverged, m, below `DIVERGED_BELOW_M`
-and in a vertical climb."""
-DIVERGED_LANDING_M = 0.4
+MAX_LOW_DEVIATION_M = 0.22
+"""Lateral distance from the setpoint at which positions have diverged, m, below
+`DIVERGED_LOW_HEIGHT_M` and in a vertical climb."""
+MAX_LANDING_DEVIATION_M = 0.4
 """The same distance during a landing, m."""
-DIVERGED_M = 0.8
+MAX_DEVIATION_M = 0.8
 """The same distance elsewhere, m: further than any draught moves the vehicle. Larger: the vehicle
 reaches the walls."""
-ASIDE_BY_LATENCY_MPS = 4.0
+DEVIATION_PER_LATENCY_SIGMA_MPS = 4.0
 """Increase of the lateral limit with the target as the position source, in m per second of the
 latency's standard deviation: pictures that are 0.1 s later than assumed cause up to 0.2 m. Larger:
 a rotated camera leads the vehicle further away."""
-ABOVE_START_M = 0.1
+MAX_VERTICAL_CLIMB_OFFSET_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 VELOCITY_DISAGREES_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
-SWINGS_MPS = 0.5
+OSCILLATION_SINK_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
-BELOW_S = 0.3
+TARGET_BELOW_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
-WEAK_S = 2.0
+SATURATED_THRUST_DWELL_S = 2.0
 """Time at full thrust after which no thrust remains for a press, s."""
-HELD_S = 2.0
+HELD_BY_OTHER_DWELL_S = 2.0
 """Time after which the magnet has been distinguished from other supports, s."""
-BLIND_VARIANCE_M2PS2 = 0.02
+MAX_BLIND_VARIANCE_M2PS2 = 0.02
 """Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
-CONTRADICTED_M = 0.3
+MIN_CONTRADICTION_M = 0.3
 """Distance of the newest sighting from the estimate at which the estimate is wrong, m. Larger:
 position control moves the vehicle further off. Smaller: an oscillation ends the flight."""
-CONTRADICTED_S = 0.35
+MIN_CONTRADICTION_AGE_S = 0.35
 """Age of the newest position, including the latency, at which contradicting sightings are not a
 single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection ends
 the flight."""
@@ -109,33 +109,35 @@ def has_diverged(c: Context) -> bool:
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
-    if c.held_s(VELOCITY_DISAGREES) >= VELOCITY_DISAGREES_DWELL_S or _swings(c):
+    if c.held_s(VELOCITY_DISAGREES) >= VELOCITY_DISAGREES_DWELL_S or _is_oscillating(c):
         return True
     if setpoint is None:
         return False
     if phase is Phase.LANDING:
         touched = b.contact_z_m is not None or c.state.stopped_s is not None
-        return not touched and _away_m(c) > DIVERGED_LANDING_M
-    spare_m = ASIDE_BY_LATENCY_MPS * c.obs.delay_sigma_s if b.is_target_positioned else 0.0
-    if phase is Phase.APPROACH and b.height_m < TAKEOFF_LIFTED_M:
-        return _away_m(c) > SIDEWAYS_M + spare_m
+        return not touched and _setpoint_deviation_m(c) > MAX_LANDING_DEVIATION_M
+    spare_m = (
+        DEVIATION_PER_LATENCY_SIGMA_MPS * c.obs.delay_sigma_s if b.is_target_positioned else 0.0
+    )
+    if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
+        return _setpoint_deviation_m(c) > MAX_GROUND_DISPLACEMENT_M + spare_m
     ground = b.takeoff_position_m
     above_start = ground is not None and (
-        math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < ABOVE_START_M
+        math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < MAX_VERTICAL_CLIMB_OFFSET_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
     is_pushed = b.imu.t_s - b.imu.pushed_s <= MAX_PUSH_DELAY_S  # by moving air
-    stays = b.height_m < DIVERGED_BELOW_M or (only_climbs and not is_pushed)
-    return _away_m(c) > (DIVERGED_LOW_M + spare_m if stays else DIVERGED_M)
+    stays = b.height_m < DIVERGED_LOW_HEIGHT_M or (only_climbs and not is_pushed)
+    return _setpoint_deviation_m(c) > (MAX_LOW_DEVIATION_M + spare_m if stays else MAX_DEVIATION_M)
 
 
-def _swings(c: Context) -> bool:
+def _is_oscillating(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
     by_capture = c.profile.positioning.source.is_mocap
-    return moves and by_capture and c.belief.climb_mps < -SWINGS_MPS
+    return moves and by_capture and c.belief.climb_mps < -OSCILLATION_SINK_MPS
 
 
-def _away_m(c: Context) -> float:
+def _setpoint_deviation_m(c: Context) -> float:
     (x_m, y_m, _), setpoint = c.telemetry.position_m, c.state.setpoint
     return 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
 
@@ -143,7 +145,7 @@ def _away_m(c: Context) -> float:
 def divergence_reason(c: Context) -> str:
     """Return how far positions have led the vehicle away, and the possible causes."""
     b = c.belief
-    if _swings(c):
+    if _is_oscillating(c):
         return (
             f"it swings up and down, now at {-b.climb_mps:.1f} m/s: are the positions of the "
             f"motion capture late?"
@@ -155,8 +157,8 @@ def divergence_reason(c: Context) -> str:
     if b.is_target_positioned:
         cause = "does camera.mount have the camera turned as it is?"
     return (
-        f"position control leads astray, {_away_m(c):.2f} m aside at a height of {b.height_m:.2f} "
-        f"m: {cause}"
+        f"position control leads astray, {_setpoint_deviation_m(c):.2f} m aside "
+        f"at a height of {b.height_m:.2f} m: {cause}"
     )
 
 
@@ -167,9 +169,9 @@ def is_position_lost(c: Context) -> bool:
     b = c.belief
     if b.position_age_s > c.profile.positioning.land_s or b.is_displaced:
         return True
-    if b.position_age_s > CONTRADICTED_S and c.obs.position_beside_m > CONTRADICTED_M:
+    if b.position_age_s > MIN_CONTRADICTION_AGE_S and c.obs.position_beside_m > MIN_CONTRADICTION_M:
         return True
-    unsure = b.velocity_variance_m2ps2 > BLIND_VARIANCE_M2PS2
+    unsure = b.velocity_variance_m2ps2 > MAX_BLIND_VARIANCE_M2PS2
     return b.is_target_positioned and b.is_position_stale and unsure
 
 
@@ -205,7 +207,7 @@ def latency_reason(c: Context) -> str:
 def is_mounting_wrong(c: Context) -> bool:
     """True if the target moves along with the vehicle, or appears below it."""
     b = c.belief
-    below = c.held_s(TARGET_BELOW) >= BELOW_S
+    below = c.held_s(TARGET_BELOW) >= TARGET_BELOW_DWELL_S
     return b.mounting.is_wrong or b.mismatch.turn_rad != 0.0 or below
 
 
@@ -232,7 +234,7 @@ def mounting_reason(c: Context) -> str:
 # --- Supports, obstacles and insufficient thrust ---
 
 
-def is_held(c: Context) -> bool:
+def is_held_by_target(c: Context) -> bool:
     """True if the target's magnet already holds the vehicle."""
     if c.held_s(HANGING) < HANGING_DWELL_S:
         return False
@@ -247,7 +249,7 @@ def is_held_elsewhere(c: Context) -> bool:
     offset = touched or contact_offset(c.belief)
     at_its_height = touched is not None or is_at_contact_height(c.belief)
     beside = offset.lateral_offset_m - 2.0 * offset.sigma_m > c.planner.perch.contact_xy_m
-    return c.held_s(HANGING) >= HELD_S and (beside or not at_its_height)
+    return c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S and (beside or not at_its_height)
 
 
 def is_blocked(c: Context) -> bool:
@@ -263,12 +265,12 @@ def is_blocked_off_target(c: Context) -> bool:
     )
 
 
-def lacks_press_thrust(c: Context) -> bool:
+def is_press_thrust_insufficient(c: Context) -> bool:
     """True if no thrust remains for a press: measured at full thrust, or predicted before the
     press."""
     if c.state.pressed:
         return False
-    if c.held_s(SATURATED_THRUST) >= WEAK_S:
+    if c.held_s(SATURATED_THRUST) >= SATURATED_THRUST_DWELL_S:
         return True
     near = c.state.phase is Phase.ASCEND and c.held_s(NEAR_STANDOFF) >= 0.0
     return near and c.belief.hover_thrust > PRESS_SATURATION_FRACTION * max_press_thrust(c.profile)
@@ -284,7 +286,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     Transition(
         "hung-but-locked",
         {Phase.COMPLETE, Phase.LANDING},
-        lambda c: c.telemetry.has_bit(LOCKED) and hangs_with_motors_off(c),
+        lambda c: c.telemetry.has_bit(LOCKED) and is_hanging_with_motors_off(c),
         Phase.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=lambda before: before or Outcome.PERCHED,  # a landing keeps its own outcome
@@ -421,7 +423,11 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     ),
     # --- the magnet may catch early ---
     Transition(
-        "caught", MAGNET_ATTACH_PHASES, is_held, Phase.COMPLETE, "hanging on the magnet already"
+        "caught",
+        MAGNET_ATTACH_PHASES,
+        is_held_by_target,
+        Phase.COMPLETE,
+        "hanging on the magnet already",
     ),
     land_row(
         "held",
@@ -433,7 +439,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "hangs-at-contact",
         MAGNET_ATTACH_PHASES,
-        lambda c: c.held_s(HANGING) >= HELD_S,
+        lambda c: c.held_s(HANGING) >= HELD_BY_OTHER_DWELL_S,
         lambda c: (
             f"it hangs at the target's height, {newest_contact_offset(c.belief).text}: "
             f"that may be its magnet"
@@ -444,7 +450,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "cannot-rise",
         {Phase.APPROACH},
-        lambda c: is_blocked(c) or lacks_press_thrust(c),
+        lambda c: is_blocked(c) or is_press_thrust_insufficient(c),
         lambda c: (
             f"pressed at {c.belief.height_m:.2f} m: something is above, or the thrust is weak"
         ),
@@ -462,7 +468,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "too-weak",
         CAMERA_GUIDED_PHASES,
-        lacks_press_thrust,
+        is_press_thrust_insufficient,
         "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
         "something is above",
     ),

@@ -4,8 +4,8 @@ limits.
 The firmware flies to a setpoint p with a cascade of PID controllers. On top of it, for the
 reference r, the vehicle's position x (height z) and its velocity v:
 
-    p = r + integral + near * limit(POSITION_GAIN (r - x) - VELOCITY_GAIN_S v)     lateral
-    p = r + limit(HEIGHT_GAIN (r - z) - HEIGHT_RATE_S v_z)                         vertical
+    p = r + integral + near * limit(LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v)     lateral
+    p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                         vertical
 
 The integral removes the offset that a steady wind leaves; `near` grows from 0 to 1 as the target
 comes closer.
@@ -24,39 +24,39 @@ from perchctl.vehicle import Command, PositionSetpoint
 
 Action = tuple[PlannerState, Command]
 
-HEIGHT_GAIN = 1.5
+HEIGHT_ERROR_GAIN = 1.5
 """Gain on the height error, against the overshoot of the onboard integrator. Larger: the vehicle
 oscillates."""
-HEIGHT_RATE_S = 0.25
+HEIGHT_DAMPING_S = 0.25
 """Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
-HEIGHT_LIMIT_M = 0.15
+MAX_HEIGHT_CORRECTION_M = 0.15
 """Largest correction of a setpoint's height, m."""
-POSITION_GAIN = 1.0
+LATERAL_ERROR_GAIN = 1.0
 """Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate."""
-VELOCITY_GAIN_S = 0.3
+LATERAL_DAMPING_S = 0.3
 """Damping of the lateral correction by the lateral velocity, s."""
-STIFF_BELOW_M = 0.8
+LATERAL_FEEDBACK_START_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
-STIFF_RANGE_M = 0.4
+LATERAL_FEEDBACK_RANGE_M = 0.4
 """Distance over which the lateral feedback grows to its full gain, m."""
-STIFF_LIMIT_M = 0.1
+MAX_LATERAL_CORRECTION_M = 0.1
 """Largest correction of a setpoint by the lateral feedback, m."""
 GROUND_CLEARANCE_M = 0.05
 """Lowest height of a setpoint above the ground, m, except in a take-off."""
-SMALL_ERROR_M = 0.06
+MAX_INTEGRATED_ERROR_M = 0.06
 """Position error below which the integral also accumulates in motion, m."""
-MOST_TRIM_M = 0.4
+MAX_INTEGRAL_M = 0.4
 """Largest integral, m: a wind of 5 m/s. Larger: the setpoint of a vehicle that is held winds up
 further. Smaller: a wind keeps the vehicle off its target permanently."""
-STANDS_MPS = 0.1
+MAX_IN_PLACE_SPEED_MPS = 0.1
 """Speed below which the vehicle hovers in place, m/s. Larger: the integral winds up on the way to
 the goal. Smaller: a gusty wind is never balanced."""
-WARY_MPS = 0.25
+UNCONFIRMED_MOUNTING_SPEED_MPS = 0.25
 """Lateral speed while the camera's mounting is unconfirmed, m/s. Larger: a rotated camera leads the
 vehicle further off."""
 OUT_OF_VIEW_SINK_MPS = 0.2
 """Sink rate during a hold while the target is out of view, m/s."""
-LOWEST_M = 0.3
+MIN_HOLD_HEIGHT_M = 0.3
 """Height above the ground at which that sink ends, m."""
 
 
@@ -90,18 +90,18 @@ def step_towards(
     *,
     up_mps: float = 0.0,
     down_mps: float = 0.4,
-    wary: bool = False,
+    is_cautious: bool = False,
     turns: bool = True,
 ) -> PositionSetpoint:
     """Return the setpoint one tick after `old`: towards `goal`, with at most `up_mps` upwards and
-    `down_mps` downwards. `wary` limits the lateral speed while the camera's mounting is
+    `down_mps` downwards. `is_cautious` limits the lateral speed while the camera's mounting is
     unconfirmed; without `turns`, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not turns:
         yaw_radps = 0.0
-    if wary and c.belief.mounting.is_unconfirmed:
-        xy_mps = min(xy_mps, WARY_MPS) if c.belief.target.is_fresh else 0.0
+    if is_cautious and c.belief.mounting.is_unconfirmed:
+        xy_mps = min(xy_mps, UNCONFIRMED_MOUNTING_SPEED_MPS) if c.belief.target.is_fresh else 0.0
     dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
     distance = math.hypot(dx, dy)
     part = 1.0 if distance <= xy_mps * dt_s else xy_mps * dt_s / distance
@@ -126,29 +126,29 @@ def fly_under_target(c: Context, z_m: float, *, up_mps: float = 0.0) -> Action:
     trim = update_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = Context(replace(c.state, integral_m=trim))
     old = c.state.setpoint or hold_here(c)
-    return fly_to(c, step_towards(c, old, goal, up_mps=up_mps, wary=True))
+    return fly_to(c, step_towards(c, old, goal, up_mps=up_mps, is_cautious=True))
 
 
 def update_integral(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
     """Return the integral (x, y) of the position error to `goal_xy`, m, world axes, which removes
     the offset that a steady wind leaves.
 
-    The integral is limited, and frozen while the vehicle is still on its way: a large error
+    The integral is limit_vector, and frozen while the vehicle is still on its way: a large error
     accumulates, and the integral may become large, only while the vehicle hovers in place.
     """
     planner = c.planner
     ex = goal_xy[0] - c.telemetry.position_m[0]
     ey = goal_xy[1] - c.telemetry.position_m[1]
     tx, ty = c.state.integral_m
-    stands = c.belief.speed_mps < STANDS_MPS
-    most_m = MOST_TRIM_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
-    if stands or math.hypot(ex, ey) < SMALL_ERROR_M:
+    stands = c.belief.speed_mps < MAX_IN_PLACE_SPEED_MPS
+    most_m = MAX_INTEGRAL_M if stands else max(planner.integral_limit_m, math.hypot(tx, ty))
+    if stands or math.hypot(ex, ey) < MAX_INTEGRATED_ERROR_M:
         tx += planner.integral_per_s * ex * dt_s
         ty += planner.integral_per_s * ey * dt_s
-    return limited(tx, ty, most_m)
+    return limit_vector(tx, ty, most_m)
 
 
-def anchor_in_wind(c: Context) -> PlannerState:
+def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     """Return the state with a setpoint at the vehicle's position and the integral that holds it
     there, if it hovers in place; the command does not change. A vehicle on its way keeps its
     setpoint and integral. Without a setpoint, or with diverged positions, the integral becomes
@@ -156,17 +156,17 @@ def anchor_in_wind(c: Context) -> PlannerState:
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.diverged:
         return replace(c.state, integral_m=(0.0, 0.0))
-    if not c.belief.is_position_valid or c.belief.speed_mps > STANDS_MPS:
+    if not c.belief.is_position_valid or c.belief.speed_mps > MAX_IN_PLACE_SPEED_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
         c.state,
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
-        integral_m=limited(sent.x_m - x_m, sent.y_m - y_m, MOST_TRIM_M),
+        integral_m=limit_vector(sent.x_m - x_m, sent.y_m - y_m, MAX_INTEGRAL_M),
     )
 
 
-def limited(x: float, y: float, most: float) -> tuple[float, float]:
+def limit_vector(x: float, y: float, most: float) -> tuple[float, float]:
     """Return the vector (x, y), shortened to at most the length `most`."""
     size = math.hypot(x, y)
     return (x, y) if size <= most else (x * most / size, y * most / size)
@@ -178,9 +178,12 @@ def correct_setpoint(
     """Return the setpoint that brings the vehicle to `reference`, by the equations in the module
     docstring; without `lift`, at the reference's own height."""
     tel = c.telemetry
-    rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
-    lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
-    dx, dy = _stiffened(c, reference)
+    rise = (
+        HEIGHT_ERROR_GAIN * (reference.z_m - tel.position_m[2])
+        - HEIGHT_DAMPING_S * tel.velocity_mps[2]
+    )
+    lifted = max(-MAX_HEIGHT_CORRECTION_M, min(MAX_HEIGHT_CORRECTION_M, rise)) if lift else 0.0
+    dx, dy = _lateral_feedback(c, reference)
     return replace(
         reference,
         x_m=reference.x_m + c.state.integral_m[0] + dx,
@@ -189,27 +192,27 @@ def correct_setpoint(
     )
 
 
-def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
+def _lateral_feedback(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     """Return the lateral feedback on top of the onboard controllers, near the target only."""
-    near = (STIFF_BELOW_M - c.belief.target.error_z_m) / STIFF_RANGE_M
+    near = (LATERAL_FEEDBACK_START_M - c.belief.target.error_z_m) / LATERAL_FEEDBACK_RANGE_M
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
         return 0.0, 0.0
     (x, y, _), (vx, vy, _) = c.telemetry.position_m, c.belief.velocity_mps
-    dx = gain * (POSITION_GAIN * (reference.x_m - x) - VELOCITY_GAIN_S * vx)
-    dy = gain * (POSITION_GAIN * (reference.y_m - y) - VELOCITY_GAIN_S * vy)
+    dx = gain * (LATERAL_ERROR_GAIN * (reference.x_m - x) - LATERAL_DAMPING_S * vx)
+    dy = gain * (LATERAL_ERROR_GAIN * (reference.y_m - y) - LATERAL_DAMPING_S * vy)
     size = math.hypot(dx, dy)
-    part = 1.0 if size <= STIFF_LIMIT_M else STIFF_LIMIT_M / size
+    part = 1.0 if size <= MAX_LATERAL_CORRECTION_M else MAX_LATERAL_CORRECTION_M / size
     return part * dx, part * dy
 
 
-def sink_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the held setpoint one tick later; lower if the target is the position source and out
     of view."""
     b = c.belief
     if not (b.is_target_positioned and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
-    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + LOWEST_M)
+    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HOLD_HEIGHT_M)
     z_m = setpoint.z_m - OUT_OF_VIEW_SINK_MPS * max(0.0, c.t_s - c.state.t_s)
     return replace(setpoint, z_m=max(lowest_m, z_m))
 

@@ -19,7 +19,7 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 class BatteryOutlook:
     """Prediction of the energy model: remaining time and attempts; None means unknown."""
 
-    left_s: float | None = None  # hover time until `battery-low` would land the vehicle
+    remaining_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # including the landing after the last one; None before the first sighting
     attempts: int | None = None
     used_mah: float = 0.0  # charge consumed by the assumed current
@@ -31,8 +31,8 @@ class LevelDescent:
     """Memory of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
 
     thrust: float = 0.0  # last ordered thrust
-    sample_s: float = -math.inf  # time of the newest sample at the last tick
-    under_way_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
+    climb_measured_s: float = -math.inf  # time of the newest sample at the last tick
+    pending_climb_mps: float = 0.0  # climb rate that recent orders cause and no sample shows yet
     floor_detected_s: float | None = None  # time at which the floor was detected
 
 
@@ -63,8 +63,8 @@ class PlannerState:
     since: dict[Condition[Any], float] = field(default_factory=dict)
     """Start time of each true condition of the phases."""
     attempts: int = 0  #: number of failed attempts
-    confirmed: int = 0  #: number of successive frames in this phase that measured the target
-    searched_places: int = 0
+    confirmed_frames: int = 0  #: number of successive frames in this phase that measured the target
+    searched_positions: int = 0
     search_step_s: float = 0.0
     setpoint: PositionSetpoint | None = None
     integral_m: tuple[float, float] = (0.0, 0.0)
@@ -74,12 +74,12 @@ class PlannerState:
     blocked_z_m: float | None = None  #: height at which an obstacle blocked the vehicle
     released_s: float | None = None  #: start of the release by raw thrust
     stopped_s: float | None = None  #: first order to stop the motors
-    ordered_s: float | None = None  #: last order to land or to stop the motors
-    orders: int = 0
-    raw_order: int | None = None  #: last ordered raw thrust; None in position mode
+    last_order_s: float | None = None  #: last order to land or to stop the motors
+    order_count: int = 0
+    raw_thrust_order: int | None = None  #: last ordered raw thrust; None in position mode
     descent: LevelDescent = LevelDescent()
     hold: str = ""  #: why the vehicle holds its position; empty without a hold
-    waits: str = ""  #: why your own row keeps the mission in its phase; empty if none does
+    waiting_reason: str = ""  #: why your own row keeps the mission in its phase; empty if none does
     waited_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
 
@@ -96,7 +96,7 @@ class PlannerState:
     @property
     def pause(self) -> str:
         """Why the mission pauses, by a hold or by your own row; empty if it does not."""
-        return self.hold or self.waits
+        return self.hold or self.waiting_reason
 
     @property
     def is_under_power(self) -> bool:
@@ -109,7 +109,7 @@ class PlannerState:
             maneuver=maneuver,
             maneuver_start_m=self.entry.position_m,
             setpoint=self.setpoint,
-            raw_thrust=self.raw_order,
+            raw_thrust=self.raw_thrust_order,
             released_s=self.released_s,
             stopped_s=self.stopped_s,
             floor_detected_s=self.descent.floor_detected_s,

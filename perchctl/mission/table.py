@@ -48,9 +48,9 @@ PHASES: dict[Phase, PhaseDefinition] = {
     )
 }
 """Definition of each phase."""
-EXITS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for row in phase.exits)
+EXIT_ROWS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for row in phase.exits)
 """The phases' own rows, in the order of `PHASES`."""
-TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXITS)
+TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXIT_ROWS)
 """The built-in table: safety rows first, then the exits of the phases."""
 CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.conditions)
 """The phases' own conditions; `update_belief` updates those of the belief."""
@@ -67,7 +67,7 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
         goes_on = waits is not None and row.severity is Severity.CONTINUE
         if undoes or goes_on or phase not in row.phases or not row.when(c):
             continue
-        if not row.waits_in(phase):
+        if not row.is_waiting_row_of(phase):
             return row
         waits = waits or row
     return waits
@@ -76,7 +76,7 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
 # --- Your own rows ---
 
 
-ALLOWED = frozenset(
+ALLOWED_TRANSITIONS = frozenset(
     (phase, row.to, row.severity)
     for row in TABLE
     for phase in row.phases & PRE_CONTACT_PHASES - {row.to}
@@ -91,8 +91,8 @@ def add_rows(
     rows: Iterable[Transition], table: tuple[Transition, ...] = TABLE
 ) -> tuple[Transition, ...]:
     """Return the table with your own rows, in their order, after all safety rows and before the
-    exits of the phases. By `ALLOWED`, each row waits in ALIGN, or returns to an earlier phase, to
-    RECOVER or to LANDING; in COMPLETE and LANDING, none applies.
+    exits of the phases. By `ALLOWED_TRANSITIONS`, each row waits in ALIGN, or returns to an earlier
+    phase, to RECOVER or to LANDING; in COMPLETE and LANDING, none applies.
 
     Raises InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name
     that is taken; in flight, for a row whose functions raise, and then the vehicle lands.
@@ -104,8 +104,10 @@ def add_rows(
             raise InvalidValue(f"row {row.name!r}: another row has that name; rename it")
         names.add(row.name)
         for phase in row.phases:
-            if (phase, row.to, row.severity) not in ALLOWED:
-                may = sorted(f"{to.name} ({how.name})" for at, to, how in ALLOWED if at is phase)
+            if (phase, row.to, row.severity) not in ALLOWED_TRANSITIONS:
+                may = sorted(
+                    f"{to.name} ({how.name})" for at, to, how in ALLOWED_TRANSITIONS if at is phase
+                )
                 raise InvalidValue(
                     f"row {row.name!r} leads from {phase.name} to {row.to.name} "
                     f"({row.severity.name}); allowed there are {', '.join(may) or 'none'}"
@@ -113,10 +115,13 @@ def add_rows(
         if row.stop is not None or row.outcome is not None or row.claims:
             raise InvalidValue(f"row {row.name!r} may have no stop, no outcome and no claims")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
-        when, reason = _named(row.name, row.when), _named(row.name, row.reason_text)
+        when, reason = (
+            _wrap_row_function(row.name, row.when),
+            _wrap_row_function(row.name, row.reason_text),
+        )
         phases = frozenset(row.phases)  # an immutable copy, so that it cannot change in flight
         own.append(replace(row, phases=phases, when=when, reason=reason, outcome=outcome))
-    at = next(i for i, row in enumerate(table) if row in EXITS)
+    at = next(i for i, row in enumerate(table) if row in EXIT_ROWS)
     return (*table[:at], *own, *table[at:])
 
 
@@ -137,7 +142,7 @@ def _check_types(row: object) -> None:
         )
 
 
-def _named(name: str, function: Callable[[Context], T]) -> Callable[[Context], T]:
+def _wrap_row_function(name: str, function: Callable[[Context], T]) -> Callable[[Context], T]:
     """Wrap a function of your own row so that its exceptions become InvalidValue with the row's
     name."""
 

@@ -34,7 +34,7 @@ class Transition:
     stop: EmergencyStop | StopMotors | None = None
     claims: Claim = Claim.NONE
 
-    def waits_in(self, phase: Phase) -> bool:
+    def is_waiting_row_of(self, phase: Phase) -> bool:
         """True if the row keeps the mission in this phase instead of leaving it."""
         return self.to is phase and self.severity is Severity.HOLD
 
@@ -42,7 +42,7 @@ class Transition:
         """Return the reason in words."""
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
-    def new_outcome(self, before: Outcome | None) -> Outcome | None:
+    def outcome_after(self, before: Outcome | None) -> Outcome | None:
         """Return the flight's outcome after this transition."""
         if self.outcome is None or isinstance(self.outcome, Outcome):
             return self.outcome or before

@@ -45,7 +45,7 @@ class FlightSummary:
         lost_records, log_problem: number of lost log records, and why; 0 and None if complete.
         recording: its summary; None without a recording, and in a log that is read back.
         simulated: the vehicle was; then nothing here is advice for the profile of a real one.
-        blames_profile: a row decided that claims the profile may be wrong.
+        is_profile_suspect: a row decided that claims the profile may be wrong.
     """
 
     outcome: str
@@ -64,7 +64,7 @@ class FlightSummary:
     log_problem: str | None = None
     recording: RecordingEnd | None = None
     simulated: bool = False
-    blames_profile: bool = False
+    is_profile_suspect: bool = False
 
     @classmethod
     def from_log(cls, log: FlightLog) -> FlightSummary:
@@ -96,7 +96,7 @@ class FlightSummary:
             lost_records=int(end.get("lost_records") or 0),
             log_problem=end.get("problem"),
             simulated=simulated,
-            blames_profile=any(
+            is_profile_suspect=any(
                 Claim.PROFILE_SUSPECT in claims_of(str(event.get("row"))) for event in log.events
             ),
         )
@@ -124,7 +124,7 @@ class FlightSummary:
         lines = [f"{self.outcome.upper()}: {self.reason}".rstrip(": ")]
         if self.cause and self.cause != self.outcome:
             lines[0] += f" [{self.cause}]"
-        if self.simulated and self.blames_profile:
+        if self.simulated and self.is_profile_suspect:
             lines.append("note:      camera and positions were simulated: change no real profile")
         if self.miss_m is not None:
             lines.append(f"miss:      {self.miss_m * 1e3:.1f} mm")
@@ -166,8 +166,8 @@ _TOUCHDOWN = {"touchdown_mps": "speed_mps", "touchdown_g": "peak_g"}
 _FINDINGS = {
     "latency_s": "latency_s",
     "latency_sigma_s": "latency_sigma_s",
-    "mount_turn_deg": "turn_deg",
-    "mount_turn_sigma_deg": "turn_sigma_deg",
+    "mount_turn_deg": "rotation_deg",
+    "mount_turn_sigma_deg": "rotation_sigma_deg",
     "advice": "advice",
 }
 

@@ -239,7 +239,7 @@ class LogWatcher:
             contact=report.contact,
             touchdown=report.touchdown,
             simulated=self.simulated,
-            blames_profile=report.blames_profile,
+            is_profile_suspect=report.is_profile_suspect,
         )
         self.end(summary.as_record())
         return replace(

@@ -438,8 +438,8 @@ def expected_corners(
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
     by_place, by_speed = sight.error_rad2
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
-    position_step_sum_m, flown_m = _camera_motions_m(then, attitude, setup)
-    moved_m = position_step_sum_m + share * (flown_m - position_step_sum_m)
+    stepped_m, flown_m = _camera_motions_m(then, attitude, setup)
+    moved_m = stepped_m + share * (flown_m - stepped_m)
     R = R_now.T.dot(R_then)
     tvec = R.dot(pose.tvec_m) - R_now.T.dot(moved_m)
     if tvec[2] <= 0.0:
@@ -490,11 +490,11 @@ def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[
     """Return the camera's displacement (3,) from the estimated positions, and from the
     velocities."""
     turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
-    position_step_sum_m = turned_m + np.subtract(now.position_m, then.position_m)
+    stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
-        return position_step_sum_m, position_step_sum_m
+        return stepped_m, stepped_m
     half_s = 0.5 * (now.t_s - then.t_s)
-    return position_step_sum_m, turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
+    return stepped_m, turned_m + half_s * np.add(now.velocity_mps, then.velocity_mps)
 
 
 def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:

@@ -55,7 +55,7 @@ def ignores_the_second_press(patch: Patch) -> None:
 
 def lands_fast(patch: Patch) -> None:
     """At 1.5 m/s, by itself and by thrust."""
-    order, by_setpoints = descent.onboard_landing, descent._by_setpoints
+    order, by_setpoints = descent.make_onboard_landing, descent._descend_by_setpoints
 
     def fast(*known: Any) -> Land:
         land = order(*known)
@@ -63,11 +63,11 @@ def lands_fast(patch: Patch) -> None:
 
     def by_itself(c: Context) -> Action:
         slow = c.belief.is_target_positioned or c.belief.is_in_magnet_reach
-        return by_setpoints(c) if slow else descent._own_landing(c)
+        return by_setpoints(c) if slow else descent._order_onboard_landing(c)
 
-    patch.setattr(descent, "onboard_landing", fast)
-    patch.setattr(descent, "_by_setpoints", by_itself)
-    for name in ("LEVEL_SINK_MPS", "LOW_SINK_MPS"):
+    patch.setattr(descent, "make_onboard_landing", fast)
+    patch.setattr(descent, "_descend_by_setpoints", by_itself)
+    for name in ("SINK_SETPOINT_MPS", "NEAR_FLOOR_SINK_SETPOINT_MPS"):
         patch.setattr(level_descent, name, 1.5)
 
 

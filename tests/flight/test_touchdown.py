@@ -11,7 +11,7 @@ import pytest
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, Touchdown
 from perchctl.mission.belief.motion import Impact
 from perchctl.mission.belief.reckoning import DeadReckoning, advance_reckoning
-from perchctl.mission.report import HARD_MPS, find_touchdown
+from perchctl.mission.report import HARD_TOUCHDOWN_MPS, find_touchdown
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
 from tests.helpers.hangs import hang_in_the_camera
@@ -77,7 +77,7 @@ def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
     assert truth_mps > 0.4
     assert felt is not None
     assert felt.speed_mps == pytest.approx(truth_mps, abs=0.15 if blind else 0.08)
-    assert felt.is_hard is (truth_mps > HARD_MPS)
+    assert felt.is_hard is (truth_mps > HARD_TOUCHDOWN_MPS)
     assert felt.peak_g > 2.0
 
 

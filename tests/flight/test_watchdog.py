@@ -12,8 +12,8 @@ import pytest
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
 from perchctl.mission import Observation, Operator, Phase, PlannerState
 from perchctl.mission.belief.update import KEEPALIVE_THRUST
-from perchctl.mission.descent import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
-from perchctl.mission.release import CATCH_STILL_ABOVE_M, STOPS
+from perchctl.mission.descent import LANDING_ORDER_PERIOD_S, MAX_LANDING_ORDERS, MIN_LANDING_ORDERS
+from perchctl.mission.release import CATCH_ABOVE_MOTORS_OFF_M, STOP_ORDER_COUNT
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -169,7 +169,7 @@ def test_a_slip_while_the_loop_is_silent_is_caught_then_landed() -> None:
     rig.z_m = CEILING_M - 0.05
     rig.after(0.33, **FALLS)
     caught = rig.after(0.35, **FALLS)
-    assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_STILL_ABOVE_M, 3.0), 0.0)
+    assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_ABOVE_MOTORS_OFF_M, 3.0), 0.0)
     rig.z_m = CEILING_M - 0.4
     for i in range(6):
         assert isinstance(rig.after(0.4 + 0.05 * i, **FALLS), PositionSetpoint)
@@ -193,16 +193,16 @@ def test_a_silence_of_a_second_lands_and_repeats_until_it_shows() -> None:
     assert rig.dog.overruled_s > LAND_S
     assert rig.after(late_s + 0.05) is None
     active = READY | HL_ACTIVE  # also shown where the notify was lost, and nothing lands
-    again_s = REPEAT_ORDER_S + 0.01
-    for i in range(1, LEAST_ORDERS):
+    again_s = LANDING_ORDER_PERIOD_S + 0.01
+    for i in range(1, MIN_LANDING_ORDERS):
         assert isinstance(rig.after(late_s + i * again_s, supervisor=active), Land)
-    assert rig.after(late_s + LEAST_ORDERS * again_s, supervisor=active) is None
+    assert rig.after(late_s + MIN_LANDING_ORDERS * again_s, supervisor=active) is None
 
 
 def test_a_landing_is_ordered_a_limited_number_of_times() -> None:
     rig = Rig()
     orders = [rig.poll(1.05 + 0.05 * i, None) for i in range(200)]
-    assert sum(isinstance(c, Land) for c in orders) == MAX_ORDERS
+    assert sum(isinstance(c, Land) for c in orders) == MAX_LANDING_ORDERS
     assert not [c for c in orders if c is not None and not isinstance(c, Land)]
 
 
@@ -233,7 +233,9 @@ def test_what_hangs_released_is_not_landed(known: bool) -> None:
 
 
 def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
-    landing = remembering(IN_AIR, phase=Phase.LANDING, orders=LEAST_ORDERS, ordered_s=T_S)
+    landing = remembering(
+        IN_AIR, phase=Phase.LANDING, order_count=MIN_LANDING_ORDERS, last_order_s=T_S
+    )
     rig = Rig(Idle(), landing)
     assert rig.after(0.5, supervisor=READY | HL_ACTIVE) is None
     assert rig.after(5.0, supervisor=READY | HL_ACTIVE) is None
@@ -288,7 +290,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     assert raw[-1] == KEEPALIVE_THRUST
     complete = PROFILE.planner.complete
     assert len(raw) * 0.02 == pytest.approx(complete.ramp_s + complete.hang_s, abs=0.2)
-    assert sent[-STOPS:] == [StopMotors()] * STOPS
+    assert sent[-STOP_ORDER_COUNT:] == [StopMotors()] * STOP_ORDER_COUNT
     assert rig.poll(9.5, None) in (None, StopMotors())  # no order spins its motors up again
 
 

@@ -319,7 +319,9 @@ def test_a_slip_is_caught_by_as_much_as_it_takes_then_held_where_it_is(
         assert is_setpoint(command, distance_below_m=HANG_Z_M - 0.1)
 
 
-@pytest.mark.parametrize("stopped", [{}, {"stopped_s": 9.5, "orders": 5}], ids=["turns", "stopped"])
+@pytest.mark.parametrize(
+    "stopped", [{}, {"stopped_s": 9.5, "order_count": 5}], ids=["turns", "stopped"]
+)
 def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped: dict[str, Any]) -> None:
     """Released, or with the motors stopped already: they spin again, and then it goes down."""
     falls = at(HANG_Z_M - 0.01, velocity_mps=(0.0, 0.0, -0.3), acc_z_g=0.2, thrust=0.0)

@@ -106,7 +106,11 @@ def test_each_term_has_its_limit(
 def test_without_a_reference_for_the_thrust_there_is_none() -> None:
     """No hover thrust was learned, or the thrust that is read is not the one that was ordered."""
     assert not is_contact(touching(), hover_thrust=0.0)
-    unanswered = {"raw_order": 20000, "thrust_mismatch_since_s": BEGIN_S - 1.0, "setpoint": None}
+    unanswered = {
+        "raw_thrust_order": 20000,
+        "thrust_mismatch_since_s": BEGIN_S - 1.0,
+        "setpoint": None,
+    }
     assert not is_contact(touching(), **unanswered)
 
 
@@ -121,15 +125,17 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
     assert found == [thrust >= PRESS_THRUST_RATIO] * 4
 
 
-@pytest.mark.parametrize(("raw_order", "presses"), [(60_000, True), (None, False)])
+@pytest.mark.parametrize(("raw_thrust_order", "presses"), [(60_000, True), (None, False)])
 def test_the_end_of_a_raw_press_counts_only_while_one_is_flown(
-    raw_order: int | None, presses: bool
+    raw_thrust_order: int | None, presses: bool
 ) -> None:
     """At 59400 of a raw press's 60000 no more can be shown; in position mode, hover thrust of a
     heavy vehicle is as much, and presses nothing."""
     raw = changed({"planner.perch.mode": "raw", "planner.perch.thrust": 62_000})
     pressing = remembering(
-        state_in(Phase.PERCH, z_m=HANG_Z_M), hover_thrust=58_500.0, raw_order=raw_order
+        state_in(Phase.PERCH, z_m=HANG_Z_M),
+        hover_thrust=58_500.0,
+        raw_thrust_order=raw_thrust_order,
     )
     b = observing(pressing, touching(thrust=59_500.0), raw).belief
     assert is_pressing(b) is presses

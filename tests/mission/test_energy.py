@@ -20,7 +20,7 @@ from perchctl.mission.belief.battery import (
     update_battery_fit,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.endurance import battery_outlook, hover_left_s
+from perchctl.mission.endurance import compute_battery_outlook, predict_hover_time_s
 from perchctl.profile import Profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell
@@ -43,7 +43,7 @@ PERIOD_S, MAH = 0.02, 250.0
 BRUSHLESS_MAH = 350.0
 LOW_V = 3.2  # under a long load, by the firmware
 HOVER = HOVER_THRUST / FULL_THRUST
-ATTEMPT_S, LANDING_S = 12.0, 10.0
+ATTEMPT_S, LANDING_END_DURATION_S = 12.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,12 @@ def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None
         ahead_s = end_s - moment.t_s
         if moment.t_s < 6.0 or ahead_s <= 0.0:
             continue
-        told_s = hover_left_s(moment.energy, PROFILE, hover, BRUSHED)
+        told_s = predict_hover_time_s(moment.energy, PROFILE, hover, BRUSHED)
         assert told_s is not None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
-            assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
+            assert told_s < ATTEMPT_S + LANDING_END_DURATION_S + PROFILE.safety.energy_reserve_s
         if ahead_s > 70.0:  # and one that is safe three times over is
-            assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
+            assert told_s > ATTEMPT_S + LANDING_END_DURATION_S + PROFILE.safety.energy_reserve_s
 
 
 @pytest.mark.parametrize("rest_v", [3.9, pytest.param(3.95, marks=pytest.mark.long)])
@@ -121,9 +121,9 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
         state = remembering(state_in(Phase.ALIGN), energy=moment.energy, hover_thrust=0.0)
-        left_s = battery_outlook(context_at(state, obs, profile)).left_s
-        assert left_s is not None
-        assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
+        remaining_s = compute_battery_outlook(context_at(state, obs, profile)).remaining_s
+        assert remaining_s is not None
+        assert remaining_s <= 1.1 * (end_s - moment.t_s) + 10.0
 
 
 def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
@@ -136,7 +136,7 @@ def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(BatteryFit(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
-    assert hover_left_s(energy, PROFILE, HOVER, BRUSHED) is None
+    assert predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED) is None
     assert energy.no_reading_s == pytest.approx(10.0)
 
 
@@ -154,7 +154,7 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
         energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED)
-    seconds = hover_left_s(energy, PROFILE, HOVER, BRUSHED)
+    seconds = predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
 
@@ -210,7 +210,7 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
     assert gated or phase is not Phase.ALIGN or state.row == "aligned"
     if gated and energy.rest_v is None:
         assert "not known" in state.reason
-        assert state.battery.left_s is None
+        assert state.battery.remaining_s is None
 
 
 def test_a_reading_that_stands_still_is_none() -> None:
@@ -218,7 +218,7 @@ def test_a_reading_that_stands_still_is_none() -> None:
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
         state = replace(observing(state, later), t_s=later.t_s)
-        assert (battery_outlook(Context(state)).left_s is not None) is known
+        assert (compute_battery_outlook(Context(state)).remaining_s is not None) is known
 
 
 @pytest.mark.parametrize(
@@ -233,8 +233,8 @@ def test_a_reading_that_stands_still_is_none() -> None:
 )
 def test_a_flight_ends_sooner_where_battery_low_fires_sooner(changes: dict[str, Any]) -> None:
     energy = replace(FINE_BATTERY, rest_v=3.95)
-    usual_s = hover_left_s(energy, PROFILE, 0.5, BRUSHED)
-    sooner_s = hover_left_s(energy, changed(changes), 0.5, BRUSHED)
+    usual_s = predict_hover_time_s(energy, PROFILE, 0.5, BRUSHED)
+    sooner_s = predict_hover_time_s(energy, changed(changes), 0.5, BRUSHED)
     assert usual_s is not None
     assert sooner_s is not None
     assert 0.0 < sooner_s < usual_s

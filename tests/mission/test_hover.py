@@ -134,7 +134,7 @@ def test_what_was_never_learned_is_felt_and_rough() -> None:
 def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
     """One late packet teaches no more in a second than in a tick."""
     start = remembering(
-        state_in(Phase.LANDING), raw_order=45_000, hover=HoverThrust(50_000.0, 0.12)
+        state_in(Phase.LANDING), raw_thrust_order=45_000, hover=HoverThrust(50_000.0, 0.12)
     )
     sample = replace(telemetry(10.02, 1.0), thrust=45_000.0)
     once = observing(start, observation(10.02, telemetry=sample))
@@ -153,7 +153,9 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
         t_s, read = 10.0 + 0.01 * i, 50_000.0 if i < 50 else step * 50_000.0
         force_g += (1.0 - math.exp(-0.01 / 0.06)) * (read / 50_000.0 - force_g)
         sample = replace(telemetry(t_s, 1.0), thrust=read, acc_z_g=force_g)
-        state = observing(replace(state, raw_order=int(read)), observation(t_s, telemetry=sample))
+        state = observing(
+            replace(state, raw_thrust_order=int(read)), observation(t_s, telemetry=sample)
+        )
         assert state.belief.hover_thrust == pytest.approx(50_000.0, rel=0.005)
 
 

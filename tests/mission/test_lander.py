@@ -30,7 +30,7 @@ from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMo
 from perchctl.mission.belief.quality import BATTERY_LOW
 from perchctl.mission.belief.reckoning import DeadReckoning
 from perchctl.mission.context import Context
-from perchctl.mission.descent import PEEL_S
+from perchctl.mission.descent import PEEL_TIMEOUT_S
 from perchctl.mission.phase import FLYING_PHASES, Claim
 from perchctl.mission.table import PHASES
 from perchctl.profile import Profile
@@ -66,7 +66,7 @@ from tests.mission.rig import BEGIN_S, TICK_S, at, fly, is_setpoint
 
 DECKS = PROFILES["deck"]
 NOW_S = 10.0
-HIGH_M, LOW_M = 1.5, 0.2
+MIN_HANGING_HEIGHT_M, LOW_M = 1.5, 0.2
 # --- By what is known ---------------------------------------------------------------------
 
 # Profile; what is observed, and what is remembered, beyond a hover that all is known of; what is
@@ -84,9 +84,12 @@ KNOWN: dict[str, tuple[Profile, dict[str, Any], dict[str, Any], type[Any]]] = {
 }  # fmt: skip
 # What goes on whatever is known: what is remembered of it, and what may be sent.
 BEGUN: dict[str, tuple[dict[str, Any], type[Any]]] = {
-    "ordered": ({"orders": 1, "ordered_s": NOW_S - 1.0}, Land),
+    "ordered": ({"order_count": 1, "last_order_s": NOW_S - 1.0}, Land),
     "released": ({"released_s": NOW_S - 0.5}, RawThrust),
-    "stopped": ({"stopped_s": NOW_S - 0.2, "orders": 1, "ordered_s": NOW_S - 0.2}, StopMotors),
+    "stopped": (
+        {"stopped_s": NOW_S - 0.2, "order_count": 1, "last_order_s": NOW_S - 0.2},
+        StopMotors,
+    ),
 }
 
 
@@ -101,10 +104,10 @@ def context(
     """A vehicle of which that is known, `held` within the magnet's reach, `since_s` after its way
     down began; with changes of its telemetry and of what is remembered."""
     profile, observed, remembered, _ = KNOWN[known]
-    if changes.get("ordered_s") and profile is BY_TARGET:
+    if changes.get("last_order_s") and profile is BY_TARGET:
         # What once had positions from outside, and was found astray, knows as little.
         profile, remembered = MOCAP, {"diverged": True}
-    z_m = z_m if z_m is not None else HANG_Z_M if held else HIGH_M
+    z_m = z_m if z_m is not None else HANG_Z_M if held else MIN_HANGING_HEIGHT_M
     observed = dict(observed)
     sample = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
     state = remembering(
@@ -155,12 +158,14 @@ def test_below_the_hand_over_it_lands_by_itself_or_level(known: str) -> None:
 def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
     """By no landing of its own, whose trajectory ends while the magnet still holds. Deaf, nobody
     can watch what the weight does: it goes on by setpoints."""
-    assert is_setpoint(descent.act(context(known, True, since_s=PEEL_S - 0.1))[1])
-    state, command = descent.act(context(known, True, since_s=PEEL_S + 0.1))
+    assert is_setpoint(descent.act(context(known, True, since_s=PEEL_TIMEOUT_S - 0.1))[1])
+    state, command = descent.act(context(known, True, since_s=PEEL_TIMEOUT_S + 0.1))
     assert isinstance(command, RawThrust)
     assert state.released_s == NOW_S
     if known == "onboard":
-        deaf, command = descent.act(context(known, True, since_s=PEEL_S + 0.1, tel={"t_s": 8.0}))
+        deaf, command = descent.act(
+            context(known, True, since_s=PEEL_TIMEOUT_S + 0.1, tel={"t_s": 8.0})
+        )
         assert is_setpoint(command, distance_below_m=HANG_Z_M)
         assert deaf.released_s is None
 
@@ -171,9 +176,11 @@ def test_what_does_not_peel_off_is_given_to_the_magnet(known: str) -> None:
 def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Command]:
     """The kind of command that a way down gives a vehicle high up: setpoints by a position, its own
     landing where telemetry, link or loop are doubtful, else raw thrust."""
-    began = remembering(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TICK_S, **state)
+    began = remembering(
+        state_in(Phase.LANDING, NOW_S - 1.0, MIN_HANGING_HEIGHT_M), t_s=NOW_S - TICK_S, **state
+    )
     age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
-    obs = at(HIGH_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
+    obs = at(MIN_HANGING_HEIGHT_M, age_s=age_s, obs=observed, behind_s=behind_s)(NOW_S)
     return type(descent.act(Context(observing(began, obs, profile)))[1])
 
 
@@ -395,12 +402,13 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     before is none."""
     profile, stale = PROFILES[positioning], hung > 1.0
     state = remembering(
-        state_in(Phase.LANDING, z_m=HIGH_M), last=telemetry(NOW_S, HIGH_M), catch_above_m=1.0,
+        state_in(Phase.LANDING, z_m=MIN_HANGING_HEIGHT_M),
+        last=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_above_m=1.0,
         since={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
     off = {"thrust": 0.0, "supervisor": READY, "battery_state": LOW_POWER}
-    obs = observation(later_s, telemetry=telemetry(later_s, HIGH_M, **off))
+    obs = observation(later_s, telemetry=telemetry(later_s, MIN_HANGING_HEIGHT_M, **off))
     after = observing(state, obs, profile)
     assert after.belief.since[MOTORS_STOPPED] == (later_s if stale else 0.0)
     assert after.belief.since[BATTERY_LOW] == 1.0
@@ -465,7 +473,7 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
         return at(HANG_Z_M, obs=unseen, roll_rad=shakes_rad, **tel)(t_s)
 
     begun = remembering(
-        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), orders=6, ordered_s=BEGIN_S,
+        state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), order_count=6, last_order_s=BEGIN_S,
         in_reach_since_s=BEGIN_S - 1.0, reckoning=DeadReckoning(distance_below_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
@@ -502,7 +510,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
         before, reckoning=DeadReckoning(UNMOVED, distance_below_m=distance_below_m)
     )
     entered = remembering(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
-    new = descent.enter_landing(
+    new = descent.enter_descent(
         context_at(entered, obs, BY_TARGET).state, context_at(before, obs, BY_TARGET).state
     )
     assert new.stopped_s == NOW_S
@@ -554,7 +562,7 @@ REMEMBERED = st.sampled_from(
             "in_reach_since_s": 9.0,
             "released_s": 9.0,
             "stopped_s": 9.8,
-            "orders": 2,
+            "order_count": 2,
         },
         {"catch_above_m": 1.0},
         {"pressed": True},

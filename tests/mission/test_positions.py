@@ -12,7 +12,7 @@ from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import contact_offset
 from perchctl.mission.belief.quality import MAX_VELOCITY_DISAGREEMENT_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.descent import LEAST_ORDERS
+from perchctl.mission.descent import MIN_LANDING_ORDERS
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -210,7 +210,11 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     assert is_setpoint(flight.command, above_m=it.estimated_m + 0.15)  # caught
 
 
-STOPPED: dict[str, Any] = {"stopped_s": BEGIN_S - 1.0, "released_s": BEGIN_S - 3.0, "orders": 5}
+STOPPED: dict[str, Any] = {
+    "stopped_s": BEGIN_S - 1.0,
+    "released_s": BEGIN_S - 3.0,
+    "order_count": 5,
+}
 
 
 def off(t_s: float, supervisor: int = READY, gained_mps: float = 0.0) -> Observation:
@@ -460,7 +464,9 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     estimate_only_mps: float,
 ) -> None:
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
-    begin = remembering(state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S)
+    begin = remembering(
+        state_in(Phase.LANDING), order_count=MIN_LANDING_ORDERS, last_order_s=BEGIN_S
+    )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
     assert state.belief.diverged is (estimate_only_mps > MAX_VELOCITY_DISAGREEMENT_MPS)
     assert isinstance(command, RawThrust) is state.belief.diverged

@@ -26,7 +26,7 @@ from perchctl.mission.belief.mounting import REQUIRED_CONTRADICTIONS, MountingMo
 from perchctl.mission.phase import FLYING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
-    ALLOWED,
+    ALLOWED_TRANSITIONS,
     TABLE,
     Transition,
     add_rows,
@@ -230,7 +230,7 @@ CASES: dict[str, Case] = {
     ),
     "found": Case(P.SEARCH, P.ESTIMATE, seen(), 0.2),
     "searched-out": Case(
-        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searched_places": 6}
+        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searched_positions": 6}
     ),
     "estimate-lost": Case(P.ESTIMATE, P.SEARCH, unseen(), 1.2),
     "estimated": Case(P.ESTIMATE, P.ALIGN, seen(), 0.6),
@@ -276,7 +276,7 @@ CASES: dict[str, Case] = {
     ),
     "not-stopped": Case(
         P.COMPLETE, P.LANDING, at(CONTACT_Z_M, thrust=1000.0, supervisor=READY), 0.1, O.SAFETY,
-        state={"stopped_s": BEGIN_S - 12.0, "orders": 5, "contact_z_m": CONTACT_Z_M},
+        state={"stopped_s": BEGIN_S - 12.0, "order_count": 5, "contact_z_m": CONTACT_Z_M},
         z_m=CONTACT_Z_M,
     ),
     "attempts-used": Case(
@@ -295,7 +295,7 @@ CASES: dict[str, Case] = {
     ),
     "landed": Case(
         P.LANDING, P.LANDED, at(0.02, **OFF), 0.3, O.OPERATOR,
-        state={"outcome": O.OPERATOR, "orders": 1}, z_m=0.02,
+        state={"outcome": O.OPERATOR, "order_count": 1}, z_m=0.02,
     ),
     "held-elsewhere": Case(
         P.LANDING, P.ABORTED, at(CONTACT_Z_M - 0.2, **OFF), 0.3, O.SAFETY,
@@ -312,7 +312,7 @@ CASES: dict[str, Case] = {
     ),
     "landing-timeout": Case(
         P.LANDING, P.ABORTED, seen(), 0.1, O.SAFETY, Idle,
-        state={"entered_s": -40.0, "orders": 1, "ordered_s": BEGIN_S},
+        state={"entered_s": -40.0, "order_count": 1, "last_order_s": BEGIN_S},
     ),
 }  # fmt: skip
 
@@ -368,7 +368,7 @@ ROGUE = Transition("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARC
 
 def test_no_row_undoes_a_landing() -> None:
     """Whatever a table says: from a landing nothing leads back into the flight."""
-    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, orders=1)
+    landing = remembering(state_in(P.LANDING), severity=Severity.LAND, order_count=1)
     context = context_at(landing, observation(BEGIN_S), PROFILE)
     assert first_transition(context, (ROGUE,)) is None
     flying = context_at(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
@@ -404,10 +404,10 @@ def test_the_phases_of_a_row_cannot_grow_in_flight() -> None:
 
 
 def test_no_row_of_your_own_may_climb_stop_or_prove() -> None:
-    assert {to for _, to, _ in ALLOWED} == {P.SEARCH, P.ALIGN, P.RECOVER, P.LANDING}
-    assert all(how >= Severity.HOLD for *_, how in ALLOWED)
-    assert [at for at, to, _ in ALLOWED if at is to] == [P.ALIGN]  # where it waits
-    assert {at for at, _, _ in ALLOWED} == FLYING_PHASES - {P.COMPLETE}
+    assert {to for _, to, _ in ALLOWED_TRANSITIONS} == {P.SEARCH, P.ALIGN, P.RECOVER, P.LANDING}
+    assert all(how >= Severity.HOLD for *_, how in ALLOWED_TRANSITIONS)
+    assert [at for at, to, _ in ALLOWED_TRANSITIONS if at is to] == [P.ALIGN]  # where it waits
+    assert {at for at, _, _ in ALLOWED_TRANSITIONS} == FLYING_PHASES - {P.COMPLETE}
 
 
 @pytest.mark.parametrize("change", [

@@ -16,11 +16,15 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, Operator, Phase, PlannerState
 from perchctl.mission.belief.belief import MAX_CORRECTION_AGE_S, MIN_GUST_SPEED_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.level_descent import BRAKE_RAD_PER_MPS, LEVEL_SINK_MPS, MOST_BRAKE_RAD
+from perchctl.mission.level_descent import (
+    BRAKE_GAIN_RAD_PER_MPS,
+    MAX_BRAKE_TILT_RAD,
+    SINK_SETPOINT_MPS,
+)
 from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import MOST_BRAKED_MPS, POSITION_GAIN_PER_S
-from perchctl.mission.setpoints import LOWEST_M
+from perchctl.mission.release import MAX_BRAKED_SPEED_MPS, ONBOARD_POSITION_GAIN_PER_S
+from perchctl.mission.setpoints import MIN_HOLD_HEIGHT_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
 from tests.helpers.mission import (
@@ -110,15 +114,17 @@ def test_what_sightings_contradict_is_not_flown_by(
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""
-    state = remembering(state_in(phase, z_m=z_m), searched_places=2, search_step_s=0.0)
+    state = remembering(state_in(phase, z_m=z_m), searched_positions=2, search_step_s=0.0)
     after = fly(state, unseen(z_m, for_s=max(age_s, HOLD_S + 0.01)), profile=PROFILE).state
     assert after.setpoint is None or after.setpoint.z_m <= z_m
 
 
 def test_sinking_ends_above_the_floor() -> None:
-    state = lost(state_in(Phase.ALIGN, z_m=LOWEST_M + 0.05), LAND_S - 0.1, LOWEST_M + 0.05).state
+    state = lost(
+        state_in(Phase.ALIGN, z_m=MIN_HOLD_HEIGHT_M + 0.05), LAND_S - 0.1, MIN_HOLD_HEIGHT_M + 0.05
+    ).state
     assert state.setpoint is not None
-    assert state.setpoint.z_m == pytest.approx(LOWEST_M)
+    assert state.setpoint.z_m == pytest.approx(MIN_HOLD_HEIGHT_M)
 
 
 @given(
@@ -135,16 +141,16 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
     assume(math.hypot(vx_mps, vy_mps) > 0.1)
     sinks = {"velocity_mps": (0.0, 0.0, -0.5), "yaw_rad": yaw_rad}
     look = at(obs={"position_age_s": age_s}, **sinks)
-    command = fly(blinded(1.0, (vx_mps, vy_mps, -LEVEL_SINK_MPS)), look, profile=PROFILE).command
+    command = fly(blinded(1.0, (vx_mps, vy_mps, -SINK_SETPOINT_MPS)), look, profile=PROFILE).command
     assert isinstance(command, RawThrust)
     # Nose down is forwards, roll to the right is to the right (docs/firmware.md).
     ahead, left = command.pitch_rad, -command.roll_rad
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     x, y = ahead * cos - left * sin, ahead * sin + left * cos
     speed_mps = math.hypot(vx_mps, vy_mps)
-    assert max(abs(ahead), abs(left)) <= MOST_BRAKE_RAD + 1e-9
+    assert max(abs(ahead), abs(left)) <= MAX_BRAKE_TILT_RAD + 1e-9
     assert x * vx_mps + y * vy_mps <= -0.1 * min(speed_mps, 1.0) * speed_mps
-    if speed_mps * BRAKE_RAD_PER_MPS < MOST_BRAKE_RAD:
+    if speed_mps * BRAKE_GAIN_RAD_PER_MPS < MAX_BRAKE_TILT_RAD:
         assert x * vy_mps - y * vx_mps == pytest.approx(0.0, abs=1e-9)
 
 
@@ -218,8 +224,8 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     assert isinstance(command, PositionSetpoint)
     if unknown_mps > MIN_GUST_SPEED_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
-            braked_mps = max(-MOST_BRAKED_MPS, min(MOST_BRAKED_MPS, mps))
-            assert way_m == pytest.approx(-braked_mps / POSITION_GAIN_PER_S, abs=0.02)
+            braked_mps = max(-MAX_BRAKED_SPEED_MPS, min(MAX_BRAKED_SPEED_MPS, mps))
+            assert way_m == pytest.approx(-braked_mps / ONBOARD_POSITION_GAIN_PER_S, abs=0.02)
     else:
         assert (command.x_m, command.y_m) == (0.0, 0.0)
 
@@ -240,8 +246,8 @@ def test_level_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(
 
     command = fly(state, sinks, profile=PROFILE if blind else DECKS).command
     assert isinstance(command, RawThrust)
-    beside = abs(speed_mps + LEVEL_SINK_MPS) < 0.02
-    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -LEVEL_SINK_MPS)
+    beside = abs(speed_mps + SINK_SETPOINT_MPS) < 0.02
+    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_SETPOINT_MPS)
     assert command.thrust <= 60000  # more is clipped
     assert blind or (command.roll_rad, command.pitch_rad) == (0.0, 0.0)
 

@@ -131,7 +131,7 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
 
 
 @pytest.mark.parametrize(
-    ("raw_order", "reads", "known"),
+    ("raw_thrust_order", "reads", "known"),
     [
         (1000, 20000.0, False),  # stands still where it was before the order
         (1000, 0.0, True),
@@ -140,12 +140,13 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
     ],
 )
 def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
-    raw_order: int | None, reads: float, known: bool
+    raw_thrust_order: int | None, reads: float, known: bool
 ) -> None:
     """It proves no hold: a magnet that carries nothing would pass for one that carries it all."""
     state = remembering(
-        state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_order=raw_order, released_s=9.5,
-        setpoint=None if raw_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
+        state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_thrust_order=raw_thrust_order,
+        released_s=9.5,
+        setpoint=None if raw_thrust_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
     )  # fmt: skip
     for t_s in times(0.38):
         obs = at(CONTACT_Z_M, thrust=reads)(t_s)
@@ -232,5 +233,5 @@ def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     it = Follows(0.1, operator=Operator.LAND)
     flight = fly(state_in(Phase.ALIGN), it, 20.0, profile)
     ordered = next(i for i, c in enumerate(flight.commands) if not isinstance(c, PositionSetpoint))
-    assert flight.ticks[ordered].state.orders == 1
+    assert flight.ticks[ordered].state.order_count == 1
     assert GROUND_CLEARANCE_M <= it.sent_m[ordered] < handover_m

@@ -13,9 +13,14 @@ from hypothesis import strategies as st
 
 from perchctl.mission import ContactOffset, ImuMotion, Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import CONTACT
-from perchctl.mission.descent import LANDING_MARGIN_S, MOST_DRIFT_M, PLANNED_MPS, onboard_landing
+from perchctl.mission.descent import (
+    MAX_HEIGHT_DRIFT_M,
+    ONBOARD_LANDING_MARGIN_S,
+    ONBOARD_LANDING_MEAN_MPS,
+    make_onboard_landing,
+)
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import UNREAD_S
+from perchctl.mission.release import UNCONFIRMED_THRUST_EXTRA_S
 from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
@@ -98,7 +103,7 @@ STATES: tuple[dict[str, Any], ...] = (
     {},
     {"contact_z_m": HANG_Z_M},
     {"contact_z_m": HANG_Z_M, "released_s": 9.9},
-    {"orders": 2, "ordered_s": 9.9},
+    {"order_count": 2, "last_order_s": 9.9},
     {"hover_thrust": 0.0},
 )
 
@@ -134,7 +139,7 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     """The whole weight for as long as it takes, where the target is or the contact was; longer
     where the thrust that is read does not follow what is ordered."""
     hang_s = PROFILE.planner.complete.hang_s
-    recent, longer = _was_fresh(seen, hang_s), _was_fresh(seen, hang_s + UNREAD_S)
+    recent, longer = _was_fresh(seen, hang_s), _was_fresh(seen, hang_s + UNCONFIRMED_THRUST_EXTRA_S)
     if longer is not None and all(_at_rest(o) for o in longer):
         return True
     return recent is not None and all(_at_rest(o) and o.telemetry.thrust <= 5000.0 for o in recent)
@@ -219,7 +224,7 @@ def test_what_has_not_come_down_hangs_where_the_target_is(
     """Its own landing ended up there, motors off."""
     z_m = HANG_Z_M - distance_below_m
     target = target_at(BEGIN_S, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
-    begin = landing(z_m, orders=3, ordered_s=9.9)
+    begin = landing(z_m, order_count=3, last_order_s=9.9)
     state = fly(begin, at(z_m, obs={"target": target}, **OFF), 2.4).state
     assert state.phase is ends
     assert words in state.reason
@@ -391,12 +396,12 @@ def test_what_has_left_its_contact_forgets_where_that_was_and_only_that_has_reco
 # --- The release -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("obs", "is_held"), [({"target": None}, True), ({}, False)])
+@pytest.mark.parametrize(("obs", "is_held_by_target"), [({"target": None}, True), ({}, False)])
 def test_a_landing_that_does_not_come_down_is_held_unless_its_target_is_far_above(
-    obs: dict[str, Any], is_held: bool
+    obs: dict[str, Any], is_held_by_target: bool
 ) -> None:
     flight = fly(landing(1.5), at(1.5, obs=obs, thrust=20000.0), 1.2)
-    assert isinstance(flight.command, RawThrust) is is_held
+    assert isinstance(flight.command, RawThrust) is is_held_by_target
 
 
 def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
@@ -435,8 +440,8 @@ def test_a_completion_whose_telemetry_stands_still_ends(
         in_reach_since_s=9.0,
         released_s=9.0,
         stopped_s=10.0,
-        ordered_s=10.0,
-        orders=1,
+        last_order_s=10.0,
+        order_count=1,
     )
     flight = fly(stopped, at(HANG_Z_M, **frozen), 50.0, PROFILES[positioning], feels=True)
     assert all(isinstance(command, StopMotors | Idle) for command in flight.commands)
@@ -456,7 +461,9 @@ def test_what_peels_off_too_fast_is_caught() -> None:
 def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     """Locked by a lost notify while it slips: it is not reported as perched."""
     locked = {**OFF, "supervisor": READY | LOCKED, "velocity_mps": (0.0, 0.0, -0.9)}
-    flight = fly(hanging(Phase.COMPLETE, stopped_s=9.0, orders=5), at(HANG_Z_M - 0.05, **locked))
+    flight = fly(
+        hanging(Phase.COMPLETE, stopped_s=9.0, order_count=5), at(HANG_Z_M - 0.05, **locked)
+    )
     assert flight.state.phase is not Phase.PERCHED
 
 
@@ -493,7 +500,9 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
 def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
     """By the line in the world that was it would dive by the step."""
     lands = AIRBORNE | HL_ACTIVE
-    state = landing(0.4, orders=3, ordered_s=9.0, last=telemetry(9.98, 0.4, supervisor=lands))
+    state = landing(
+        0.4, order_count=3, last_order_s=9.0, last=telemetry(9.98, 0.4, supervisor=lands)
+    )
     up = at(0.9, obs={"jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
     state, command = step_mission(state, up(10.0), PROFILE)
     assert is_setpoint(command, above_m=1.2)
@@ -513,8 +522,11 @@ def cut(z_m: float, climb_mps: float, **obs: Any) -> Look:
 
 
 OVERDUE = landing(3.0, entered_s=10.0 - 0.6 * PROFILE.planner.landing.timeout_s)
-ORDERED, LOW = landing(1.5, orders=1, ordered_s=9.5), landing(1.5, orders=3, ordered_s=5.0)
-HIGH = landing(1.8, orders=3, ordered_s=5.0)
+ORDERED, LOW = (
+    landing(1.5, order_count=1, last_order_s=9.5),
+    landing(1.5, order_count=3, last_order_s=5.0),
+)
+HIGH = landing(1.8, order_count=3, last_order_s=5.0)
 
 
 @pytest.mark.parametrize(
@@ -551,11 +563,13 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     """Also from below the ground, from where it would climb to it. Of a quintic the largest speed
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
-    order = onboard_landing(PROFILE.planner, 0.0, flown_s, z_m)
-    drift_m = min(MOST_DRIFT_M, config.drift_mps * flown_s)
+    order = make_onboard_landing(PROFILE.planner, 0.0, flown_s, z_m)
+    drift_m = min(MAX_HEIGHT_DRIFT_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
-    assert 15 / 8 * way_m / (order.duration_s - LANDING_MARGIN_S) == pytest.approx(PLANNED_MPS)
+    assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_MARGIN_S) == pytest.approx(
+        ONBOARD_LANDING_MEAN_MPS
+    )
 
 
 # --- What stays up, or stands still ----------------------------------------------------

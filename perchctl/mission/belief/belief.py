@@ -1,9 +1,9 @@
 """The planner's belief about the vehicle: one frozen value per tick.
 
-`update_belief` computes it once per tick from the previous belief, the observation, the orders sent
-so far, and the profile. The belief makes no decisions and knows no phases. Quantities that follow
-from its fields are properties, computed on first access. Every claim has a variance or an age; an
-unknown one is infinite.
+`update_belief` computes it once per tick from the previous belief, the observation, the orders
+sent so far, and the profile. The belief makes no decisions and knows no phases. Quantities that
+follow from its fields are properties, computed on first access. Every claim has a variance or an
+age; an unknown one is infinite.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ class Maneuver:
 
 @dataclass(frozen=True, kw_only=True)
 class SentOrders:
-    """The orders that the planner has sent so far; the belief knows no other state of the planner.
+    """The orders that the planner has sent so far; the belief knows no other state of the
+    planner.
 
     Times are on the loop's clock; positions are in the world frame of the state estimate.
     """
@@ -60,9 +61,8 @@ class SentOrders:
     raw_thrust: int | None = None  # last order; None in position mode
     released_s: float | None = None  # start of the release by raw thrust
     stopped_s: float | None = None  # first order to stop the motors
-    floor_detected_s: float | None = (
-        None  # time at which a descent by raw thrust detected the floor
-    )
+    # time at which a descent by raw thrust detected the floor
+    floor_detected_s: float | None = None
 
     @property
     def is_level_descent(self) -> bool:
@@ -75,8 +75,8 @@ class SentOrders:
         return self.released_s is None and self.stopped_s is None
 
     def with_frame_shift(self, setpoint: PositionSetpoint | None, by_m: Vector) -> SentOrders:
-        """Return the same orders with the start of the maneuver shifted by `by_m`, the motion of
-        the estimate's world frame, and with `setpoint` in the new frame."""
+        """Return the same orders with the start of the maneuver shifted by `by_m`, the motion
+        of the estimate's world frame, and with `setpoint` in the new frame."""
         x, y, z = self.maneuver_start_m
         return replace(
             self, setpoint=setpoint, maneuver_start_m=(x + by_m[0], y + by_m[1], z + by_m[2])

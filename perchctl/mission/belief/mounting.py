@@ -83,9 +83,8 @@ class MountingMonitor:
 
     sightings: tuple[MountingSample, ...] = ()
     paused_until_s: float = -math.inf
-    is_confirmed: bool = (
-        False  # the target has stood still over `MIN_PROVEN_MOTION_M`: the check is complete
-    )
+    # the target has stood still over `MIN_PROVEN_MOTION_M`: the check is complete
+    is_confirmed: bool = False
     is_target_stationary: bool = False  # the target has stood still so far
     contradictions: int = 0  # successive sightings that contradict the mounting
     turn_rad: float = 0.0  # rotation of the mounting with which the target would stand still

@@ -8,7 +8,7 @@ from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.endurance import battery_shortfall, is_short_of_charge
+from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low
 from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.recover import has_recovered
 from perchctl.mission.setpoints import Action, fly_under_target, hold_here
@@ -35,11 +35,11 @@ def is_aligned(c: Context) -> bool:
     return c.held_s(ALIGNED) >= c.planner.align.dwell_s
 
 
-def lacks_charge_to_begin(c: Context) -> bool:
+def should_wait_for_charge(c: Context) -> bool:
     """True if an attempt or a retry is about to begin and the battery has too little charge for
     it."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
-    return begins and c.state.attempts < c.planner.attempts and is_short_of_charge(c)
+    return begins and c.state.attempts < c.planner.attempts and is_charge_too_low(c)
 
 
 ALIGN = PhaseDefinition(
@@ -67,8 +67,8 @@ ALIGN = PhaseDefinition(
         land_row(
             "too-little-left",
             {Phase.ALIGN, Phase.RECOVER},
-            lacks_charge_to_begin,
-            battery_shortfall,
+            should_wait_for_charge,
+            battery_shortfall_text,
         ),
         Transition(
             "aligned", {Phase.ALIGN}, is_aligned, Phase.ASCEND, "aligned in position and heading"

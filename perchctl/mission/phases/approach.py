@@ -11,24 +11,24 @@ from perchctl.mission.setpoints import Action, fly_to, step_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-LIFT_ABOVE_M = 0.1
+MIN_HEIGHT_CONTROL_M = 0.1
 """Height below which the vehicle may still stand on the ground, m; the height is not corrected
 there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that still
 stands jumps up."""
-APPROACH_PART = 0.7
+APPROACH_HEIGHT_FRACTION = 0.7
 """Share of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
-AT_HEIGHT_PART = 0.8
+REACHED_HEIGHT_FRACTION = 0.8
 """Share of the take-off height that counts as reached."""
-AT_HEIGHT_MPS = 0.25
+MAX_TAKEOFF_END_SPEED_MPS = 0.25
 """Largest speed that counts as hovering, m/s."""
-AT_HEIGHT_S = 0.3
+TAKEOFF_END_DWELL_S = 0.3
 """Time for which the vehicle must hover, s."""
 
 AT_TAKEOFF_HEIGHT = Condition[Context](
     "at take-off height",
     lambda c: (
-        c.belief.height_m >= AT_HEIGHT_PART * c.planner.takeoff_height_m
-        and c.belief.speed_mps <= AT_HEIGHT_MPS
+        c.belief.height_m >= REACHED_HEIGHT_FRACTION * c.planner.takeoff_height_m
+        and c.belief.speed_mps <= MAX_TAKEOFF_END_SPEED_MPS
         and c.state.setpoint is not None
     ),
 )
@@ -41,11 +41,14 @@ def act(c: Context) -> Action:
     assert b.takeoff_position_m is not None
     x, y, z = b.takeoff_position_m
     start = state.setpoint or PositionSetpoint(x, y, z, state.entry.yaw_rad)
-    if planner.approach_xy_m is not None and b.height_m > APPROACH_PART * planner.takeoff_height_m:
+    if (
+        planner.approach_xy_m is not None
+        and b.height_m > APPROACH_HEIGHT_FRACTION * planner.takeoff_height_m
+    ):
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
     setpoint = step_towards(c, start, goal, up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, lift=b.height_m > LIFT_ABOVE_M)
+    return fly_to(c, setpoint, lift=b.height_m > MIN_HEIGHT_CONTROL_M)
 
 
 APPROACH = PhaseDefinition(
@@ -57,7 +60,7 @@ APPROACH = PhaseDefinition(
         Transition(
             "approached",
             {Phase.APPROACH},
-            lambda c: c.held_s(AT_TAKEOFF_HEIGHT) >= AT_HEIGHT_S,
+            lambda c: c.held_s(AT_TAKEOFF_HEIGHT) >= TAKEOFF_END_DWELL_S,
             Phase.SEARCH,
             "hovering in the perching area",
         ),

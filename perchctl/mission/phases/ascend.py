@@ -14,17 +14,17 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
-CLIMB_WITHIN = 0.7
+CLIMB_CONE_FRACTION = 0.7
 """Share of the cone's radius within which the vehicle climbs. Larger: it leaves the cone and
 returns to ALIGN."""
-MOST_LAG_M = 0.15
+MAX_SETPOINT_LEAD_M = 0.15
 """Largest height of the setpoint above the vehicle during the climb, m. Larger: the setpoint runs
 far ahead of a weak vehicle."""
-LEAST_CLIMB_MPS = 0.02
+MIN_CLIMB_MPS = 0.02
 """Speed with which the setpoint approaches the stand-off, m/s."""
 
 
-def cone_m(c: Context) -> float:
+def cone_radius_m(c: Context) -> float:
     """Return the radius of the cone at the present height, m: the largest offset from the target's
     axis."""
     ascend = c.planner.ascend
@@ -63,7 +63,7 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     """Reset the search: if the aligned target is lost later, the search starts from the
     beginning."""
     del before
-    return replace(state, searched_places=0)
+    return replace(state, searched_positions=0)
 
 
 def act(c: Context) -> Action:
@@ -71,11 +71,13 @@ def act(c: Context) -> Action:
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or hold_here(c)
     goal_z = target.contact_body_z_m - ascend.standoff_m
-    may_climb = target.is_fresh and target.error_xy_m < CLIMB_WITHIN * cone_m(c)
+    may_climb = target.is_fresh and target.error_xy_m < CLIMB_CONE_FRACTION * cone_radius_m(c)
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.error_z_m < ascend.near_m else ascend.speed_mps
-    speed = min(speed, max(LEAST_CLIMB_MPS, goal_z - setpoint.z_m))
-    return fly_under_target(c, goal_z, up_mps=speed if may_climb and lag_m < MOST_LAG_M else 0.0)
+    speed = min(speed, max(MIN_CLIMB_MPS, goal_z - setpoint.z_m))
+    return fly_under_target(
+        c, goal_z, up_mps=speed if may_climb and lag_m < MAX_SETPOINT_LEAD_M else 0.0
+    )
 
 
 ASCEND = PhaseDefinition(
@@ -100,7 +102,7 @@ ASCEND = PhaseDefinition(
         Transition(
             "outside-cone",
             {Phase.ASCEND},
-            lambda c: c.belief.target.error_xy_m > cone_m(c),
+            lambda c: c.belief.target.error_xy_m > cone_radius_m(c),
             Phase.ALIGN,
             "drifted out of the cone",
             Severity.HOLD,

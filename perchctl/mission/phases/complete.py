@@ -20,10 +20,10 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
-OFF_S = 0.1
+MOTORS_OFF_DWELL_S = 0.1
 """Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
 sample ends the flight. Larger: the flight ends later."""
-UNSTOPPED_S = 10.0
+MOTOR_STOP_TIMEOUT_S = 10.0
 """Time after the monitoring at which the flight ends although telemetry still shows thrust, s."""
 
 
@@ -46,14 +46,17 @@ def act(c: Context) -> Action:
     return release_by_thrust(c) if holds or c.state.released_s is not None else lower_thrust(c)
 
 
-def stopped_for_s(c: Context) -> float:
+def time_since_stop_s(c: Context) -> float:
     """Seconds since the first order to stop the motors; -1 before it."""
     return -1.0 if c.state.stopped_s is None else c.t_s - c.state.stopped_s
 
 
-def release_monitored(c: Context) -> bool:
+def is_release_monitored(c: Context) -> bool:
     """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
-    return stopped_for_s(c) >= c.planner.complete.watch_s and c.held_s(MOTORS_STOPPED) >= OFF_S
+    return (
+        time_since_stop_s(c) >= c.planner.complete.watch_s
+        and c.held_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S
+    )
 
 
 COMPLETE = PhaseDefinition(
@@ -81,7 +84,7 @@ COMPLETE = PhaseDefinition(
         Transition(
             "perched",
             {Phase.COMPLETE},
-            lambda c: release_monitored(c) and is_still_hanging(c),
+            lambda c: is_release_monitored(c) and is_still_hanging(c),
             Phase.PERCHED,
             "hanging still with the motors off",
             outcome=Outcome.PERCHED,
@@ -89,13 +92,13 @@ COMPLETE = PhaseDefinition(
         land_row(
             "fell-unseen",
             {Phase.COMPLETE},
-            release_monitored,
+            is_release_monitored,
             "it is not known to hang where it did",
         ),
         land_row(
             "not-stopped",
             {Phase.COMPLETE},
-            lambda c: stopped_for_s(c) > c.planner.complete.watch_s + UNSTOPPED_S,
+            lambda c: time_since_stop_s(c) > c.planner.complete.watch_s + MOTOR_STOP_TIMEOUT_S,
             lambda c: f"motors stopped, but their thrust still reads {c.telemetry.thrust:.0f}",
         ),
     ),

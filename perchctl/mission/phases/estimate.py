@@ -10,7 +10,7 @@ from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.setpoints import Action, fly_to, hold_here
 from perchctl.mission.transition import Transition
 
-UNTRACKED_S = 1.0
+UNTRACKED_TIMEOUT_S = 1.0
 """Time without the target after which the search restarts, s."""
 
 UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
@@ -39,7 +39,8 @@ ESTIMATE = PhaseDefinition(
             "estimate-lost",
             {Phase.ESTIMATE},
             lambda c: (
-                c.held_s(UNTRACKED) > UNTRACKED_S or c.in_phase_s > c.planner.estimate.timeout_s
+                c.held_s(UNTRACKED) > UNTRACKED_TIMEOUT_S
+                or c.in_phase_s > c.planner.estimate.timeout_s
             ),
             Phase.SEARCH,
             "the target's pose does not settle",

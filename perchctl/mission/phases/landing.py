@@ -6,7 +6,7 @@ from perchctl.mission.belief.contact import MOTORS_STOPPED
 from perchctl.mission.belief.reckoning import correct_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.descent import MANEUVER, act, enter_landing
+from perchctl.mission.descent import MANEUVER, act, enter_descent
 from perchctl.mission.phase import Claim, Outcome, Phase
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
@@ -14,10 +14,10 @@ from perchctl.mission.transition import Predicate, Transition, give_up_row
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
-OFF_S = 0.1
+MOTORS_OFF_DWELL_S = 0.1
 """Time for which telemetry must show the motors off before they count as off, s. Smaller: one wrong
 sample ends the flight. Larger: the flight ends later."""
-LOOKED_S = 2.0
+TARGET_LOOK_DURATION_S = 2.0
 """Time after the motors are off in which the camera may still show the target far above, s."""
 
 
@@ -34,12 +34,12 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
         b = replace(b, contact=None)  # no evidence of a support at that position
     # With a wrong mounting, the setpoint leads in a wrong direction.
     setpoint = None if Claim.MOUNTING_WRONG in claims else state.setpoint
-    return enter_landing(replace(state, belief=b, setpoint=setpoint), before.state)
+    return enter_descent(replace(state, belief=b, setpoint=setpoint), before.state)
 
 
-def rests_as(rest: RestState) -> Predicate:
+def make_rest_predicate(rest: RestState) -> Predicate:
     """Return the predicate that the motors are off and the vehicle is in the rest state `rest`."""
-    return lambda c: c.held_s(MOTORS_STOPPED) >= OFF_S and find_rest_state(c) is rest
+    return lambda c: c.held_s(MOTORS_STOPPED) >= MOTORS_OFF_DWELL_S and find_rest_state(c) is rest
 
 
 def unconfirmed_reason(c: Context) -> str:
@@ -56,7 +56,7 @@ def unconfirmed_reason(c: Context) -> str:
     return f"the landing was not confirmed in time: {cause}"
 
 
-def _hung_outcome(before: Outcome | None) -> Outcome | None:
+def _outcome_after_hanging(before: Outcome | None) -> Outcome | None:
     """Return the outcome of a vehicle that hangs: it has found its target after all."""
     return Outcome.ATTEMPTS_USED_UP if before is Outcome.TARGET_NOT_FOUND else before
 
@@ -70,15 +70,15 @@ LANDING = PhaseDefinition(
         Transition(
             "hung",
             {Phase.LANDING},
-            rests_as(RestState.HANGS),
+            make_rest_predicate(RestState.HANGS),
             Phase.PERCHED,
             "hanging with the motors off",
-            outcome=_hung_outcome,
+            outcome=_outcome_after_hanging,
         ),
         Transition(
             "landed",
             {Phase.LANDING},
-            rests_as(RestState.STANDS),
+            make_rest_predicate(RestState.STANDS),
             Phase.LANDED,
             lambda c: (
                 "motors off"
@@ -91,13 +91,13 @@ LANDING = PhaseDefinition(
         ),
         give_up_row(
             "held-elsewhere",
-            rests_as(RestState.HELD),
+            make_rest_predicate(RestState.HELD),
             "motors off; something holds it where its estimate has no target: look before you "
             "touch it",
         ),
         give_up_row(
             "hangs-or-stands",
-            lambda c: c.held_s(MOTORS_STOPPED) >= LOOKED_S,
+            lambda c: c.held_s(MOTORS_STOPPED) >= TARGET_LOOK_DURATION_S,
             "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
             "whether it hangs or stands: look before you touch it",
         ),

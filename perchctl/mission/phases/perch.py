@@ -30,7 +30,7 @@ from perchctl.vehicle import RawThrust
 
 LATERAL_BLOW_DWELL_S = 0.04
 """Time for which the vehicle must move laterally, s: more than one telemetry sample."""
-BLIND_PRESS_S = 1.25
+MAX_BLIND_PRESS_S = 1.25
 """Longest press after the last sighting, s, since the last centimetres are flown without the target
 in view; with the target alone, by dead reckoning. Larger: the vehicle presses outside the magnet's
 radius. Smaller: a covered marker ends attempts that would succeed."""
@@ -84,7 +84,7 @@ PERCH = PhaseDefinition(
         back_off_row(
             "pressed-blindly",
             {Phase.PERCH},
-            lambda c: c.belief.is_target_positioned and c.belief.position_age_s > BLIND_PRESS_S,
+            lambda c: c.belief.is_target_positioned and c.belief.position_age_s > MAX_BLIND_PRESS_S,
             lambda c: (
                 f"no contact {c.belief.position_age_s:.1f} s after the last sight of the target"
             ),

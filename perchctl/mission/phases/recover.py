@@ -17,7 +17,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Claim, Outcome, Phase
 from perchctl.mission.release import (
-    catch_goal_above_m,
+    catch_setpoint_above_m,
     catch_slip,
     clear_contact_below,
     leave_press,
@@ -34,16 +34,16 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-CARRIED_RATIO = 0.85
+MIN_NO_CATCH_THRUST_RATIO = 0.85
 """Share of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
 catch."""
-RECOVER_CLEAR_M = 0.05
+CONTACT_CLEARANCE_M = 0.05
 """Distance below the contact at which the vehicle has left it, m; at most half of the descent."""
-SEEN_LATELY_S = 3.0
+MAX_FOLLOWED_SIGHTING_AGE_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
-ATTEMPTS_SEEN_S = 0.5
+LAST_RECOVERY_DURATION_S = 0.5
 """Time that the vehicle recovers before the last failed attempt ends the flight, s."""
-RECOVER_DOWN_MPS = 10.0
+RECOVER_DESCENT_MPS = 10.0
 """Speed of the setpoint downwards, m/s: so large that the setpoint steps to its goal at once."""
 
 STEADY = Condition[Context]("steady", lambda c: c.belief.speed_mps <= c.planner.recover.steady_mps)
@@ -56,10 +56,10 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or Claim.BLOCKED in claims
     # A vehicle whose motors carry most of its weight hardly falls.
-    falls = Claim.SLIPPED in claims and thrust < CARRIED_RATIO * b.hover_thrust
+    falls = Claim.SLIPPED in claims and thrust < MIN_NO_CATCH_THRUST_RATIO * b.hover_thrust
     belief = replace(
         state.belief,
-        contact=_touched(before, claims),
+        contact=_find_touch_offset(before, claims),
         # The vehicle counts as within the magnet's reach until its position is below.
         contact_z_m=z_m if touched else b.contact_z_m,
     )
@@ -68,12 +68,12 @@ def enter(state: PlannerState, before: Context) -> PlannerState:
         belief=belief,
         stopped_s=None,
         released_s=None,
-        catch_above_m=catch_goal_above_m(b.hover_thrust, thrust) if falls else None,
+        catch_above_m=catch_setpoint_above_m(b.hover_thrust, thrust) if falls else None,
         blocked_z_m=z_m if Claim.BLOCKED in claims else old.blocked_z_m,
     )
 
 
-def _touched(before: Context, claims: Claim) -> ContactOffset | None:
+def _find_touch_offset(before: Context, claims: Claim) -> ContactOffset | None:
     """Return the gear's offset at the touch that ended the attempt; None if no touch is known."""
     old, b = before.state, before.belief
     if Claim.STILL_ATTACHED in claims:  # the contact was proven, and the vehicle has not come off
@@ -94,7 +94,7 @@ def act(c: Context) -> Action:
     if (caught := catch_slip(c)) is not None:
         return caught
     recover = c.planner.recover
-    c = Context(clear_contact_below(c.state, min(RECOVER_CLEAR_M, 0.5 * recover.descend_m)))
+    c = Context(clear_contact_below(c.state, min(CONTACT_CLEARANCE_M, 0.5 * recover.descend_m)))
     state, away = leave_press(c)
     if away is not None:
         return state, away
@@ -107,13 +107,13 @@ def act(c: Context) -> Action:
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)
     target = c.belief.target
-    if target.world_m is not None and target.age_s < SEEN_LATELY_S:
+    if target.world_m is not None and target.age_s < MAX_FOLLOWED_SIGHTING_AGE_S:
         x, y = body_xy_under_target(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
-    return fly_to(c, step_towards(c, setpoint, goal, down_mps=RECOVER_DOWN_MPS))
+    return fly_to(c, step_towards(c, setpoint, goal, down_mps=RECOVER_DESCENT_MPS))
 
 
 def has_recovered(c: Context) -> bool:
@@ -147,7 +147,9 @@ RECOVER = PhaseDefinition(
         land_row(
             "attempts-used",
             {Phase.RECOVER},
-            lambda c: c.state.attempts >= c.planner.attempts and c.in_phase_s > ATTEMPTS_SEEN_S,
+            lambda c: (
+                c.state.attempts >= c.planner.attempts and c.in_phase_s > LAST_RECOVERY_DURATION_S
+            ),
             "all perching attempts are used up",
             Outcome.ATTEMPTS_USED_UP,
         ),

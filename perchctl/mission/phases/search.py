@@ -15,9 +15,9 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-BLOCKED_ROOM_M = 0.1
+OBSTACLE_CLEARANCE_M = 0.1
 """Distance that the search keeps below an obstacle, m."""
-WARY_M = 0.2
+MAX_UNCONFIRMED_DISTANCE_M = 0.2
 """Largest lateral distance flown to a target seen before, while the camera's mounting is
 unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
@@ -38,34 +38,34 @@ def act(c: Context) -> Action:
     takeoff_position_m = b.takeoff_position_m
     assert takeoff_position_m is not None
     if c.t_s - state.search_step_s > search.wait_s:
-        state = replace(state, searched_places=state.searched_places + 1, search_step_s=c.t_s)
+        state = replace(state, searched_positions=state.searched_positions + 1, search_step_s=c.t_s)
         c = Context(state)
     x, y, z = state.entry.position_m
     if b.target.world_m is not None:
         there = body_xy_under_target(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_unconfirmed
-        x, y = _not_far(b.mounting, (x, y), there) if unconfirmed else there
+        x, y = _limit_distance(b.mounting, (x, y), there) if unconfirmed else there
         height = min(z, b.target.contact_body_z_m - c.planner.ascend.near_m)
     else:
         top = max(z, takeoff_position_m[2] + search.max_height_m)
         if state.blocked_z_m is not None:
-            top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
-        height = min(z + search.step_m * state.searched_places, top)
-    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_places
+            top = min(top, state.blocked_z_m - OBSTACLE_CLEARANCE_M)
+        height = min(z + search.step_m * state.searched_positions, top)
+    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_positions
     goal = PositionSetpoint(x, y, height, yaw)
     old = state.setpoint or hold_here(c)
     return fly_to(c, step_towards(c, old, goal, up_mps=c.planner.ascend.speed_mps))
 
 
-def _not_far(
+def _limit_distance(
     mount: MountingMonitor, start: tuple[float, float], goal: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m), limited to `WARY_M` from the last sighting, else from
-    `start`."""
+    """Return the goal, world x and y (m), limited to `MAX_UNCONFIRMED_DISTANCE_M` from the last
+    sighting, else from `start`."""
     if mount.sightings:
         start = (mount.sightings[-1].vehicle_m.real, mount.sightings[-1].vehicle_m.imag)
     dx, dy = goal[0] - start[0], goal[1] - start[1]
-    part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
+    part = min(1.0, MAX_UNCONFIRMED_DISTANCE_M / max(math.hypot(dx, dy), 1e-6))
     return start[0] + part * dx, start[1] + part * dy
 
 
@@ -85,14 +85,14 @@ SEARCH = PhaseDefinition(
         Transition(
             "found",
             {Phase.SEARCH},
-            lambda c: c.state.confirmed >= c.planner.search.confirm_frames,
+            lambda c: c.state.confirmed_frames >= c.planner.search.confirm_frames,
             Phase.ESTIMATE,
             "target seen",
         ),
         land_row(
             "searched-out",
             {Phase.SEARCH},
-            lambda c: c.state.searched_places >= c.planner.search.attempts,
+            lambda c: c.state.searched_positions >= c.planner.search.attempts,
             not_found_reason,
             Outcome.TARGET_NOT_FOUND,
         ),
