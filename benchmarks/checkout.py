@@ -107,12 +107,13 @@ def _seen(frames: list[tuple[float, Picture]], pipeline: Any) -> tuple[Any, ...]
     state, output, t_s = PipelineState(), None, 0.0
     # Older ones keep what they know of the fields beside the state.
     fields = room.FieldState() if hasattr(room, "FieldState") else None
+    deinterlace = getattr(room, "deinterlace", None) or room.pictures  # its former name
     for index, (at_s, image) in enumerate(frames):
         parts = (Frame(index, at_s, image),)
         if fields is None:
-            state, parts = room.pictures(state, parts[0], pipeline)
+            state, parts = deinterlace(state, parts[0], pipeline)
         else:
-            fields, parts = room.pictures(fields, parts[0], pipeline)
+            fields, parts = deinterlace(fields, parts[0], pipeline)
         for part in parts:
             state, output = room.step(state, part, None, pipeline)
             t_s = part.t_s

@@ -43,7 +43,7 @@ from perchctl.profile import Profile
 from perchctl.record import LogWatcher
 from perchctl.record.summary import RecordingEnd
 from perchctl.vehicle import PositionSetpoint, Telemetry
-from perchctl.vision import Frame, PipelineOutput, PipelineState, pictures, step
+from perchctl.vision import Frame, PipelineOutput, PipelineState, deinterlace, step
 
 GOAL_MS = 0.3
 BLOCK_S = 1.0
@@ -97,7 +97,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         given, mid = time.perf_counter(), preempted()
         output: PipelineOutput | None = None
         if frame is not None:
-            state, found = pictures(state, frame, setup)
+            state, found = deinterlace(state, frame, setup)
             for picture in found:
                 state, output = step(state, picture, None, setup)
         tick = tick_of(number, now_s, frame, output)

@@ -28,7 +28,7 @@ from perchctl.vision import (
     Frame,
     PipelineOutput,
     PipelineState,
-    pictures,
+    deinterlace,
     step,
 )
 from perchctl.vision.markers.detect import detect_markers
@@ -97,7 +97,7 @@ def main() -> None:
 
     def whole(k: int, attitude: Attitude | None) -> Found:
         nonlocal state
-        state, (frame,) = pictures(state, frames[k][0], setup)
+        state, (frame,) = deinterlace(state, frames[k][0], setup)
         state, output = step(state, frame, attitude, setup)
         return {"large": output.detections.large, "small": output.detections.small, "all": output}
 

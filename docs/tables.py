@@ -40,7 +40,7 @@ from perchctl.profile import Profile  # noqa: E402
 from perchctl.profile.keys import Key, keys  # noqa: E402
 from perchctl.record.fields import FIELDS  # noqa: E402
 from perchctl.vision import step  # noqa: E402
-from perchctl.vision.markers.detect import METHODS  # noqa: E402
+from perchctl.vision.markers.detect import CORNER_METHODS  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
@@ -200,7 +200,7 @@ def corner_methods() -> str:
     rows = (
         f"| [{method.name}](#{method.name.lower().replace(' ', '-')}) | {method.needs} "
         f"| {method.cost} | {method.used_when} |"
-        for method in METHODS
+        for method in CORNER_METHODS
     )
     return "\n".join(["| method | needs | cost | used when |", "|---|---|---|---|", *rows])
 

@@ -11,7 +11,7 @@ import pytest
 
 from perchctl.opencv_threads import one_thread
 from perchctl.profile import Profile
-from perchctl.vision import PipelineState, make_pipeline, pictures, step
+from perchctl.vision import PipelineState, deinterlace, make_pipeline, step
 from perchctl.vision import pipeline as pipeline_module
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
@@ -58,7 +58,7 @@ def test_a_whole_picture_is_searched_by_all_threads_and_a_tracked_target_by_one(
     monkeypatch.setattr(pipeline_module, "detect_markers", found)
     setup, state = make_pipeline(Profile(), CAMERA), PipelineState()
     for frame in Pass(0.5).frames(3):
-        state, (picture,) = pictures(state, frame, setup)
+        state, (picture,) = deinterlace(state, frame, setup)
         state, _ = step(state, picture, None, setup)
     assert threads == [2, 1, 1]
     assert cv2.getNumThreads() == 2

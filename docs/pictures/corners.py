@@ -24,13 +24,13 @@ from perchctl.plot import BLUE, GREEN, ORANGE, PURPLE, VERMILLION, figure_bytes,
 from perchctl.vision.lens import distort, undistort_px
 from perchctl.vision.markers.corners import (
     apply_homography,
-    homography_from_unit,
+    homography_from_unit_square,
     mean_side_px,
     refine_subpix,
 )
 from perchctl.vision.markers.cut import RigidPose, fit_pose, make_lattice, make_outline
-from perchctl.vision.markers.edge_fit import measure_edges, prepare_markers
-from perchctl.vision.markers.partial import seen_edges
+from perchctl.vision.markers.edge_fit import measure_edges, prepare_marker_sides
+from perchctl.vision.markers.partial import find_visible_edges
 from perchctl.vision.markers.photometric_fit import (
     align_drawing,
     distort_px,
@@ -38,7 +38,7 @@ from perchctl.vision.markers.photometric_fit import (
     project_nodes,
     render_blurred,
 )
-from perchctl.vision.markers.search import search, search_halved, search_window
+from perchctl.vision.markers.search import search, search_half_size, search_window
 from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import SETUP
 from tests.helpers.target_picture import CAMERA
@@ -55,7 +55,7 @@ def edge_fit(file: Path) -> None:
     """The profiles across the sides, the edges on them, and where the lines meet."""
     view = _view("Edge fit")
     figure, whole, near = _panels(view)
-    markers = prepare_markers(_expected(view)[None], [_LARGE.rim], CAMERA)
+    markers = prepare_marker_sides(_expected(view)[None], [_LARGE.rim], CAMERA)
     assert markers is not None
     edges, _ = measure_edges(view.image, markers, CAMERA, with_inner=False)
     used = edges.points[edges.weight > 0.0]
@@ -77,7 +77,7 @@ def half_size_search(file: Path) -> None:
     half.set_title("searched at half size", fontsize=9)
     whole.set_xlim(-0.5, view.image.shape[1] - 0.5)
     whole.set_ylim(view.image.shape[0] - 0.5, -0.5)
-    searched = search_halved(view.picture, view.prior.both)
+    searched = search_half_size(view.picture, view.prior.both)
     assert searched is not None
     for quad in searched.corners_px.values():
         own = 0.5 * (quad - (columns.start or 0, rows.start or 0)) - 0.25
@@ -89,8 +89,8 @@ def partial_view_fit(file: Path) -> None:
     """The edges that are in view, and the square that follows from them."""
     view = _view("Partial-view fit")
     figure, whole, near = _panels(view)
-    H = homography_from_unit(undistort_px(_found(view), CAMERA))
-    seen = seen_edges(view.picture, H, _LARGE)
+    H = homography_from_unit_square(undistort_px(_found(view), CAMERA))
+    seen = find_visible_edges(view.picture, H, _LARGE)
     assert seen is not None
     points = apply_homography(H, seen.points[seen.weight > 0.0])
     at = distort_px(points.T, CAMERA).T
@@ -208,7 +208,7 @@ def _drawing(view: View, file: Path) -> None:
     assert fit is not None
     n = 44
     grid = make_grid(n, drawing.reach)
-    H = homography_from_unit(undistort_px(fit.corners_px, CAMERA))
+    H = homography_from_unit_square(undistort_px(fit.corners_px, CAMERA))
     x, y = distort_px(project_nodes(H, grid.uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
     node_px = drawing.reach * mean_side_px(fit.corners_px) / n

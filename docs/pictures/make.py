@@ -70,7 +70,7 @@ from perchctl.sim import (  # noqa: E402
 )
 from perchctl.vehicle import Idle, Telemetry  # noqa: E402
 from perchctl.vision import Frame, PipelineState, TargetEstimate, make_pipeline, step  # noqa: E402
-from perchctl.vision.markers.detect import METHODS  # noqa: E402
+from perchctl.vision.markers.detect import CORNER_METHODS  # noqa: E402
 from perchctl.vision.types import Stage  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1280, 760), (1200, 1250)
@@ -386,7 +386,7 @@ def corner_method(_: Flight, file: Path) -> None:
 
 
 CORNERS = {
-    f"corners-{method.name.lower().replace(' ', '-')}.png": method.name for method in METHODS
+    f"corners-{method.name.lower().replace(' ', '-')}.png": method.name for method in CORNER_METHODS
 }
 PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "vehicle.svg": vehicle_drawing,

@@ -195,6 +195,6 @@ def _blur_px(
             corners = seen.corners_px.reshape(1, 4, 2)
             (refined,) = refine_lines(frame.image, corners, [rim], pipeline.camera)
             if refined is not None:
-                found_px.append(refined.least_blur_px)
+                found_px.append(refined.min_blur_px)
                 break  # the large one, where there is one
     return float(np.median(found_px)) if found_px else None

@@ -163,7 +163,9 @@ class FlightInputs:
         if search:
             for _, self.output in perception.process_fields(frame):
                 if positioning is not None and self._is_heard(now_s):
-                    positioning.add_pose(perception.state.measured.surest, self.history, now_s)
+                    positioning.add_pose(
+                        perception.state.measured.most_certain_pose, self.history, now_s
+                    )
         mirrored = perception.is_mirrored
         self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
 

@@ -35,8 +35,8 @@ from perchctl.vision import (
     PipelineOutput,
     PipelineState,
     TargetEstimate,
+    deinterlace,
     estimate,
-    pictures,
     step,
 )
 
@@ -88,7 +88,7 @@ class Perception:
             found: tuple[Frame, ...] = (frame,)
             self.state = PipelineState()
         else:
-            self.state, found = pictures(self.state, frame, self.pipeline)
+            self.state, found = deinterlace(self.state, frame, self.pipeline)
         for picture in found:
             at = picture.t_s
             attitude = self.attitude(at) if self.attitude else attitude_at(self.history, at)
@@ -131,7 +131,7 @@ class Perception:
 
     def _calibrate(self, output: PipelineOutput, used_s: float) -> None:
         # Use the source's stamp: a correction of the latency in progress must not change it.
-        pose, t_s = self.state.measured.surest, output.detections.t_s + used_s
+        pose, t_s = self.state.measured.most_certain_pose, output.detections.t_s + used_s
         if pose is None:
             return
         measured = self._measured_latency

@@ -7,9 +7,9 @@ from .pipeline import Detector as Detector
 from .pipeline import Pipeline as Pipeline
 from .pipeline import Step as Step
 from .pipeline import camera_profile as camera_profile
+from .pipeline import deinterlace as deinterlace
 from .pipeline import estimate as estimate
 from .pipeline import make_pipeline as make_pipeline
-from .pipeline import pictures as pictures
 from .pipeline import step as step
 from .pose import PoseSetup as PoseSetup
 from .pose import camera_covariance as camera_covariance

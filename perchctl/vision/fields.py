@@ -21,49 +21,55 @@ from perchctl.vision.types import FieldState, Frame
 
 Grey = NDArray[np.uint8]
 
-_COMBED = 1.4  # threshold of the ratio of differences; exceeded by fields one pixel apart
+# threshold of the ratio of differences; exceeded by fields one pixel apart
+_MIN_COMBING_RATIO = 1.4
 # Rows per group; all but the outer four rows of a group are compared with their neighbours.
-_GROUP = 8
-_STRONG = 5.0  # multiple of the mean difference within a field above which a difference counts
-_LEAST_GREY = 8.0
-_FLOOR = 0.25  # grey^2 per pixel: strong differences that noise may leave
-_EVERY = 3
+_GROUP_ROWS = 8
+# multiple of the mean difference within a field above which a difference counts
+_STRONG_DIFFERENCE_RATIO = 5.0
+_MIN_DIFFERENCE_GREY = 8.0
+_NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
+_CLASSIFICATION_PERIOD_FRAMES = 3
 _ALIAS_PX, _ALIAS_BLURS = 0.8, 2.45
-_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # cubic interpolation at the midpoint
+_INTERPOLATION_TAPS = (
+    np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
+)  # cubic interpolation at the midpoint
 
-_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
-_VIDEO_PERIODS_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
-_ANY_PERIOD_S = (0.004, 0.1)
-_KEPT_PERIODS = 25
-_LOST_PERIODS = 1.8
+_STANDARD_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
+_STANDARD_PERIOD_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL
+_VALID_PERIOD_RANGE_S = (0.004, 0.1)
+_MAX_KEPT_PERIODS = 25
+_LOST_FRAME_PERIOD_RATIO = 1.8
 _MAX_GAP_S = 0.25  # s; older pictures carry no information about the order
-_EVIDENCE = 1.0  # sum of votes, each at most 1, that decides the order: two frames at least
-_MOST_EVIDENCE = 3.0  # limit of the sum, so that a changed order is noticed in time
-_TURNED_EVIDENCE = 1.0  # sum of votes that reverses an order decided before
+_MIN_ORDER_VOTES = 1.0  # sum of votes, each at most 1, that decides the order: two frames at least
+_MAX_ORDER_VOTES = 3.0  # limit of the sum, so that a changed order is noticed in time
+_MIN_REVERSAL_VOTES = 1.0  # sum of votes that reverses an order decided before
 
 
 def is_combed(image: Grey) -> bool:
     """True if an interlaced picture (h, w) shows combing: a row differs more from its neighbours
     than from the rows of its own field."""
-    groups, width = len(image) // _GROUP, image.shape[1]
+    groups, width = len(image) // _GROUP_ROWS, image.shape[1]
     if groups == 0:
         return False
     # Groups of rows in one row: the next row is `width` further on. Every third group is enough.
-    flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
+    flat = np.ascontiguousarray(image[: groups * _GROUP_ROWS]).reshape(groups, _GROUP_ROWS * width)[
+        ::3
+    ]
     above2, above, row, below, below2 = (
-        flat[:, k * width : (k + _GROUP - 4) * width] for k in range(5)
+        flat[:, k * width : (k + _GROUP_ROWS - 4) * width] for k in range(5)
     )
     # In place, to keep the frame in the processor's cache for the next steps.
     other = cv2.addWeighted(above, 0.5, below, 0.5, 0.0)
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_STRONG * cv2.mean(own)[0], _LEAST_GREY)
+    least = max(_STRONG_DIFFERENCE_RATIO * cv2.mean(own)[0], _MIN_DIFFERENCE_GREY)
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
-    return energy[0] / (energy[1] + _FLOOR * row.size) > _COMBED
+    return energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size) > _MIN_COMBING_RATIO
 
 
 def split_fields(image: Grey) -> tuple[Grey, ...]:
@@ -78,7 +84,9 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
     """Return the field whose first row is `first_row` (0 or 1), interpolated to full height."""
     own = image[first_row::2]
     # Row k of the result is between rows k and k + 1 of the field.
-    between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
+    between = cv2.filter2D(
+        own, -1, _INTERPOLATION_TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE
+    )
     picture = image.copy()
     if first_row == 0:
         picture[1::2] = between[: len(picture[1::2])]
@@ -115,48 +123,54 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
 
     In a stream without fields so far, only every third frame is examined.
     """
-    skip = frame.fields is None and state.kind == "whole" and state.skipped + 1 < _EVERY
+    skip = (
+        frame.fields is None
+        and state.kind == "whole"
+        and state.skipped + 1 < _CLASSIFICATION_PERIOD_FRAMES
+    )
     frame = replace(frame, fields="whole") if skip else classify_fields(frame)
     skipped = state.skipped + 1 if skip else 0
     # Once interlaced, a stream counts as interlaced.
     kind = state.kind if state.kind == "woven" else frame.fields
-    periods_s = _periods_s(state, frame)
+    periods_s = _update_periods_s(state, frame)
     if frame.fields == "whole":
         new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
         return new, (frame,)
-    state = _voted(replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame)
+    state = _vote_on_field_order(
+        replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame
+    )
     if frame.fields != "woven" or state.top_first is None:
         return state, (frame,)
     top, bottom = field_frames(frame)
     early, late = (top, bottom) if state.top_first else (bottom, top)
-    apart_s = _period_s(state.periods_s) / 2.0
+    apart_s = _estimate_period_s(state.periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
         replace(late, t_s=frame.t_s + apart_s / 2.0),
     )
 
 
-def _period_s(periods_s: tuple[float, ...]) -> float:
+def _estimate_period_s(periods_s: tuple[float, ...]) -> float:
     if not periods_s:
-        return _PERIODS_S[1]
+        return _STANDARD_PERIODS_S[1]
     middle_s = median(periods_s)
     # The receiver's own rate makes the periods vary: 25 frames a second at 60 Hz arrive 33 and 50
     # ms apart.
-    period_s = mean(p for p in periods_s if p < _LOST_PERIODS * middle_s)
-    if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
-        return min(_PERIODS_S, key=lambda p: abs(p - period_s))
+    period_s = mean(p for p in periods_s if p < _LOST_FRAME_PERIOD_RATIO * middle_s)
+    if _STANDARD_PERIOD_RANGE_S[0] < period_s < _STANDARD_PERIOD_RANGE_S[1]:
+        return min(_STANDARD_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s
 
 
-def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
+def _update_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
     if state.last_s is not None:
         gap_s = frame.t_s - state.last_s
-        if _ANY_PERIOD_S[0] < gap_s < _ANY_PERIOD_S[1]:
-            return (*state.periods_s[1 - _KEPT_PERIODS :], gap_s)
+        if _VALID_PERIOD_RANGE_S[0] < gap_s < _VALID_PERIOD_RANGE_S[1]:
+            return (*state.periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
     return state.periods_s
 
 
-def _voted(state: FieldState, frame: Frame) -> FieldState:
+def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
     before, votes, top_first = state.previous, state.votes, state.top_first
     near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
@@ -168,9 +182,9 @@ def _voted(state: FieldState, frame: Frame) -> FieldState:
         high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
-        votes = min(max(votes + vote, -_MOST_EVIDENCE), _MOST_EVIDENCE)
-    if top_first is None and abs(votes) > _EVIDENCE:
+        votes = min(max(votes + vote, -_MAX_ORDER_VOTES), _MAX_ORDER_VOTES)
+    if top_first is None and abs(votes) > _MIN_ORDER_VOTES:
         top_first = votes > 0.0
-    elif top_first is not None and (votes if not top_first else -votes) > _TURNED_EVIDENCE:
+    elif top_first is not None and (votes if not top_first else -votes) > _MIN_REVERSAL_VOTES:
         top_first = not top_first
     return replace(state, last_s=frame.t_s, votes=votes, top_first=top_first, previous=frame.image)

@@ -32,22 +32,22 @@ MAX_TRACK_GAP_S = 1.0
 MAX_PREDICTION_S = 1.0
 """Longest prediction, s; after it, the target is assumed to stay at the predicted position."""
 
-_AXES: Array = np.eye(3)
-_STILL: Array = np.eye(8)
-_MOVES: Array = np.eye(8, k=1)
-_MOVES[RATES] = 0.0
+_IDENTITY_3: Array = np.eye(3)
+_IDENTITY_8: Array = np.eye(8)
+_RATE_TO_VALUE: Array = np.eye(8, k=1)
+_RATE_TO_VALUE[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # units of the paper, per state
+_PAPER_UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # units of the paper, per state
 
-_PUSH_S = 0.1
+_ACCELERATION_DURATION_S = 0.1
 """Duration of an acceleration, s: the density of the white noise is its square times this,
 (m/s^2)^2 s."""
-_WANDER = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
+_ESTIMATE_RANDOM_WALK = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Random walk of the state estimate's yaw, x, y and z within one second, as variances (rad^2,
 m^2)."""
-_HEADING_RADPS2 = 0.1  # acceleration of the state estimate's heading
+_HEADING_SIGMA_RADPS2 = 0.1  # acceleration of the state estimate's heading
 _RESTART_NIS = 25.0
 """Limit of the normalized innovation squared (NIS), four degrees of freedom: exceeded by chance in
 5 of 100 000 updates. Larger: after a lost frame, the track of a camera alone learns a wrong
@@ -69,7 +69,7 @@ class ProcessNoise:
     def rate_variance(self) -> Array:
         """Covariance (4, 4) that one second adds to the rates of (yaw, x, y, z)."""
         push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
-        return np.diag(push * push) * _PUSH_S
+        return np.diag(push * push) * _ACCELERATION_DURATION_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +115,11 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
     first[RATES] = (5.0 if in_world else level_rate) ** 2  # cm/s and deg/s
-    squares = _UNITS**2
+    squares = _PAPER_UNITS**2
     process = None
     if measured:
         process = (
-            ProcessNoise(config.drift_mps2, _HEADING_RADPS2, is_drifting=True)
+            ProcessNoise(config.drift_mps2, _HEADING_SIGMA_RADPS2, is_drifting=True)
             if in_world
             else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
         )
@@ -145,7 +145,7 @@ def tilt_jacobian(vector_m: Array) -> Array:
 
 def transition_matrix(dt_s: float) -> Array:
     """Return the state transition matrix F (8, 8) of the paper's equation 1 over `dt_s`."""
-    return _STILL + dt_s * _MOVES
+    return _IDENTITY_8 + dt_s * _RATE_TO_VALUE
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
@@ -154,24 +154,24 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
     noise = setup.process
     if noise is None:
         return setup.Q
-    pushed = _pushed(noise, position_m) * dt_s
+    pushed = _acceleration_covariance(noise, position_m) * dt_s
     # A value and its rate are adjacent in the state.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.is_drifting:
-        Q[MEASURED, MEASURED] += _WANDER * dt_s
+        Q[MEASURED, MEASURED] += _ESTIMATE_RANDOM_WALK * dt_s
     return Q
 
 
-def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
+def _acceleration_covariance(noise: ProcessNoise, position_m: Array) -> Array:
     """Return the covariance (4, 4) that one second adds to the rates of yaw, x, y and z."""
     if noise.turn_radps2 == 0.0:
         return noise.rate_variance
-    turned2 = noise.turn_radps2**2 * _PUSH_S
+    turned2 = noise.turn_radps2**2 * _ACCELERATION_DURATION_S
     x, y, z = position_m.tolist()
     density = noise.rate_variance.copy()
     density[1:, 1:] += turned2 * (
-        (x * x + y * y + z * z) * _AXES - np.outer(position_m, position_m)
+        (x * x + y * y + z * z) * _IDENTITY_3 - np.outer(position_m, position_m)
     )
     return density
 
@@ -224,7 +224,7 @@ def step_track(
             return None
         x = track.x.copy()
         x[RATES] *= setup.alpha  # equation 3
-        return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
+        return _predict_from_state(track, x, dt_s, t_s, track.unseen + 1, setup)
     F, Q = transition_matrix(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
     R = setup.R if measured.R is None else measured.R
@@ -235,7 +235,7 @@ def step_track(
             begun = start_track(measured, t_s, setup)
             begun.P[MEASURED, MEASURED] += np.outer(off, off)
             return begun
-    x, P, gain = _updated(x, P, measured.z, R)
+    x, P, gain = _kalman_update(x, P, measured.z, R)
     bias = F.dot(track.bias)
     if measured.bias is not None:
         bias += gain.dot(measured.bias - bias[MEASURED])
@@ -249,7 +249,7 @@ def _innovation(x: Array, z: Array) -> Array:
     return off
 
 
-def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
+def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
     """Return state and covariance after a measurement, in Joseph form, and the gain (8, 4)."""
     off = _innovation(x, z)
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
@@ -258,7 +258,7 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
     gain = np.asarray(solved.T, dtype=np.float64)
     x = x + gain.dot(off)
     x[YAW] = wrap_rad(float(x[YAW]))
-    left = _STILL.copy()
+    left = _IDENTITY_8.copy()
     left[:, MEASURED] -= gain
     return x, left.dot(P).dot(left.T) + gain.dot(R).dot(gain.T), gain
 
@@ -271,13 +271,13 @@ def predict_track(
     if dt_s <= 0.0:
         return track
     if with_cov:
-        return _moved(track, track.x, dt_s, t_s, track.unseen, setup)
-    x = transition_matrix(dt_s).dot(_drifting(track.x, setup))
+        return _predict_from_state(track, track.x, dt_s, t_s, track.unseen, setup)
+    x = transition_matrix(dt_s).dot(_limit_drift_speed(track.x, setup))
     x[YAW] = wrap_rad(float(x[YAW]))
     return replace(track, t_s=t_s, x=x)
 
 
-def _drifting(x: Array, setup: FilterSetup) -> Array:
+def _limit_drift_speed(x: Array, setup: FilterSetup) -> Array:
     """Return the state with its speed limited to the drift of its frame."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.drift_mps:
@@ -287,11 +287,11 @@ def _drifting(x: Array, setup: FilterSetup) -> Array:
     return x
 
 
-def _moved(
+def _predict_from_state(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
 ) -> MarkerTrack:
     """Return the track predicted from the state `x` to `t_s`, without a measurement."""
-    x = _drifting(x, setup)
+    x = _limit_drift_speed(x, setup)
     F = transition_matrix(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
     x[YAW] = wrap_rad(float(x[YAW]))

@@ -14,8 +14,8 @@ from perchctl.vision.types import CameraModel
 
 # OpenCV's default stops after five iterations, with errors of up to 0.12 px in the picture's
 # corners.
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)  # px
-_ZERO = np.zeros(3)
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)  # px
+_ZERO_VECTOR = np.zeros(3)
 
 
 def undistort(points_px: Array, camera: CameraModel) -> Array:
@@ -29,7 +29,7 @@ def undistort(points_px: Array, camera: CameraModel) -> Array:
         return np.empty((0, 2))
     solve = cv2.fisheye.undistortPoints if camera.model == "fisheye" else cv2.undistortPoints
     return np.asarray(
-        solve(points, camera.K, camera.dist, criteria=_CRITERIA), dtype=np.float64
+        solve(points, camera.K, camera.dist, criteria=_UNDISTORT_CRITERIA), dtype=np.float64
     ).reshape(-1, 2)
 
 
@@ -52,7 +52,7 @@ def distort(normalised: Array, camera: CameraModel) -> Array:
     """Convert normalised coordinates (n, 2) to pixels (n, 2); the inverse of `undistort`."""
     rays = np.ones((len(normalised), 1, 3))
     rays[:, 0, :2] = normalised
-    return _projected(rays, _ZERO, _ZERO, camera)
+    return _project_points(rays, _ZERO_VECTOR, _ZERO_VECTOR, camera)
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
@@ -60,10 +60,10 @@ def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel
     2)."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
-    return _projected(points, rvec, tvec, camera)
+    return _project_points(points, rvec, tvec, camera)
 
 
-def _projected(points: Array, rvec: Array, tvec: Array, camera: CameraModel) -> Array:
+def _project_points(points: Array, rvec: Array, tvec: Array, camera: CameraModel) -> Array:
     if len(points) == 0:
         return np.empty((0, 2))
     call = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints

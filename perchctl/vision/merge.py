@@ -28,7 +28,7 @@ from perchctl.vision.types import (
 
 CONSISTENT_CHI2 = 4.0
 """Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
-_PLACE_YAW = [X, Y, Z, YAW]
+_POSITION_AND_YAW = [X, Y, Z, YAW]
 _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 
@@ -81,49 +81,51 @@ def measure_markers(
         return MeasuredMarkers(poses, {"joint": joint})
     contradicting = False
     if not clear and len(singles) == 2:
-        contradicting = markers_disagree(singles["large"], singles["small"], config.disagreement_m)
-    fed, one = dict(singles), joint
+        contradicting = is_pair_inconsistent(
+            singles["large"], singles["small"], config.disagreement_m
+        )
+    used_poses, one = dict(singles), joint
     if len(singles) == 2:
-        better = better_conditioned(singles["large"], singles["small"])
+        better = choose_better_conditioned(singles["large"], singles["small"])
         one = joint or better
         if contradicting:
-            fed = {better.source: better}
+            used_poses = {better.source: better}
         elif config.stages == "range":
             # By the distance from the camera to the target's plane (equations 4, 6 and 11).
             offset = level_rotation(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
             z_m = float(better.e_m[2] + offset[2])
             if not config.z3_m < z_m <= config.z2_m:
-                del fed["small" if z_m > config.z2_m else "large"]
+                del used_poses["small" if z_m > config.z2_m else "large"]
     if config.method == "joint":
-        one = next(iter(fed.values())) if len(fed) == 1 else one
-        fed = {} if one is None else {"joint": one}
-    return MeasuredMarkers(poses, fed, contradicting)
+        one = next(iter(used_poses.values())) if len(used_poses) == 1 else one
+        used_poses = {} if one is None else {"joint": one}
+    return MeasuredMarkers(poses, used_poses, contradicting)
 
 
 def merge_tracks(
-    tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose], weights: WeightsConfig
+    tracks: Mapping[str, MarkerTrack], used_poses: Mapping[str, MarkerPose], weights: WeightsConfig
 ) -> MergedTarget | None:
     """Return the target merged by W (equations 5, 8, 12) from the tracks that this frame's poses
-    `fed` update, or otherwise from the tracks measured last; None without tracks."""
+    `used_poses` update, or otherwise from the tracks measured last; None without tracks."""
     if not tracks:
         return None
     least = min(track.unseen for track in tracks.values())
     used = {name: track for name, track in tracks.items() if track.unseen == least}
-    used = {name: track for name, track in used.items() if name in fed} or used
+    used = {name: track for name, track in used.items() if name in used_poses} or used
     if len(used) == 1:
         ((name, track),) = used.items()
         return MergedTarget(
-            vector=track.x[_PLACE_YAW],
+            vector=track.x[_POSITION_AND_YAW],
             velocity_mps=track.x[VELOCITY],
             cov_m2=track.P[POSITION, POSITION],
             bias_m=track.bias[POSITION],
             var_yaw_rad2=float(track.P[YAW, YAW]),
             unseen=least,
-            stage=_STAGE_OF[fed[name].source] if name in fed else Stage.NONE,
+            stage=_STAGE_OF[used_poses[name].source] if name in used_poses else Stage.NONE,
         )
     large, small = used["large"], used["small"]
-    order = _PLACE_YAW
-    W2 = weight_matrix(weights) ** 2  # squared: the errors are independent
+    order = _POSITION_AND_YAW
+    W2 = make_weight_matrix(weights) ** 2  # squared: the errors are independent
     pairs = np.stack([np.diag(large.P)[order], np.diag(small.P)[order]], axis=1)
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
@@ -134,14 +136,14 @@ def merge_tracks(
         bias_m=w[:, None] * large.bias[POSITION] + (1.0 - w[:, None]) * small.bias[POSITION],
         var_yaw_rad2=float(variance[3]),
         unseen=least,
-        stage=Stage.BOTH if fed else Stage.NONE,
+        stage=Stage.BOTH if used_poses else Stage.NONE,
     )
 
 
-def widen(merged: MergedTarget, rival: Array) -> MergedTarget:
+def widen_covariance(merged: MergedTarget, rival: Array) -> MergedTarget:
     """Return the target with a covariance that covers a second possible position: the state (8,) of
     a contradicting `rival`. With the difference d between both, the covariance grows by d d^T."""
-    off = rival[_PLACE_YAW] - merged.vector
+    off = rival[_POSITION_AND_YAW] - merged.vector
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
         merged,
@@ -210,7 +212,7 @@ def detected_stage(large: bool, small: bool) -> Stage:
     return Stage.SMALL if small else Stage.NONE
 
 
-def weight_matrix(weights: WeightsConfig) -> Array:
+def make_weight_matrix(weights: WeightsConfig) -> Array:
     """Return the weights W (4, 8) of equation 9; columns: x, y, z, yaw, each for large and
     small."""
     W = np.zeros((4, 8))
@@ -221,22 +223,24 @@ def weight_matrix(weights: WeightsConfig) -> Array:
 
 def merge_pair(large: Array, small: Array, weights: WeightsConfig) -> Array:
     """Merge (x, y, z, yaw) of both markers, each (4,), by equation 8, with the yaws as angles."""
-    W = weight_matrix(weights)
+    W = make_weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
     return np.asarray(merged)
 
 
-def markers_disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
+def is_pair_inconsistent(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
     """True if the markers differ by more than `limit_m` and four standard deviations on any axis.
     Errors of the print shift both markers alike, so they add no tolerance."""
     gap = np.abs(large.e_m - small.e_m)
-    variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
+    variance = [
+        np.maximum(p.sigma_m**2 - (p.print_shift_m**2).sum(axis=1), 0.0) for p in (large, small)
+    ]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])
     return bool((gap > np.maximum(limit_m, vague)).any())
 
 
-def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
+def choose_better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
     """Return the pose whose position has the smaller standard deviation."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

@@ -24,13 +24,19 @@ from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_
 from perchctl.values import replace
 from perchctl.vision.fields import classify_fields, separate_fields
 from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter, predict_track
-from perchctl.vision.markers.cut import prepare_cut_markers
+from perchctl.vision.markers.cut import warm_up_cut_marker_fit
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
-from perchctl.vision.merge import MergedTarget, detected_stage, measure_markers, merge_tracks, widen
+from perchctl.vision.markers.detector import DetectorSetup, make_detector_setup
+from perchctl.vision.merge import (
+    MergedTarget,
+    detected_stage,
+    measure_markers,
+    merge_tracks,
+    widen_covariance,
+)
 from perchctl.vision.pose import PoseCandidate, PoseSetup, normal_cam
 from perchctl.vision.target_selection import (
-    OwnTargetPlace,
+    OwnTargetPosition,
     marker_offset_m,
     relative_bias_m,
     to_level,
@@ -39,8 +45,8 @@ from perchctl.vision.target_selection import (
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
-    contradiction,
     expected_corners,
+    predict_rival_state,
     update_last_pose,
     update_tracks,
 )
@@ -60,7 +66,7 @@ from perchctl.vision.types import (
     to_grey,
 )
 
-SEVERAL = "more than one target in view: the one that was tracked is followed"
+SEVERAL_TARGETS_TEXT = "more than one target in view: the one that was tracked is followed"
 
 
 class Detector(Protocol):
@@ -113,14 +119,14 @@ def make_pipeline(
     if profile.camera.mask is not None:
         mask = read_mask(profile.camera.mask, camera.size_px) if covered is None else covered
         mask = mask[:, ::-1] if profile.camera.mirrored else mask
-    detector = make_aruco_detector(profile.detector, profile.target, mask)
+    detector = make_detector_setup(profile.detector, profile.target, mask)
     if detector.fits_lines:
-        prepare_cut_markers(detector.patterns, camera)
+        warm_up_cut_marker_fit(detector.patterns, camera)
     target = profile.target
     # the position where the vehicle searches for it
-    own = OwnTargetPlace(profile.planner.approach_xy_m)
+    own = OwnTargetPosition(profile.planner.approach_xy_m)
     if target.expected_xy_m is not None:
-        own = OwnTargetPlace(target.expected_xy_m, target.expected_within_m)
+        own = OwnTargetPosition(target.expected_xy_m, target.expected_within_m)
     return Pipeline(
         detector=detector,
         pose=pose,
@@ -153,7 +159,7 @@ def camera_profile(profile: Profile) -> Profile:
     )
 
 
-def pictures(
+def deinterlace(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """Return the new state, and the frames to pass to `step` one by one: the frame itself, or its
@@ -246,11 +252,11 @@ def step_detections(
     disagreeing = state.disagreeing_frames
     if stage is Stage.BOTH and verdict.accepted:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
-    surest = measured.surest
-    sees = surest is not None and verdict.accepted
-    if surest is not None and sees:
-        last_pose = update_last_pose(last_pose, surest, attitude, pipeline.pose)
-    target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
+    most_certain_pose = measured.most_certain_pose
+    sees = most_certain_pose is not None and verdict.accepted
+    if most_certain_pose is not None and sees:
+        last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose)
+    target = _estimate_at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     last = state.last
     if anything and verdict.accepted:
         last = detections
@@ -275,7 +281,7 @@ def step_detections(
         target=target,
         stage=stage,
         disagreeing_frames=disagreeing,
-        lock_note=verdict.text or (SEVERAL if detections.targets > 1 else ""),
+        lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.targets > 1 else ""),
         fields=fields,
         refused=verdict.is_foreign_target,
     )
@@ -301,11 +307,13 @@ def estimate(
     if state.tracks and state.in_world:
         world = pipeline.tracks.world
         tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
-        merged = merge_tracks(tracks, state.measured.fed, pipeline.merge.weights)
+        merged = merge_tracks(tracks, state.measured.used_poses, pipeline.merge.weights)
         assert merged is not None
-        rival = contradiction(state.lock, state.rival, True, t_s, world)
-        merged = merged if rival is None else widen(merged, rival)
-        return replace(target, t_s=t_s, **_placed(merged, attitude, True, pipeline, spread))
+        rival = predict_rival_state(state.lock, state.rival, True, t_s, world)
+        merged = merged if rival is None else widen_covariance(merged, rival)
+        return replace(
+            target, t_s=t_s, **_convert_to_frames(merged, attitude, True, pipeline, spread)
+        )
     if not state.tracks:
         nothing = np.zeros(3)
         target = replace(
@@ -325,7 +333,7 @@ def estimate(
 # --- From the tracks to the target ---
 
 
-def _at_frame(
+def _estimate_at_frame(
     followed: TrackedFrame,
     before: TargetEstimate | None,
     t_s: float,
@@ -333,14 +341,14 @@ def _at_frame(
     in_world: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    fed, tracks = followed.measured.fed, followed.tracks
-    merged = merge_tracks(tracks, fed, pipeline.merge.weights)
+    used_poses, tracks = followed.measured.used_poses, followed.tracks
+    merged = merge_tracks(tracks, used_poses, pipeline.merge.weights)
     if merged is None:
         return None
     constants = pipeline.tracks.constants(in_world)
-    rival = contradiction(followed.lock, followed.rival, in_world, t_s, constants)
-    merged = merged if rival is None else widen(merged, rival)
-    measured = any(n in tracks and tracks[n].t_s == t_s for n in fed)
+    rival = predict_rival_state(followed.lock, followed.rival, in_world, t_s, constants)
+    merged = merged if rival is None else widen_covariance(merged, rival)
+    measured = any(n in tracks and tracks[n].t_s == t_s for n in used_poses)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
     return TargetEstimate(
@@ -351,11 +359,11 @@ def _at_frame(
         measured=measured,
         tracked=True,
         unseen=merged.unseen,
-        **_placed(merged, attitude, in_world, pipeline),
+        **_convert_to_frames(merged, attitude, in_world, pipeline),
     )
 
 
-def _placed(
+def _convert_to_frames(
     merged: MergedTarget,
     attitude: Attitude | None,
     in_world: bool,

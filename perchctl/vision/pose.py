@@ -24,8 +24,8 @@ from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerPose
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling combined
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
-_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
-_CURL_LEFT_SHARE = 0.5  # share that may remain if the curl of the sheet is the cause
+_MIN_CURLED_CHI2 = 3.0  # chi-squared per degree of freedom of both markers' corners on a flat sheet
+_MAX_CURL_RESIDUAL_FRACTION = 0.5  # share that may remain if the curl of the sheet is the cause
 _Source = Literal["large", "small", "joint"]
 
 
@@ -95,25 +95,29 @@ def estimate_pose(
     else:
         prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
     most_px = setup.config.max_reprojection_px
-    solution = _continued(points, start, prior, most_px) or solve_pose(points, prior)
+    solution = _refine_from_start(points, start, prior, most_px) or solve_pose(points, prior)
     if solution is None or not solution.rms_px <= most_px:
         return None
     pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
-    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.target.curl_per_m == 0.0:
+    if source != "joint" or pose.chi2 < _MIN_CURLED_CHI2 or setup.target.curl_per_m == 0.0:
         return pose
-    if any(d.lying_sigma_px > 0.0 for d in detections):
+    if any(d.horizontal_side_sigma_px > 0.0 for d in detections):
         return pose  # sides between interpolated rows look curled
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
     points = replace(points, curled=True)
-    settled = _continued(points, solution, prior, most_px)
+    settled = _refine_from_start(points, solution, prior, most_px)
     if settled is None:
         return pose
     bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
-    return replace(bent, chi2=pose.chi2) if bent.chi2 < _CURL_LEFT_SHARE * pose.chi2 else pose
+    return (
+        replace(bent, chi2=pose.chi2)
+        if bent.chi2 < _MAX_CURL_RESIDUAL_FRACTION * pose.chi2
+        else pose
+    )
 
 
-def _continued(
+def _refine_from_start(
     points: WeightedCorners, start: PoseCandidate | None, prior: TiltPrior, most_px: float
 ) -> ScoredPose | None:
     """Return the solution refined from `start` if its RMS error is at most `most_px`, else None."""
@@ -143,8 +147,8 @@ def _level_pose(
     cov_e = G.dot(cov).dot(G.T)
     # A target that is larger by some share is further away by the same share of the distance.
     print_cam = np.array([setup.target.size_sigma * solution.tvec, curl[3:]])
-    print_m = R_level_cam.dot(print_cam.T)
-    cov_e[:3, :3] += print_m.dot(print_m.T)
+    print_shift_m = R_level_cam.dot(print_cam.T)
+    cov_e[:3, :3] += print_shift_m.dot(print_shift_m.T)
     sigma = np.sqrt(np.maximum(cov_e.diagonal(), 0.0))
     return MarkerPose(
         source=source,
@@ -158,7 +162,7 @@ def _level_pose(
         reprojection_px=solution.rms_px,
         chi2=chi2,
         cov=cov_e,
-        print_m=print_m,
+        print_shift_m=print_shift_m,
         camera_cov=cov,
     )
 
@@ -202,11 +206,12 @@ def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
 _MIN_FLIP_RAD = math.radians(2.0)  # solutions closer than this are the same
 _MIN_SCORE_SIGMA_PX = 0.05  # lens and print limit the information in smaller residuals
 _MAX_STEPS = 8
-_TRUST = 8.0  # weight of the claimed spread against the residuals, in degrees of freedom
+# weight of the claimed spread against the residuals, in degrees of freedom
+_CLAIMED_SPREAD_DOF = 8.0
 
 _SMALL_GAIN, _SMALL_STEP = 1.0, 0.005  # rad and m
 # The nonlinearity is the square of the motion over the distance between corners, 20 px or more.
-_SMALL_MOVE_PX = 0.3
+_MAX_LINEAR_MOTION_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,13 +255,13 @@ class TiltPrior:
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     """Return the better of the two possible poses of a planar marker; None if neither is valid."""
-    candidates = [_refined(points, c) for c in _closed_form(points)]
-    scored = [_scored(c, points) for c in candidates if _usable(c)]
+    candidates = [_refine(points, c) for c in _closed_form(points)]
+    scored = [_score(c, points) for c in candidates if _is_valid(c)]
     if not scored:
         return None
-    best = _likeliest(scored, points, prior)
+    best = _choose_likeliest(scored, points, prior)
     if prior.normal_cam is None or prior.contradicts(best):
-        best = _likeliest([best, *_other_tilt(best, points)], points, prior)
+        best = _choose_likeliest([best, *_flipped_candidates(best, points)], points, prior)
     # The unweighted optimum is so close that the errors are linear.
     return refine_pose(points, best) or best
 
@@ -268,11 +273,11 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
     before = math.inf
     W = points.whitening
     for _ in range(_MAX_STEPS):
-        scored = _scored(candidate, points)
+        scored = _score(candidate, points)
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
         if points.curled:
-            weight = curl_weight(_curl(points, scored))
+            weight = curl_weight(_whiten_curl(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -286,7 +291,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         # reduction of the cost by the step, in squared standard deviations
         gain = float(step.dot(g))
         moved_px = scored.jacobian.dot(step).reshape(-1, 2)
-        small = gain < _SMALL_GAIN or float(np.abs(moved_px).max()) < _SMALL_MOVE_PX
+        small = gain < _SMALL_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEAR_MOTION_PX
         if small and max(map(abs, step.tolist())) < _SMALL_STEP:
             # Errors are linear in a step of this size.
             error_px = scored.error_px - moved_px
@@ -298,7 +303,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
             PoseCandidate(candidate.rvec - step[:3], candidate.tvec - step[3:]),
             cost,
         )
-        if not _usable(candidate):
+        if not _is_valid(candidate):
             return None
     return None
 
@@ -313,7 +318,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     W = points.whitening
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
-    curl = _curl(points, scored)
+    curl = _whiten_curl(points, scored)
     weight = curl_weight(curl) if points.curled else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
@@ -321,7 +326,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
         return np.full((6, 6), np.inf), math.inf, np.zeros(6)
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
-    growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
+    growth = max((_CLAIMED_SPREAD_DOF + chi2) / (_CLAIMED_SPREAD_DOF + freedom), 0.7)
     common = gain.dot(points.shift)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
@@ -331,7 +336,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     return cov, chi2 / freedom, curled
 
 
-def _curl(points: WeightedCorners, scored: ScoredPose) -> Array:
+def _whiten_curl(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the effect of each mode of curl on the whitened errors."""
     normal_cam = rotation_matrix(scored.rvec)[:, 2]
     # A corner out of the sheet's plane appears where a target moved along its normal would show it.
@@ -356,15 +361,15 @@ def _closed_form(points: WeightedCorners) -> list[PoseCandidate]:
         return []
     solutions = zip(rvecs, tvecs, strict=True)
     candidates = [PoseCandidate(np.ravel(r), np.ravel(t)) for r, t in solutions]
-    return [candidate for candidate in candidates if _usable(candidate)]
+    return [candidate for candidate in candidates if _is_valid(candidate)]
 
 
-def _usable(candidate: PoseCandidate) -> bool:
+def _is_valid(candidate: PoseCandidate) -> bool:
     rvec, tvec = candidate.rvec, candidate.tvec
     return bool(is_finite(rvec) and is_finite(tvec) and tvec[2] > 0.0)
 
 
-def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
+def _refine(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
@@ -373,14 +378,14 @@ def _refined(points: WeightedCorners, start: PoseCandidate) -> PoseCandidate:
     return PoseCandidate(np.ravel(rvec), np.ravel(tvec))
 
 
-def _scored(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
+def _score(candidate: PoseCandidate, points: WeightedCorners) -> ScoredPose:
     rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
     return ScoredPose(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
 
 
-def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
+def _flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
     """Return the best candidate near the normal mirrored at the line of sight, if it is a different
     one."""
     R = rotation_matrix(scored.rvec)
@@ -392,11 +397,13 @@ def _other_tilt(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]
     if angle < _MIN_FLIP_RAD or sine < 1e-9:
         return []
     rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
-    turned = _refined(points, PoseCandidate(rvec, scored.tvec))
-    return [_scored(turned, points)] if _usable(turned) else []
+    turned = _refine(points, PoseCandidate(rvec, scored.tvec))
+    return [_score(turned, points)] if _is_valid(turned) else []
 
 
-def _likeliest(scored: list[ScoredPose], points: WeightedCorners, prior: TiltPrior) -> ScoredPose:
+def _choose_likeliest(
+    scored: list[ScoredPose], points: WeightedCorners, prior: TiltPrior
+) -> ScoredPose:
     if len(scored) == 1:
         return scored[0]
     sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
@@ -438,14 +445,18 @@ def curl_weight(curl: Array) -> Array:
 # fit, faults of small markers would corrupt it.
 
 
-_EACH = np.eye(8)
-_TILT = np.array(1.0 / math.sqrt(3.0))
+_IDENTITY_8 = np.eye(8)
+_LINE_TILT_SCALE = np.array(1.0 / math.sqrt(3.0))
 _PREVIOUS_CORNER = np.array([3, 0, 1, 2])
-_START = np.arange(4)  # side k runs from corner k ...
-_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
-_ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
-_COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
-_SIDES = 8 * _ROWS + _COLUMNS  # indices into a flattened (8, 8) matrix
+_SIDE_START = np.arange(4)  # side k runs from corner k ...
+_SIDE_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
+_SIDE_MATRIX_ROWS = np.concatenate([2 * np.tile(_SIDE_START, 4), 2 * np.tile(_SIDE_START, 4) + 1])
+_SIDE_MATRIX_COLUMNS = np.concatenate(
+    [2 * _SIDE_START, 2 * _SIDE_START + 1, 2 * _SIDE_END, 2 * _SIDE_END + 1] * 2
+)
+_SIDE_MATRIX_INDICES = (
+    8 * _SIDE_MATRIX_ROWS + _SIDE_MATRIX_COLUMNS
+)  # indices into a flattened (8, 8) matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -490,12 +501,14 @@ def weigh_corners(
             except np.linalg.LinAlgError:  # rounding, for far corners of a cut target
                 W[rows, rows] = np.diag(np.maximum(np.diagonal(d.cov_px2), 1e-6) ** -0.5)
         elif d.refined:
-            spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
+            spread_px = (
+                d.sigma_px if d.horizontal_side_sigma_px == 0.0 else _side_sigma_px(d, corners)
+            )
             own = np.zeros(64)
-            own[_SIDES] = _of_lines(normals[i], spread_px)
+            own[_SIDE_MATRIX_INDICES] = _whitening_of_lines(normals[i], spread_px)
             W[rows, rows] = own.reshape(8, 8)
         else:
-            W[rows, rows] = _EACH / d.sigma_px
+            W[rows, rows] = _IDENTITY_8 / d.sigma_px
         if d.common_px is not None:
             shift[rows, 1] = d.common_px.ravel()
         if d.row_sigma_px > 0.0:
@@ -511,7 +524,7 @@ def weigh_corners(
 
 def _outward_normals(corners: Array) -> Array:
     """Return the outward unit normals (m, 4, 2) of the sides of m squares."""
-    side = corners.take(_END, axis=1) - corners
+    side = corners.take(_SIDE_END, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
     length = np.copysign(length, (x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])[:, None])
@@ -521,17 +534,19 @@ def _outward_normals(corners: Array) -> Array:
     return normals
 
 
-def _lying_px(d: Detection, corners: Array) -> Array:
+def _side_sigma_px(d: Detection, corners: Array) -> Array:
     """Return the standard deviation of each side, (4,): larger for a side along the rows."""
-    way = corners.take(_END, axis=0) - corners
+    way = corners.take(_SIDE_END, axis=0) - corners
     lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(way[:, 1])
-    return np.asarray(np.hypot(d.sigma_px, d.lying_sigma_px * lying / np.hypot(1.0, rows)))
+    return np.asarray(
+        np.hypot(d.sigma_px, d.horizontal_side_sigma_px * lying / np.hypot(1.0, rows))
+    )
 
 
-def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
+def _whitening_of_lines(normals: Array, sigma_px: float | Array) -> Array:
     """Return the whitening of corners by the offset and tilt of four lines with normals (4, 2), at
-    `_SIDES`; `sigma_px` is a scalar for all lines, or (4,)."""
+    `_SIDE_MATRIX_INDICES`; `sigma_px` is a scalar for all lines, or (4,)."""
     across = (normals.T / sigma_px).ravel()
-    tilt = across * _TILT
+    tilt = across * _LINE_TILT_SCALE
     return np.concatenate([across, across, -tilt, tilt])

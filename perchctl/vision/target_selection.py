@@ -18,11 +18,11 @@ from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, tilt_
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
-_SIGMA_PX = 1.0  # standard deviation of corners from a search
+_SEARCHED_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
 
 
 @dataclass(frozen=True)
-class OwnTargetPlace:
+class OwnTargetPosition:
     """Position (x, y) of the vehicle's own target in the world frame of the state estimate, None if
     unknown. A target further than `within_m` from this position belongs to another vehicle."""
 
@@ -35,13 +35,13 @@ OwnOffset = Callable[[MarkerName, Array], float]
 position, or inf."""
 
 
-_NO_POSE_M = 1e9
+_NO_POSE_OFFSET_M = 1e9
 """Distance for corners that yield no pose yet, for example next to a highlight, m: examined last,
 but not refused."""
 
 
 def marker_offset_m(
-    place: OwnTargetPlace,
+    place: OwnTargetPosition,
     t_s: float,
     attitude: Attitude | None,
     setup: PoseSetup,
@@ -50,15 +50,15 @@ def marker_offset_m(
 ) -> float:
     """Return `target_offset_m` for a marker's corners (4, 2) px; infinite beyond
     `place.within_m`."""
-    seen = Detection(marker, corners_px, _SIGMA_PX, refined=False)
+    seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
-    away_m = _NO_POSE_M if pose is None else target_offset_m(pose, attitude, place, setup)
+    away_m = _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, place, setup)
     is_bounded = attitude is not None and math.isfinite(place.within_m)
     return away_m if not is_bounded or away_m <= place.within_m else math.inf
 
 
 def target_offset_m(
-    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
+    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPosition, setup: PoseSetup
 ) -> float:
     """Return a target's horizontal distance from the own target's position; from the gear if
     unknown."""
@@ -69,7 +69,7 @@ def target_offset_m(
 
 
 def refusal_text(
-    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
+    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
     """Return the message that a pose is another vehicle's target; None if it may be the own
     target."""
@@ -87,10 +87,10 @@ def refusal_text(
 # --- The target in the world, in the level frame, and as a measurement for a filter ---
 
 
-_STILL = np.eye(4)
+_IDENTITY_4 = np.eye(4)
 # 0.006 deg, 0.03 mm: errors of lens and print
-_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
-_YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
+_MIN_MEASUREMENT_COVARIANCE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2
+_YAW_FIRST_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
 def to_world(
@@ -131,17 +131,21 @@ def track_measurement(
     if constants.process is None or pose.cov is None:
         return Measurement(z)
     noise = pose.cov.copy()
-    noise[:3, :3] -= pose.print_m.dot(pose.print_m.T)
+    noise[:3, :3] -= pose.print_shift_m.dot(pose.print_shift_m.T)
     bias = np.zeros((4, 4))
-    bias[1:, PRINT] = pose.print_m
+    bias[1:, PRINT] = pose.print_shift_m
     if attitude is not None:
         bias[1:, TILTS] = tilt_jacobian(way_m) * constants.tilt_sigma_rad
     if in_world and attitude is not None:
-        turn = _STILL.copy()
+        turn = _IDENTITY_4.copy()
         turn[:3, :3] = attitude.R_world_level
         noise = turn.dot(noise).dot(turn.T)
         bias[1:] = attitude.R_world_level.dot(bias[1:])
-    R = np.asarray(noise[_YAW_FIRST] + _LEAST_NOISE) if is_finite(noise) else None
+    R = (
+        np.asarray(noise[_YAW_FIRST_INDICES] + _MIN_MEASUREMENT_COVARIANCE)
+        if is_finite(noise)
+        else None
+    )
     return Measurement(z, R, bias)
 
 

@@ -22,7 +22,7 @@ from perchctl.vision.filter import (
 from perchctl.vision.lens import project
 from perchctl.vision.markers.cut import make_lattice
 from perchctl.vision.pose import PoseCandidate, PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.target_selection import OwnTargetPlace, refusal_text, track_measurement
+from perchctl.vision.target_selection import OwnTargetPosition, refusal_text, track_measurement
 from perchctl.vision.types import (
     Attitude,
     LastPose,
@@ -45,7 +45,7 @@ class TrackSetup:
     world: FilterSetup
     pose: PoseSetup
     has_gate: bool
-    own_place: OwnTargetPlace
+    own_place: OwnTargetPosition
 
     def constants(self, in_world: bool) -> FilterSetup:
         """Return the filters' constants in the world or the level frame."""
@@ -54,8 +54,8 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """The tracks, lock and rival after a frame, and the verdict of the gate; `measured.fed` is
-    empty if the gate rejects the frame's pose."""
+    """The tracks, lock and rival after a frame, and the verdict of the gate; `measured.used_poses`
+    is empty if the gate rejects the frame's pose."""
 
     measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
@@ -74,21 +74,23 @@ def update_tracks(
 ) -> TrackedFrame:
     """Return the tracks after a frame, updated with the poses that the gate accepts."""
     constants = setup.constants(in_world)
-    fed = {
+    used_poses = {
         name: track_measurement(pose, attitude, in_world, constants, setup.pose)
-        for name, pose in measured.fed.items()
+        for name, pose in measured.used_poses.items()
     }
     old = state.tracks if state.in_world == in_world else {}
     sight, verdict = None, GateVerdict(accepted=True, rival=state.rival)
-    pose = measured.surest
-    if fed and pose is not None:
-        name = next(n for n, each in measured.fed.items() if each is pose)
+    pose = measured.most_certain_pose
+    if used_poses and pose is not None:
+        name = next(n for n, each in measured.used_poses.items() if each is pose)
         whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-        sight = FramePose(t_s, pose, fed[name], in_world, whole, camera_alone=attitude is None)
+        sight = FramePose(
+            t_s, pose, used_poses[name], in_world, whole, is_camera_alone=attitude is None
+        )
         if state.rival is not None and state.lock is not None and attitude is not None:
             place_m = state.lock.track.x[POSITION]
             looks = not in_world or is_in_view(place_m, attitude, setup.pose)
-            sight = replace(sight, lock_in_view=looks)
+            sight = replace(sight, is_lock_in_view=looks)
         if setup.has_gate:
             verdict = judge_pose(state.lock, state.rival, sight, constants)
         # A locked target stays locked, however far the estimate's world frame has drifted
@@ -99,16 +101,19 @@ def update_tracks(
         if another is not None and verdict.accepted:
             verdict = GateVerdict(False, rival=state.rival, text=another, is_foreign_target=True)
     if not verdict.accepted:
-        measured, fed = replace(measured, fed={}), {}
+        measured, used_poses = replace(measured, used_poses={}), {}
     begun = {} if verdict.restarts else old
-    stepped = {n: step_track(begun.get(n), fed.get(n), t_s, constants) for n in {**begun, **fed}}
+    stepped = {
+        n: step_track(begun.get(n), used_poses.get(n), t_s, constants)
+        for n in {**begun, **used_poses}
+    }
     tracks = {n: track for n, track in stepped.items() if track is not None}
     if not setup.has_gate:
         return TrackedFrame(measured, tracks, verdict)
     lock, rival = drop_expired(state.lock, verdict.rival, t_s)
     if sight is not None and verdict.accepted and tracks:
-        surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
-        lock = update_lock(lock, surest, sight, verdict)
+        most_certain_pose = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
+        lock = update_lock(lock, most_certain_pose, sight, verdict)
     return TrackedFrame(measured, tracks, verdict, lock, rival)
 
 
@@ -124,8 +129,9 @@ def update_tracks(
 #
 # A camera alone, without a vehicle, knows neither its own motion nor how many frames a recording
 # lacks, so a rival is most likely the target from a different viewpoint. The lock then changes
-# after `RELOCK_S` in which only the rival was seen, if the rival has both markers or the lock never
-# had. A rival that was seen before the target was lost is a second target and waits `REACQUIRE_S`.
+# after `MIN_RIVAL_ONLY_S` in which only the rival was seen, if the rival has both markers or the
+# lock never had. A rival that was seen before the target was lost is a second target and waits
+# `REACQUIRE_S`.
 #
 # While a rival is seen and the target is not, the target's predicted position may be wrong, and its
 # covariance covers the rival's position, too.
@@ -141,27 +147,29 @@ def update_tracks(
 REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 """Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
 another target captures the lock."""
-RELOCK_S = 0.3
+MIN_RIVAL_ONLY_S = 0.3
 """Time for which a camera alone must see only the rival, s. Larger: after lost frames, a recording
 has no target for longer. Smaller: fewer wrong frames in succession capture the lock."""
-FORGET_S = 10.0
+LOCK_TIMEOUT_S = 10.0
 """Time after which a lock in the world frame expires, s."""
 ESTABLISHED_FRAMES = 5
 """Number of frames below which a lock yields to a rival that was seen more often."""
 
-_JUMPED = "the state estimate jumped, the target did not"
-_WENT_BACK = "the target is where it was expected before the last pose, which may have been wrong"
-_GATE = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
-_SAME_RANGE = 4.0  # standard deviations
+_ESTIMATE_JUMPED_TEXT = "the state estimate jumped, the target did not"
+_PREVIOUS_POSE_WRONG_TEXT = (
+    "the target is where it was expected before the last pose, which may have been wrong"
+)
+_GATE_CHI2 = 25.0  # squared distance in four dimensions: exceeded by chance in 5 of 100 000
+_MAX_SAME_RANGE_SIGMAS = 4.0  # standard deviations
 # Errors outside any covariance: calibration, print, latency; plus shares of the range.
-_LEAST_M, _LEAST_YAW_RAD = 0.01, math.radians(4.0)
-_SIDEWAYS, _ALONG = 0.015, 0.02
-_PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
-_TURNED_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
+_MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
+_UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
+_POSITION_AXES: Array = np.diag([0.0, 1.0, 1.0, 1.0])
+_MIN_REPORTED_ROTATION_RAD = math.radians(15.0)  # a larger rotation is mentioned in the message
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
-_CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
+_MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
 # largest share of the squared misfit that the better of two explanations may leave
-_JUMP_LEFT_SHARE = 0.25
+_MAX_REMAINING_MISFIT_FRACTION = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +183,8 @@ class FramePose:
     measured: Measurement
     in_world: bool
     has_both_markers: bool
-    lock_in_view: bool = True
-    camera_alone: bool = False
+    is_lock_in_view: bool = True
+    is_camera_alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,20 +214,24 @@ def judge_pose(
         return GateVerdict(accepted=True)
     if sight.t_s <= lock.track.t_s:  # the tracks are newer
         return GateVerdict(accepted=False, rival=rival)
-    if rival is None and _is_clear(lock.track, sight, constants):
+    if rival is None and _is_clearly_consistent(lock.track, sight, constants):
         return GateVerdict(accepted=True)
-    fit = _misfit(lock.track, sight, constants)
-    other = None if rival is None else _misfit(rival.track, sight, constants)
-    theirs = other is not None and other.squared <= _GATE
-    if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
+    fit = _compute_misfit(lock.track, sight, constants)
+    other = None if rival is None else _compute_misfit(rival.track, sight, constants)
+    theirs = other is not None and other.squared <= _GATE_CHI2
+    if fit.squared <= _GATE_CHI2 and not (theirs and other is not None and other.cost < fit.cost):
         return GateVerdict(accepted=True, rival=rival)
-    if not theirs and _goes_on(lock, sight, fit.off):
-        return GateVerdict(accepted=True, restarts=True, same_target=True, text=_JUMPED)
-    if not theirs and _goes_back(lock, sight, fit.off, constants):
-        return GateVerdict(accepted=True, restarts=True, same_target=True, text=_WENT_BACK)
-    seen = _watched(rival if theirs else None, sight, fit, constants)
-    if _believed(lock, seen, sight):
-        text = f"target taken up anew, {fit.away_m:.2f} m from where it was expected"
+    if not theirs and _matches_last_view(lock, sight, fit.off):
+        return GateVerdict(
+            accepted=True, restarts=True, same_target=True, text=_ESTIMATE_JUMPED_TEXT
+        )
+    if not theirs and _matches_previous_track(lock, sight, fit.off, constants):
+        return GateVerdict(
+            accepted=True, restarts=True, same_target=True, text=_PREVIOUS_POSE_WRONG_TEXT
+        )
+    seen = _update_rival(rival if theirs else None, sight, fit, constants)
+    if _is_rival_accepted(lock, seen, sight):
+        text = f"target taken up anew, {fit.distance_m:.2f} m from where it was expected"
         return GateVerdict(accepted=True, restarts=True, text=text)
     return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
@@ -236,12 +248,12 @@ def drop_expired(
     # A position in the level frame expires soon, but a rival stays a rival.
     lasting = lock.in_world or rival is not None
     # After the clock was set back, no older track can be confirmed.
-    if age_s < -MAX_TRACK_GAP_S or age_s > (FORGET_S if lasting else MAX_TRACK_GAP_S):
+    if age_s < -MAX_TRACK_GAP_S or age_s > (LOCK_TIMEOUT_S if lasting else MAX_TRACK_GAP_S):
         return None, None
     return lock, rival
 
 
-def contradiction(
+def predict_rival_state(
     lock: Lock | None, rival: RivalTrack | None, in_world: bool, t_s: float, constants: FilterSetup
 ) -> Array | None:
     """Return the rival's state (8,) at `t_s` if it was seen since the lock's target was; else None.
@@ -275,7 +287,7 @@ def update_lock(
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _Misfit:
     """The misfit of a pose in (yaw, x, y, z), (4,), and its covariance (4, 4)."""
 
     off: Array
@@ -291,11 +303,11 @@ class _Fit:
         return self.squared + float(np.linalg.slogdet(self.S)[1])
 
     @property
-    def away_m(self) -> float:
+    def distance_m(self) -> float:
         return float(np.linalg.norm(self.off[1:]))
 
 
-def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fit:
+def _compute_misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Misfit:
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The largest drift counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
@@ -304,62 +316,70 @@ def _misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Fi
     # A constant error shifts both.
     bias = wanted.bias[MEASURED] if measured.bias is None else measured.bias - wanted.bias[MEASURED]
     R = constants.R if measured.R is None else measured.R
-    S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _PLACE + R + bias @ bias.T
-    return _Fit(off, S + np.diag(_unclaimed(_range_m(sight)) ** 2))
+    S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _POSITION_AXES + R + bias @ bias.T
+    return _Misfit(off, S + np.diag(_unmodelled_sigma(_range_m(sight)) ** 2))
 
 
-def _is_clear(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
+def _is_clearly_consistent(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
     """True if errors outside any covariance explain the misfit, as in most frames: a fast check."""
     wanted = predict_track(track, sight.t_s, constants, with_cov=False)
     off = sight.measured.z - wanted.x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
-    off /= _unclaimed(_range_m(sight))
-    return float(off @ off) <= _GATE
+    off /= _unmodelled_sigma(_range_m(sight))
+    return float(off @ off) <= _GATE_CHI2
 
 
 def _range_m(sight: FramePose) -> float:
     return math.hypot(*sight.pose.tvec_m.tolist())
 
 
-def _unclaimed(range_m: float) -> Array:
+def _unmodelled_sigma(range_m: float) -> Array:
     """Return the standard deviations of (yaw, x, y, z) for errors outside any covariance."""
-    sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
-    return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
+    sideways_m, along_m = (
+        _MIN_UNMODELLED_M + _UNMODELLED_ACROSS * range_m,
+        _MIN_UNMODELLED_M + _UNMODELLED_ALONG * range_m,
+    )
+    return np.array([_MIN_UNMODELLED_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _goes_on(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
+def _matches_last_view(lock: Lock, sight: FramePose, off_in_world: Array) -> bool:
     """True if the pose fits the vehicle's last view of the target much better than its position in
     the world."""
     dt_s = sight.t_s - lock.track.t_s
-    if not sight.in_world or dt_s > _CALM_S:
+    if not sight.in_world or dt_s > _MAX_CALM_DURATION_S:
         return False
     range_m = _range_m(sight)
     off = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
     off[1:] = sight.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
-    unclaimed = _unclaimed(range_m)
+    unclaimed = _unmodelled_sigma(range_m)
     seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, off_in_world))
-    calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
-    return calm and seen < _JUMP_LEFT_SHARE * jumped
+    calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE_CHI2
+    return calm and seen < _MAX_REMAINING_MISFIT_FRACTION * jumped
 
 
-def _goes_back(lock: Lock, sight: FramePose, off: Array, constants: FilterSetup) -> bool:
+def _matches_previous_track(
+    lock: Lock, sight: FramePose, off: Array, constants: FilterSetup
+) -> bool:
     """True if the pose fits the track before the lock's last pose much better than the present
     track, from which it differs by `off`. At few pictures per second, a single wrong pose passes
     the gate and gives the track of a camera alone a wrong velocity."""
     if lock.before is None or sight.in_world:
         return False
-    fit, unclaimed = _misfit(lock.before, sight, constants), _unclaimed(_range_m(sight))
+    fit, unclaimed = (
+        _compute_misfit(lock.before, sight, constants),
+        _unmodelled_sigma(_range_m(sight)),
+    )
     before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.off, off))
-    return fit.squared <= _GATE and before < _JUMP_LEFT_SHARE * now
+    return fit.squared <= _GATE_CHI2 and before < _MAX_REMAINING_MISFIT_FRACTION * now
 
 
 # --- Rivals ---
 
 
-def _watched(
-    before: RivalTrack | None, sight: FramePose, fit: _Fit, constants: FilterSetup
+def _update_rival(
+    before: RivalTrack | None, sight: FramePose, fit: _Misfit, constants: FilterSetup
 ) -> RivalTrack:
     if before is not None:
         track = step_track(before.track, sight.measured, sight.t_s, constants)
@@ -367,9 +387,9 @@ def _watched(
         whole = before.whole_frames + int(sight.has_both_markers)
         return replace(before, track=track, frames=before.frames + 1, whole_frames=whole)
     turned_rad, farther_m = abs(float(fit.off[0])), float(fit.off[3])
-    range_differs = farther_m**2 > _SAME_RANGE**2 * float(fit.S[3, 3])
-    where = f"{fit.away_m:.2f} m away from it"
-    if turned_rad > _TURNED_RAD:
+    range_differs = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(fit.S[3, 3])
+    where = f"{fit.distance_m:.2f} m away from it"
+    if turned_rad > _MIN_REPORTED_ROTATION_RAD:
         where += f" and turned by {math.degrees(turned_rad):.0f} deg"
     if range_differs:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
@@ -385,10 +405,10 @@ def _watched(
     )
 
 
-def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
+def _is_rival_accepted(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     if lock.frames < ESTABLISHED_FRAMES and rival.frames > lock.frames:
         return True
-    if sight.camera_alone and _has_jumped(lock, rival, sight):
+    if sight.is_camera_alone and _has_jumped(lock, rival, sight):
         return True
     if rival.whole_frames < ESTABLISHED_FRAMES or not sight.has_both_markers:
         return False
@@ -397,7 +417,7 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     unseen_s = sight.t_s - max(rival.since_s, lock.track.t_s)
     # A position outside the picture is not known to be empty.
     return (
-        (sight.lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
+        (sight.is_lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
         and not rival.range_differs
         and rival.whole_frames >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
@@ -407,7 +427,7 @@ def _believed(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
 def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     """True if the rival is most likely the target, after the camera has moved during lost
     frames."""
-    if rival.since_s < lock.track.t_s or sight.t_s - rival.since_s < RELOCK_S:
+    if rival.since_s < lock.track.t_s or sight.t_s - rival.since_s < MIN_RIVAL_ONLY_S:
         return False
     if not lock.has_both_markers:
         return rival.frames >= ESTABLISHED_FRAMES
@@ -419,7 +439,7 @@ def _has_jumped(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
 # and as velocity times time. Each is weighted by its recent errors in the target's own pictures.
 
 
-_FORGOTTEN = 0.1  # share of the old errors that each picture replaces
+_ERROR_UPDATE_FRACTION = 0.1  # share of the old errors that each picture replaces
 
 
 def expected_corners(
@@ -438,7 +458,7 @@ def expected_corners(
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
     by_place, by_speed = sight.error_rad2
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
-    stepped_m, flown_m = _camera_motions_m(then, attitude, setup)
+    stepped_m, flown_m = _camera_displacements_m(then, attitude, setup)
     moved_m = stepped_m + share * (flown_m - stepped_m)
     R = R_now.T.dot(R_then)
     tvec = R.dot(pose.tvec_m) - R_now.T.dot(moved_m)
@@ -466,10 +486,10 @@ def update_last_pose(
     # Across the line of sight, because the distance of a far target is uncertain along it.
     off = [
         R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2]
-        for way_m in _camera_motions_m(then, attitude, setup)
+        for way_m in _camera_displacements_m(then, attitude, setup)
     ]
     by_place, by_speed = (
-        old + _FORGOTTEN * (float(new.dot(new)) - old)
+        old + _ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
         for old, new in zip(before.error_rad2, off, strict=True)
     )
     return LastPose(pose, attitude, (by_place, by_speed))
@@ -478,7 +498,7 @@ def update_last_pose(
 def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     """True if a position (3,) in the world is in the picture at the vehicle's attitude."""
     R = _R_world_cam(attitude, setup)
-    way_m = R.T @ (place_m - attitude.position_m - _ahead_m(attitude, setup))
+    way_m = R.T @ (place_m - attitude.position_m - _camera_offset_m(attitude, setup))
     # Further off the axis, a lens model may fold back into the picture.
     if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > make_lattice(setup.camera).reach * way_m[2]:
         return False
@@ -486,10 +506,10 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
     return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())
 
 
-def _camera_motions_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
+def _camera_displacements_m(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
     """Return the camera's displacement (3,) from the estimated positions, and from the
     velocities."""
-    turned_m = _ahead_m(now, setup) - _ahead_m(then, setup)
+    turned_m = _camera_offset_m(now, setup) - _camera_offset_m(then, setup)
     stepped_m = turned_m + np.subtract(now.position_m, then.position_m)
     if now.velocity_mps is None or then.velocity_mps is None:
         return stepped_m, stepped_m
@@ -502,7 +522,7 @@ def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
     return R_world_cam
 
 
-def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
+def _camera_offset_m(attitude: Attitude, setup: PoseSetup) -> Array:
     """Return the vector from the vehicle to the camera in the world, (3,)."""
     ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
     return ahead_m

@@ -153,7 +153,8 @@ class Detection:
     common_px: Array | None = None
     cov_px2: Array | None = None
     row_sigma_px: float = 0.0  # standard deviation due to the jitter of rows in analogue video
-    lying_sigma_px: float = 0.0  # for sides along the rows, if every second one is interpolated
+    # for sides along the rows, if every second one is interpolated
+    horizontal_side_sigma_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -234,8 +235,8 @@ class MarkerPose:
         reprojection_px: RMS error of the corners.
         chi2: squared errors of the corners over their variances, per degree of freedom.
         cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
-        print_m: shift of `e_m` by one standard deviation of the print's size and of the sheet's
-            curl, (3, 2). Included in `sigma_m` and `cov`, but identical in every frame.
+        print_shift_m: shift of `e_m` by one standard deviation of the print's size and of the
+            sheet's curl, (3, 2). Included in `sigma_m` and `cov`, but identical in every frame.
         camera_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the errors of the print.
     """
 
@@ -250,7 +251,7 @@ class MarkerPose:
     reprojection_px: float
     chi2: float = 0.0
     cov: Array | None = None
-    print_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
+    print_shift_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
     camera_cov: Array | None = None
 
 
@@ -362,19 +363,19 @@ class RivalTrack:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMarkers:
-    """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order; `fed`, the
-    poses that update a track, by the track's name; and whether the two markers contradict each
-    other."""
+    """The poses of one frame: `poses` by ``joint``, ``large``, ``small``, in this order;
+    `used_poses`, the poses that update a track, by the track's name; and whether the two markers
+    contradict each other."""
 
     poses: dict[str, MarkerPose] = field(default_factory=dict)
-    fed: dict[str, MarkerPose] = field(default_factory=dict)
+    used_poses: dict[str, MarkerPose] = field(default_factory=dict)
     contradicting: bool = False
 
     @property
-    def surest(self) -> MarkerPose | None:
-        """The pose with the smallest standard deviation in `fed`, otherwise in `poses`; None
+    def most_certain_pose(self) -> MarkerPose | None:
+        """The pose with the smallest standard deviation in `used_poses`, otherwise in `poses`; None
         without poses."""
-        poses = self.fed or self.poses
+        poses = self.used_poses or self.poses
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 

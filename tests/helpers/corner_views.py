@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision import MARKERS, Frame
-from perchctl.vision.markers.detect import METHODS, CornerMethod, Findings, Prior, make_prior
+from perchctl.vision.markers.detect import (
+    CORNER_METHODS,
+    CornerFindings,
+    CornerMethod,
+    Prior,
+    make_prior,
+)
 from perchctl.vision.markers.detector import Picture
 from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners
@@ -72,14 +78,14 @@ VIEWS = (
     _view("Search", "large", pose_of(0.1, -0.1, 0.6, 0.5, -0.1, 0.1)),
     _view("Blurred search", "large", pose_of(-0.3, 0.2, 1.6, 0.5), blur_px=6.0, within_px=0.5),
 )
-"""One for each of `METHODS`, in its order."""
+"""One for each of `CORNER_METHODS`, in its order."""
 
 
-def findings(view: View) -> list[tuple[CornerMethod, Findings]]:
+def findings(view: View) -> list[tuple[CornerMethod, CornerFindings]]:
     """The methods that are used in the view, each with all that was found up to it."""
-    picture, prior, found = view.picture, view.prior, Findings()
+    picture, prior, found = view.picture, view.prior, CornerFindings()
     steps = []
-    for method in METHODS:
+    for method in CORNER_METHODS:
         if method.is_used(picture, prior, found):
             found = method.find(picture, prior, found)
             steps.append((method, found))

@@ -14,13 +14,13 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
 from perchctl.vision import MARKERS, Frame, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import add_partly_visible, follow_markers
-from perchctl.vision.markers.detector import Picture, make_aruco_detector
+from perchctl.vision.markers.detect import add_partly_visible, refine_expected_markers
+from perchctl.vision.markers.detector import Picture, make_detector_setup
 from perchctl.vision.markers.pattern import Pattern
 from perchctl.vision.types import MarkerName
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
-SETUP = make_aruco_detector(DetectorConfig(), TargetConfig())
+SETUP = make_detector_setup(DetectorConfig(), TargetConfig())
 SIDES_M: dict[MarkerName, float] = {"large": 0.150, "small": 0.025}
 POSE = pose_of(0.03, -0.02, 0.35, 0.7, 0.05, -0.08)
 
@@ -51,7 +51,7 @@ def followed(
 ) -> dict[MarkerName, RefinedCorners]:
     """What is where it is expected, wholly or partly."""
     picture = Picture(image, hidden, replace(SETUP, patterns=patterns), CAMERA)
-    return add_partly_visible(picture, expected, follow_markers(picture, expected))
+    return add_partly_visible(picture, expected, refine_expected_markers(picture, expected))
 
 
 def box(cx: float, cy: float, side: float) -> Array:

@@ -15,8 +15,8 @@ from perchctl.vision import (
     PictureKind,
     Pipeline,
     PipelineState,
+    deinterlace,
     estimate_pose,
-    pictures,
     step,
 )
 from perchctl.vision.fields import interpolate_field, is_combed, separate_fields
@@ -150,7 +150,7 @@ def measured(scene: Pass, frames: list[Frame], setup: Pipeline) -> tuple[list[Ar
     """Errors, mm, of the poses at their pictures' own times, and the number of pictures."""
     state, errors, count = PipelineState(), [], 0
     for frame in frames:
-        state, parts = pictures(state, frame, setup)
+        state, parts = deinterlace(state, frame, setup)
         for part in parts:
             count += 1
             state, output = step(state, part, None, setup)
@@ -186,8 +186,11 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
         image = render(*T, noise=2.0, seed=k)
         field = Frame(0, 0.0, interpolate_field(image, first_row), fields=kind)
         seen = detect_markers(field, None, setup.detector, CAMERA).large
-        assert seen.lying_sigma_px > 0.0
-        for name, d in (("claimed", seen), ("as elsewhere", replace(seen, lying_sigma_px=0.0))):
+        assert seen.horizontal_side_sigma_px > 0.0
+        for name, d in (
+            ("claimed", seen),
+            ("as elsewhere", replace(seen, horizontal_side_sigma_px=0.0)),
+        ):
             pose = estimate_pose([d], 0.0, None, setup.pose)
             e = pose.tvec_m - T[1]
             squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)

@@ -26,11 +26,11 @@ from perchctl.vision.filter import Measurement, X, make_filter
 from perchctl.vision.pipeline import step_detections
 from perchctl.vision.tracks import (
     ESTABLISHED_FRAMES,
-    FORGET_S,
+    LOCK_TIMEOUT_S,
+    MIN_RIVAL_ONLY_S,
     REACQUIRE_S,
-    RELOCK_S,
     FramePose,
-    _is_clear,
+    _is_clearly_consistent,
     judge_pose,
 )
 from perchctl.vision.types import Detections, Lock, MarkerTrack, RivalTrack
@@ -126,7 +126,7 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
     assert all(measured(watch.show(LOCKED)))
     decoy = DECOYS[name]
     lasts = watch.in_world or "markers" in decoy
-    outputs = watch.show(72 if lasts else int(RELOCK_S * HZ), **decoy)
+    outputs = watch.show(72 if lasts else int(MIN_RIVAL_ONLY_S * HZ), **decoy)
     assert all(output.poses for output in outputs)  # it was seen
     assert not any(measured(outputs))
     assert all(o.lock_note.startswith("not the tracked target: ") for o in outputs)
@@ -164,7 +164,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     constants = make_filter(KalmanConfig(), in_world=True)
     rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
     lock = Lock(track=track, pose=pose, in_world=True, frames=9, has_both_markers=True)
-    if _is_clear(track, sight, constants):
+    if _is_clearly_consistent(track, sight, constants):
         assert judge_pose(lock, rival, sight, constants).accepted
 
 
@@ -196,7 +196,7 @@ def test_without_the_gate_all_of_them_steer(build: Build) -> None:
 
 def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> None:
     watch.show(LOCKED)
-    while_s = REACQUIRE_S if watch.in_world else RELOCK_S
+    while_s = REACQUIRE_S if watch.in_world else MIN_RIVAL_ONLY_S
     outputs = watch.show(int(1.2 * while_s * HZ) + 2, away_m=(0.3, 0.0, 0.0))
     first = measured(outputs).index(True)
     assert while_s * HZ - 1 <= first <= while_s * HZ + 2
@@ -227,7 +227,7 @@ def test_a_second_target_seen_beside_the_first_takes_no_camera_alone_soon(build:
 
 def test_no_jump_locks_the_pipeline_out_for_ever(watch: Watch) -> None:
     watch.show(LOCKED)
-    assert not any(measured(watch.show(int((FORGET_S - 0.1) * HZ), **HALF)))
+    assert not any(measured(watch.show(int((LOCK_TIMEOUT_S - 0.1) * HZ), **HALF)))
     assert any(measured(watch.show(int(0.5 * HZ), **HALF)))
 
 

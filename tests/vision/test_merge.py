@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array, wrap_rad, yaw_of
 from perchctl.profile import Profile, WeightsConfig
-from perchctl.vision import MarkerPose, PipelineState, make_pipeline, pictures, step
-from perchctl.vision.merge import markers_disagree, merge_pair
+from perchctl.vision import MarkerPose, PipelineState, deinterlace, make_pipeline, step
+from perchctl.vision.merge import is_pair_inconsistent, merge_pair
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 
@@ -58,10 +58,10 @@ def test_yaw_is_merged_on_the_circle(w: WeightsConfig, a: float, gap: float) -> 
 
 def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:
     sure = pose((0.0, 0.0, 0.5))
-    assert not markers_disagree(sure, pose((0.0, 0.029, 0.5), name="small"), 0.03)
-    assert markers_disagree(sure, pose((0.0, 0.031, 0.5), name="small"), 0.03)
-    assert markers_disagree(sure, pose((0.0, 0.0, 0.54), name="small"), 0.03)
-    assert not markers_disagree(sure, pose((0.0, 0.0, 0.54), 0.02, "small"), 0.03)
+    assert not is_pair_inconsistent(sure, pose((0.0, 0.029, 0.5), name="small"), 0.03)
+    assert is_pair_inconsistent(sure, pose((0.0, 0.031, 0.5), name="small"), 0.03)
+    assert is_pair_inconsistent(sure, pose((0.0, 0.0, 0.54), name="small"), 0.03)
+    assert not is_pair_inconsistent(sure, pose((0.0, 0.0, 0.54), 0.02, "small"), 0.03)
 
 
 # --- A rolling shutter's corners, brought to one moment ----------------------------------------
@@ -81,7 +81,7 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
     setup = make_pipeline(Profile.model_validate(values), CAMERA)
     state, errors, nees = PipelineState(), [], []
     for k, frame in enumerate(scene.frames(12)):
-        state, parts = pictures(state, frame, setup)
+        state, parts = deinterlace(state, frame, setup)
         for part in parts:
             state, output = step(state, part, None, setup)
             if k < 4:

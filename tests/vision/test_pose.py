@@ -37,7 +37,7 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.filter import PRINT, make_filter
-from perchctl.vision.merge import markers_disagree
+from perchctl.vision.merge import is_pair_inconsistent
 from perchctl.vision.pose import normal_cam
 from perchctl.vision.target_selection import track_measurement
 from perchctl.vision.types import Detection
@@ -321,7 +321,7 @@ def test_a_wrong_print_excuses_no_gap_between_the_markers() -> None:
     large = solved(["large"], setup, place)
     smaller = solved(["small"], setup, (0.0, 0.0, 1.0, 0.0, 0.05, -0.04))
     assert np.abs(large.e_m - smaller.e_m).max() < 4.0 * large.sigma_m.max()
-    assert markers_disagree(large, smaller, 0.03)
+    assert is_pair_inconsistent(large, smaller, 0.03)
 
 
 def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:

@@ -27,28 +27,28 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import (
     RefinedCorners,
     apply_homography,
-    doubled_area,
-    homography_to_unit,
+    homography_to_unit_square,
+    is_inside_picture,
     mean_side_px,
     side_lengths_px,
-    within,
+    signed_double_area,
 )
-from perchctl.vision.markers.detector import Picture, make_quadrilateral_finder
-from perchctl.vision.markers.edge_fit import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, correlations
+from perchctl.vision.markers.detector import Picture, make_quad_detector
+from perchctl.vision.markers.edge_fit import CLIPPED_FRACTION, CLIPPED_GREY, CLIPPED_SIGMA_PX
+from perchctl.vision.markers.pattern import MIN_MARKER_SIDE_PX, Pattern, correlate_pattern
 from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
 _BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
 _SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # largest error of an expected position
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
-_MIN_START_RESEMBLANCE = 0.5
+_MIN_START_CORRELATION = 0.5
 # minimum at an expected position; textures seldom reach it, and each costs a fit
-_NEAR_RESEMBLANCE = 0.45
+_MIN_EXPECTED_CORRELATION = 0.45
 _MAX_CANDIDATES = 3
 _CENTRE_GREY, _BEYOND_GREY = 0.3, 0.6  # grey of areas with unknown content
-_SAME = 0.15  # distance, as a share of a side, of candidates that count as one
-_SHEET = 1.3  # half sides of a marker that are certainly paper
+_MAX_DUPLICATE_DISTANCE = 0.15  # distance, as a share of a side, of candidates that count as one
+_PAPER_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
 
 
 def find_expected_blurred(
@@ -62,12 +62,12 @@ def find_expected_blurred(
     blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
         corners = expected.get(name)
-        if corners is None or not within(corners, image.shape):
+        if corners is None or not is_inside_picture(corners, image.shape):
             continue
-        if mean_side_px(corners) < LEAST_SIDE_PX:
+        if mean_side_px(corners) < MIN_MARKER_SIDE_PX:
             continue
-        start = _shifted(image, corners, patterns[name])
-        if correlations(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
+        start = _align_by_correlation(image, corners, patterns[name])
+        if correlate_pattern(image, start, patterns[name])[0] < _MIN_EXPECTED_CORRELATION:
             continue
         for blur_px in blurs_px:
             seen = align_marker(picture, name, start, blur_px=blur_px)
@@ -80,32 +80,35 @@ def find_blurred(picture: Picture) -> dict[MarkerName, RefinedCorners]:
     """Return the marker in the best of the picture's quadrilaterals; empty if none contains a
     marker."""
     image, setup = picture.image, picture.setup
-    corners, _, others, _ = make_quadrilateral_finder(setup).detectMarkersMultiDict(image)
+    corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
-    for name, corners_px in _best(image, quads, setup.patterns):
+    for name, corners_px in _rank_quads(image, quads, setup.patterns):
         seen = align_marker(picture, name, corners_px, blur_px=_FIRST_BLUR_PX)
         if seen is not None:
             return {name: seen}
     return {}
 
 
-def _best(
+def _rank_quads(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[tuple[MarkerName, Array]]:
     """Return quads (m, 4, 2) similar to a marker, rolled to its orientation, best first, each
     position once."""
-    quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
+    quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_PX]
     if len(quads) == 0:
         return []
     found: list[tuple[float, MarkerName, Array]] = []
     for name in MARKERS:
-        like = np.array([correlations(image, quad, patterns[name]) for quad in quads])
-        for i in np.flatnonzero(like.max(axis=1) > _MIN_START_RESEMBLANCE):
+        like = np.array([correlate_pattern(image, quad, patterns[name]) for quad in quads])
+        for i in np.flatnonzero(like.max(axis=1) > _MIN_START_CORRELATION):
             turn = int(like[i].argmax())
             found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
-        middle, room_px = corners_px.mean(axis=0), _SAME * mean_side_px(corners_px)
+        middle, room_px = (
+            corners_px.mean(axis=0),
+            _MAX_DUPLICATE_DISTANCE * mean_side_px(corners_px),
+        )
         if not any(
             name == other and float(np.abs(there.mean(axis=0) - middle).max()) < room_px
             for other, there in chosen
@@ -114,13 +117,13 @@ def _best(
     return chosen[:_MAX_CANDIDATES]
 
 
-def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
     """Return the corners moved to the best correlation of the drawing with the picture."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_SEARCH_PX, _SEARCH_SIDES * side_px)
     centre = corners_px.mean(axis=0)
-    half = float(np.abs(corners_px - centre).max()) * _SHEET
+    half = float(np.abs(corners_px - centre).max()) * _PAPER_HALF_SIDES
     h, w = image.shape
     low = np.clip(np.floor(centre - half - reach), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(centre + half + reach) + 1, 1, (w, h)).astype(int)
@@ -135,15 +138,15 @@ def _shifted(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> A
     if min(patch.shape) <= size or size < _MIN_TEMPLATE_PX:
         return corners_px
     grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
-    template = _template(
-        pattern, apply_homography(homography_to_unit(local - first), grid), side_px * scale
+    template = _render_template(
+        pattern, apply_homography(homography_to_unit_square(local - first), grid), side_px * scale
     )
     score = cv2.matchTemplate(patch.astype(np.float32), template, cv2.TM_CCOEFF_NORMED)
     _, _, _, peak = cv2.minMaxLoc(score)
     return np.asarray(corners_px + (np.array(peak) - first) / scale, dtype=np.float64)
 
 
-def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
+def _render_template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float32]:
     """Return the blurred drawing at the marker's own coordinates (n, n, 2)."""
     n = len(pattern.drawing.cells)
     cell = np.floor((own + 1.0) * 0.5 * n).astype(np.intp)
@@ -152,7 +155,7 @@ def _template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np.float3
     white = np.where(inside, pattern.drawing.cells[cell[..., 1], cell[..., 0]], 1.0)
     if pattern.drawing.centre is not None:
         white[np.abs(own).max(axis=2) < pattern.drawing.ratio] = _CENTRE_GREY
-    white[np.abs(own).max(axis=2) > _SHEET] = _BEYOND_GREY
+    white[np.abs(own).max(axis=2) > _PAPER_HALF_SIDES] = _BEYOND_GREY
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
@@ -164,12 +167,12 @@ _MIN_SIGMA_PX = 0.015
 _BLUR_SIGMA = 0.012  # share of the blur: no picture equals its drawing with uniform blur
 _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
-_MAX_CELL_DEPARTURE = 0.3
+_MAX_CELL_DEVIATION = 0.3
 _MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
-_MOST_ALIGNED_SIGMA = 0.06  # share of the side
+_MAX_ALIGNED_SIGMA = 0.06  # share of the side
 _MIN_REACH_PX = 3.0
 _MIN_GROWTH, _MAX_GROWTH = 0.6, 1.6  # ratio of the mean sides
-_MIN_EVENNESS = 0.6  # ratio of the shortest side to the longest
+_MIN_SIDE_RATIO = 0.6  # ratio of the shortest side to the longest
 
 
 def align_marker(
@@ -178,7 +181,7 @@ def align_marker(
     start_px: Array,
     reach: float = 0.6,
     blur_px: float = 1.5,
-    max_sigma: float = _MOST_ALIGNED_SIGMA,
+    max_sigma: float = _MAX_ALIGNED_SIGMA,
     alone: bool = True,
 ) -> RefinedCorners | None:
     """Return the marker fitted by its drawing; None unless the picture matches the drawing.
@@ -188,7 +191,7 @@ def align_marker(
     must be distinctive; otherwise the other marker identifies this one.
     """
     side_px = mean_side_px(start_px)
-    if not side_px >= LEAST_SIDE_PX:
+    if not side_px >= MIN_MARKER_SIDE_PX:
         return None
     image, drawing = picture.image, picture.setup.patterns[name].drawing
     found = align_drawing(image, start_px, drawing, picture.camera, blur_px)
@@ -196,27 +199,27 @@ def align_marker(
         found is None
         or not is_verified(found, max_sigma)
         or (alone and not is_distinctive(found))
-        or found.moved_px > max(reach * side_px, _MIN_REACH_PX)
+        or found.motion_px > max(reach * side_px, _MIN_REACH_PX)
     ):
         return None
     # The square must remain a square of about the same size and orientation.
     sides_px, areas = side_lengths_px(found.corners_px), [found.corners_px, start_px]
     if (
-        sides_px.min() < _MIN_EVENNESS * sides_px.max()
+        sides_px.min() < _MIN_SIDE_RATIO * sides_px.max()
         or not _MIN_GROWTH < float(sides_px.mean()) / side_px < _MAX_GROWTH
-        or np.prod(doubled_area(np.stack(areas))) <= 0.0
+        or np.prod(signed_double_area(np.stack(areas))) <= 0.0
     ):
         return None
     sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
     (left, top), (right, bottom) = found.corners_px.min(axis=0), found.corners_px.max(axis=0)
     part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
-    if int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size:
+    if int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_FRACTION * part.size:
         # The light model does not explain clipped white.
         sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
     return RefinedCorners(found.corners_px, sigma_px, True)
 
 
-def is_verified(found: Alignment, max_sigma: float = _MOST_ALIGNED_SIGMA) -> bool:
+def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool:
     """True if the picture matches the drawing.
 
     Without the marker, the correlation of the pattern stays below 0.72 at the right strength; with
@@ -224,9 +227,9 @@ def is_verified(found: Alignment, max_sigma: float = _MOST_ALIGNED_SIGMA) -> boo
     """
     return (
         found.pattern > _MIN_PATTERN
-        and found.likeness > _MIN_LIKENESS
+        and found.fit_correlation > _MIN_LIKENESS
         and _MIN_STRENGTH < found.strength < _MAX_STRENGTH
-        and found.cell_departure < _MAX_CELL_DEPARTURE
+        and found.cell_deviation < _MAX_CELL_DEVIATION
         and found.sigma_px < max_sigma * mean_side_px(found.corners_px)
     )
 
@@ -234,4 +237,4 @@ def is_verified(found: Alignment, max_sigma: float = _MOST_ALIGNED_SIGMA) -> boo
 def is_distinctive(found: Alignment) -> bool:
     """True if any other codeword would look different. All of 36 other markers that `is_verified`
     accepted had a flip above 0.5."""
-    return found.flip < _MAX_FLIP and found.flip_sigma < _MAX_FLIP_SIGMA
+    return found.wrong_bit_degree < _MAX_FLIP and found.wrong_bit_sigma < _MAX_FLIP_SIGMA

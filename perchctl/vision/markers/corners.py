@@ -19,28 +19,31 @@ from perchctl.geometry import Array
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
-UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+UNIT_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners of the unit square in the marker's own coordinates, (4, 2)."""
 NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # indices of corner i's neighbours
-OUT: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 """Outward normal of each side in the marker's own coordinates."""
-_UNIT32 = UNIT.astype(np.float32)
-_UNIT1: Array = np.column_stack([UNIT, np.ones(4)])
-_INCREMENTS: Array = np.array(
-    [[[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]] for u, v in UNIT]
+_UNIT_SQUARE_F32 = UNIT_SQUARE.astype(np.float32)
+_UNIT_SQUARE_HOMOGENEOUS: Array = np.column_stack([UNIT_SQUARE, np.ones(4)])
+_INCREMENT_JACOBIANS: Array = np.array(
+    [
+        [[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]]
+        for u, v in UNIT_SQUARE
+    ]
 )
 """Motion of each corner with the terms of an increment, in the marker's own coordinates."""
 
 
-def homography_from_unit(corners: Array) -> Array:
+def homography_from_unit_square(corners: Array) -> Array:
     """Return the homography (3, 3) from the square of -1 to 1 to corners (4, 2)."""
-    H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
+    H = cv2.getPerspectiveTransform(_UNIT_SQUARE_F32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
-def homography_to_unit(corners: Array) -> Array:
+def homography_to_unit_square(corners: Array) -> Array:
     """Return the homography (3, 3) from corners (4, 2) to the square of -1 to 1."""
-    H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
+    H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT_SQUARE_F32)
     return np.asarray(H, dtype=np.float64)
 
 
@@ -53,10 +56,10 @@ def apply_homography(H: Array, points: Array) -> Array:
 def homography_jacobian(homography: Array) -> Array:
     """Return the Jacobian (8, 8) of the projected corners of the unit square by the terms `p` of
     `increment_homography`, at a homography (3, 3)."""
-    q = _UNIT1.dot(homography.T)
+    q = _UNIT_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
-    return np.asarray((A @ _INCREMENTS).reshape(8, 8))
+    return np.asarray((A @ _INCREMENT_JACOBIANS).reshape(8, 8))
 
 
 def increment_homography(H: Array, p: Array) -> Array:
@@ -78,13 +81,13 @@ def mean_side_px(corners_px: Array) -> float:
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
-def doubled_area(corners: Array) -> Array:
+def signed_double_area(corners: Array) -> Array:
     """Return twice the area (m,) of corners (m, 4, 2), positive if clockwise."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def within(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
+def is_inside_picture(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
     """True if all corners (4, 2) are at least `margin_px` inside the edges of a picture (h, w)."""
     h, w = shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
@@ -96,11 +99,13 @@ def scale_square(corners_px: Array, ratio: float, camera: CameraModel | None = N
     """Return the corners (4, 2) of the square scaled by `ratio` about its centre, in its plane;
     without a camera, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort(corners_px, camera)
-    found = apply_homography(homography_from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
+    found = apply_homography(
+        homography_from_unit_square(straight), (_UNIT_SQUARE_F32 * ratio).astype(np.float64)
+    )
     return found if camera is None else distort(found, camera)
 
 
-def with_missing_marker(
+def add_missing_marker(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> dict[MarkerName, Array]:
     """Return both markers' corners; a missing marker follows from the other one and their
@@ -118,11 +123,11 @@ def with_missing_marker(
 # target looks too far away.
 
 
-RAW_SIGMA_PX = 0.6
+DETECTOR_CORNER_SIGMA_PX = 0.6
 """Standard deviation of corners from OpenCV's detector, px."""
-SUBPIX_SIGMA_PX = 0.25
+SUBPIX_CORNER_SIGMA_PX = 0.25
 """Standard deviation of corners from `cv2.cornerSubPix`, px."""
-NESTED_SIGMA_PX = 0.6  # derived from the other marker, not measured
+DERIVED_CORNER_SIGMA_PX = 0.6  # derived from the other marker, not measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +144,7 @@ class RefinedCorners:
     edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
     row_sigma_px: float = 0.0
-    least_blur_px: float = math.inf
+    min_blur_px: float = math.inf
 
 
 def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:
@@ -157,5 +162,5 @@ def refine_subpix(image: NDArray[np.uint8], raw_px: Array, cells: int) -> Refine
     moved = points.reshape(4, 2).astype(np.float64)
     moved_px = np.linalg.norm(moved - raw_px, axis=1).max()
     if not np.isfinite(moved_px) or moved_px > half + 1.0:
-        return RefinedCorners(raw_px, RAW_SIGMA_PX, False)
-    return RefinedCorners(moved, SUBPIX_SIGMA_PX, False)
+        return RefinedCorners(raw_px, DETECTOR_CORNER_SIGMA_PX, False)
+    return RefinedCorners(moved, SUBPIX_CORNER_SIGMA_PX, False)

@@ -34,49 +34,62 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.lens import distort, undistort
-from perchctl.vision.markers.corners import UNIT, RefinedCorners, apply_homography, within
-from perchctl.vision.markers.detector import Covered, Picture, is_hidden, make_aruco_detector
-from perchctl.vision.markers.edge_fit import MIDDLES, sample_profiles
+from perchctl.vision.markers.corners import (
+    UNIT_SQUARE,
+    RefinedCorners,
+    apply_homography,
+    is_inside_picture,
+)
+from perchctl.vision.markers.detector import HiddenMask, Picture, is_hidden, make_detector_setup
+from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS, sample_profiles
 from perchctl.vision.markers.pattern import Drawing, Pattern, render_cells
-from perchctl.vision.markers.photometric_fit import likeness, make_grid
+from perchctl.vision.markers.photometric_fit import fit_correlation, make_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
-MOST_AGE_S = 0.5
+MAX_CUT_FIT_AGE_S = 0.5
 """Largest time since the target was last measured, s; after it, a visible part of the target is no
 evidence."""
-_EDGE_PX = 40  # from the edge of the picture, where a marker may just have been cut
+_MAX_EDGE_DISTANCE_PX = 40  # from the edge of the picture, where a marker may just have been cut
 # cell of the small marker; if it is smaller, the large marker is in view
-_LEAST_SMALL_CELL_PX = 8.0
-_MIN_GLANCE = 0.6  # correlation required at the moved prediction
-_GOOD_GLANCE = 0.95  # correlation at which no other size is tried
-_GROWTHS = (1.0, 0.94, 1.06)
+_MIN_SMALL_CELL_PX = 8.0
+_MIN_OVERVIEW_CORRELATION = 0.6  # correlation required at the moved prediction
+_GOOD_OVERVIEW_CORRELATION = 0.95  # correlation at which no other size is tried
+_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_LIKENESS, _MIN_CUT_GAIN = 0.9, 20.0
-_MIN_SHOWN = 0.75  # share of the edge points in view
-_MOST_RESIDUAL_PX = 1.2
-_MOST_SPREAD = 0.04  # of the centre, in half sides
-_FLOOR_PX = 0.02
-_SMALL_PLACES = 12  # edge points that make the small marker the measured one
-_INVERTED = 1e-3  # normalised; the lens model is valid where its inverse exists
-_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # rotation from a marker's own coordinates to its axes
+_MIN_SHOWN_FRACTION = 0.75  # share of the edge points in view
+_MAX_RESIDUAL_PX = 1.2
+_MAX_CENTRE_SIGMA = 0.04  # of the centre, in half sides
+_MIN_CORNER_SIGMA_PX = 0.02
+_MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
+_MAX_INVERSION_ERROR = 1e-3  # normalised; the lens model is valid where its inverse exists
+_R_AXES_COORDINATES = np.diag(
+    [1.0, -1.0, -1.0]
+)  # rotation from a marker's own coordinates to its axes
 
 
-def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
+def warm_up_cut_marker_fit(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
     """Fill the caches of `fit_cut_markers` before the flight, so that its first call is fast."""
-    _outline(patterns), make_texture(patterns["large"].drawing), make_lattice(camera)
+    _make_target_outline(patterns), make_texture(patterns["large"].drawing), make_lattice(camera)
 
 
 def is_target_cut(
-    expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: Covered | None = None
+    expected: Mapping[MarkerName, Array], shape: tuple[int, ...], hidden: HiddenMask | None = None
 ) -> bool:
     """True if each expected marker (4, 2) px may be cut by the picture's edge or hidden by the
     vehicle's gear."""
-    whole = [corners for corners in expected.values() if within(corners, shape, _EDGE_PX)]
+    whole = [
+        corners
+        for corners in expected.values()
+        if is_inside_picture(corners, shape, _MAX_EDGE_DISTANCE_PX)
+    ]
     return bool(expected) and all(is_hidden(hidden, c) for c in whole)
 
 
-def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
+def can_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
     """True if an expected marker (4, 2) px may be completely in the picture."""
-    return any(within(corners, shape, -_EDGE_PX) for corners in expected.values())
+    return any(
+        is_inside_picture(corners, shape, -_MAX_EDGE_DISTANCE_PX) for corners in expected.values()
+    )
 
 
 def fit_cut_markers(
@@ -87,24 +100,24 @@ def fit_cut_markers(
     image, camera, patterns = picture.image, picture.camera, picture.setup.patterns
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre
-    start = _start(expected, ratio, camera)
+    start = _initial_pose(expected, ratio, camera)
     if start is None or centre is None:
         return {}
-    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _LEAST_SMALL_CELL_PX:
+    if 2.0 * ratio / len(centre) * camera.K[0, 0] / start.t[2] < _MIN_SMALL_CELL_PX:
         return {}
     covered = None if picture.hidden is None else picture.hidden.astype(np.uint8)
     view, texture = make_overview(image, camera, covered), make_texture(drawing)
-    near = _moved_near(start, texture, view)
+    near = _search_near_pose(start, texture, view)
     if near is None:
         return {}
-    found = fit_pose(image, near, _outline(patterns), camera, covered)
-    if found is None or not _trusted(found):
+    found = fit_pose(image, near, _make_target_outline(patterns), camera, covered)
+    if found is None or not _is_reliable(found):
         return {}
-    like, gain = drawing_likeness(found.pose.H, texture, view)
+    like, gain = correlate_drawing(found.pose.H, texture, view)
     if like < _MIN_LIKENESS or gain < _MIN_CUT_GAIN:
         return {}
-    name = _stands_for(found)
-    corners = _corners(found, ratio if name == "small" else 1.0, camera)
+    name = _measured_marker(found)
+    corners = _marker_corners(found, ratio if name == "small" else 1.0, camera)
     return {} if corners is None else {name: corners}
 
 
@@ -113,31 +126,31 @@ def shows_enough_of_target(
 ) -> bool:
     """True if the visible part of the target suffices for a measurement, for a large marker with
     the rotation (3, 3) and centre (3,) in the camera frame."""
-    patterns = _patterns_of(target)
-    pose = RigidPose(R_cam_marker @ _OWN_AXES, position_m / (target.large.side_m / 2.0))
-    found = predict_fit(pose, _outline(patterns), camera)
-    if found is None or not _trusted(found):
+    patterns = _make_patterns(target)
+    pose = RigidPose(R_cam_marker @ _R_AXES_COORDINATES, position_m / (target.large.side_m / 2.0))
+    found = predict_fit(pose, _make_target_outline(patterns), camera)
+    if found is None or not _is_reliable(found):
         return False
-    half = patterns["large"].drawing.ratio if _stands_for(found) == "small" else 1.0
-    return _corners(found, half, camera) is not None
+    half = patterns["large"].drawing.ratio if _measured_marker(found) == "small" else 1.0
+    return _marker_corners(found, half, camera) is not None
 
 
 @lru_cache(maxsize=4)
-def _patterns_of(target: TargetConfig) -> dict[MarkerName, Pattern]:
-    return make_aruco_detector(DetectorConfig(), target).patterns
+def _make_patterns(target: TargetConfig) -> dict[MarkerName, Pattern]:
+    return make_detector_setup(DetectorConfig(), target).patterns
 
 
-def _outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
+def _make_target_outline(patterns: Mapping[MarkerName, Pattern]) -> Outline:
     large, small = patterns["large"], patterns["small"]
     return make_outline(large.drawing, large.rim.tolerance, small.rim.tolerance)
 
 
-def _stands_for(found: PoseFit) -> MarkerName:
+def _measured_marker(found: PoseFit) -> MarkerName:
     """Return the marker that was measured: the small one if enough of it was visible."""
-    return "small" if found.small_points >= _SMALL_PLACES else "large"
+    return "small" if found.small_points >= _MIN_SMALL_MARKER_POINTS else "large"
 
 
-def _start(
+def _initial_pose(
     expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
 ) -> RigidPose | None:
     name: MarkerName = "small" if "small" in expected else "large"
@@ -145,7 +158,9 @@ def _start(
     if not np.isfinite(rays).all():
         return None
     half = ratio if name == "small" else 1.0
-    H = cv2.getPerspectiveTransform((half * UNIT).astype(np.float32), rays.astype(np.float32))
+    H = cv2.getPerspectiveTransform(
+        (half * UNIT_SQUARE).astype(np.float32), rays.astype(np.float32)
+    )
     scale = 0.5 * float(np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
     if not (np.isfinite(H).all() and scale > 1e-9 and H[2, 2] != 0.0):
         return None
@@ -155,38 +170,38 @@ def _start(
     return RigidPose(R, np.asarray(H[:, 2])) if np.linalg.det(R) > 0.0 else None
 
 
-def _moved_near(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
+def _search_near_pose(start: RigidPose, texture: Texture, view: Overview) -> RigidPose | None:
     """Return the prediction moved to its best match in the picture; None without a match."""
-    best, pose, lattice = _MIN_GLANCE, None, view.lattice
-    for growth in _GROWTHS:
+    best, pose, lattice = _MIN_OVERVIEW_CORRELATION, None, view.lattice
+    for growth in _SCALE_CANDIDATES:
         t = start.t * (1.0, 1.0, 1.0 / growth)
-        wide = render_drawing(RigidPose(start.R, t).H, texture, lattice, _SEARCHED)
+        wide = render_drawing(RigidPose(start.R, t).H, texture, lattice, _SEARCH_RANGE_NODES)
         mask = view.seen.astype(np.float32)
         score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
-        drift = (_SEARCHED - np.array([column, row], dtype=np.float64)) * lattice.step
+        drift = (_SEARCH_RANGE_NODES - np.array([column, row], dtype=np.float64)) * lattice.step
         if score[row, column] > best:
             best = float(score[row, column])
             pose = RigidPose(start.R, t + np.append(drift * t[2], 0.0))
-        if best > _GOOD_GLANCE:
+        if best > _GOOD_OVERVIEW_CORRELATION:
             break
     return pose
 
 
-def _trusted(found: PoseFit) -> bool:
+def _is_reliable(found: PoseFit) -> bool:
     """True if nearly all edges were found and determine the position."""
     spread = math.sqrt(max(float(np.linalg.eigvalsh(found.cov[3:, 3:])[-1]), 0.0))
     return (
-        found.points_shown >= _MIN_SHOWN * found.points_in_view
-        and found.residual_px < _MOST_RESIDUAL_PX
-        and spread < _MOST_SPREAD
+        found.points_shown >= _MIN_SHOWN_FRACTION * found.points_in_view
+        and found.residual_px < _MAX_RESIDUAL_PX
+        and spread < _MAX_CENTRE_SIGMA
     )
 
 
-def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners | None:
+def _marker_corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners | None:
     """Return the corners of the marker with this half side; None outside the lens model."""
-    r = np.column_stack([half * UNIT, np.zeros(4)]) @ found.pose.R.T
+    r = np.column_stack([half * UNIT_SQUARE, np.zeros(4)]) @ found.pose.R.T
     X = r + found.pose.t
     if X[:, 2].min() <= 0.0:
         return None  # one corner is next to or behind the camera
@@ -198,9 +213,9 @@ def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners
         J[2 * k : 2 * k + 2, :3] = np.cross(r[k], P)
         J[2 * k : 2 * k + 2, 3:] = P
     corners_px = distort(x, camera)
-    if not np.abs(undistort(corners_px, camera) - x).max() < _INVERTED:
+    if not np.abs(undistort(corners_px, camera) - x).max() < _MAX_INVERSION_ERROR:
         return None
-    cov_px2 = J @ found.cov @ J.T + _FLOOR_PX**2 * np.eye(8)
+    cov_px2 = J @ found.cov @ J.T + _MIN_CORNER_SIGMA_PX**2 * np.eye(8)
     sigma_px = math.sqrt(float(np.trace(cov_px2)) / 8.0)
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
 
@@ -210,13 +225,13 @@ def _corners(found: PoseFit, half: float, camera: CameraModel) -> RefinedCorners
 
 Grey = NDArray[np.float32]
 
-_NODES = 80  # across the picture, approximately
-_FINE = 2  # samples per node in both directions
-_WIDEST = 1.5  # normalised: 56 degrees off the axis
-_RIM_POINTS = 40
-_REACHED = 1.02
-_SEARCHED = 6  # nodes to each side
-_LEAST_NODES = 200  # least number of nodes on paper
+_LATTICE_COLUMNS = 80  # across the picture, approximately
+_SAMPLES_PER_NODE = 2  # samples per node in both directions
+_MAX_FIELD_OF_VIEW_RADIUS = 1.5  # normalised: 56 degrees off the axis
+_POINTS_PER_BORDER = 40
+_REACH_MARGIN = 1.02
+_SEARCH_RANGE_NODES = 6  # nodes to each side
+_MIN_PAPER_NODES = 200  # least number of nodes on paper
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,26 +266,30 @@ class Overview:
 def make_lattice(camera: CameraModel) -> Lattice:
     """Return the lattice over a camera's picture."""
     w, h = camera.size_px
-    s = np.linspace(0.0, 1.0, _RIM_POINTS)
+    s = np.linspace(0.0, 1.0, _POINTS_PER_BORDER)
     low, high = np.zeros_like(s), np.ones_like(s)
     rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
     rays = undistort(rim * (w - 1.0, h - 1.0), camera)
-    rays = np.clip(np.nan_to_num(rays, nan=0.0), -_WIDEST, _WIDEST)
-    reach = _REACHED * float(np.hypot(*rays.T).max())
-    step = w / (_NODES * float(camera.K[0, 0]))
+    rays = np.clip(
+        np.nan_to_num(rays, nan=0.0), -_MAX_FIELD_OF_VIEW_RADIUS, _MAX_FIELD_OF_VIEW_RADIUS
+    )
+    reach = _REACH_MARGIN * float(np.hypot(*rays.T).max())
+    step = w / (_LATTICE_COLUMNS * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
     fine = [
-        rays.min(axis=0)[k] + step * ((np.arange(_FINE * nodes[k]) + 0.5) / _FINE) for k in (0, 1)
+        rays.min(axis=0)[k]
+        + step * ((np.arange(_SAMPLES_PER_NODE * nodes[k]) + 0.5) / _SAMPLES_PER_NODE)
+        for k in (0, 1)
     ]
     x, y = np.meshgrid(*fine)
     at = distort(np.stack([x.ravel(), y.ravel()], axis=1), camera)
     inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
     inside &= (at > 0.0).all(axis=1) & (at < (w - 1, h - 1)).all(axis=1)
     at = np.where(inside[:, None], at, -1e3)
-    every = max(round(w / (_FINE * _NODES)), 1)
+    every = max(round(w / (_SAMPLES_PER_NODE * _LATTICE_COLUMNS)), 1)
     size = (max(w // every, 1), max(h // every, 1))
     reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
-    shape = (int(nodes[1]), _FINE, int(nodes[0]), _FINE)
+    shape = (int(nodes[1]), _SAMPLES_PER_NODE, int(nodes[0]), _SAMPLES_PER_NODE)
     flat = x.shape
     return Lattice(
         first=rays.min(axis=0) + step / 2.0,
@@ -292,25 +311,25 @@ def make_overview(
     seen = lattice.inside
     if mask is not None:
         covered = (mask != 0).astype(np.float32)
-        seen = seen & (_looked_up(covered, lattice) < 1e-3)
-    return Overview(lattice, _looked_up(image, lattice), seen)
+        seen = seen & (_sample_at_nodes(covered, lattice) < 1e-3)
+    return Overview(lattice, _sample_at_nodes(image, lattice), seen)
 
 
-def _looked_up(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
+def _sample_at_nodes(picture: NDArray[np.uint8] | Grey, lattice: Lattice) -> Grey:
     small = cv2.resize(picture, lattice.size, interpolation=cv2.INTER_AREA).astype(np.float32)
     fine = cv2.remap(small, lattice.x, lattice.y, cv2.INTER_LINEAR)
-    return _coarse(np.asarray(fine, np.float32))
+    return _downsample(np.asarray(fine, np.float32))
 
 
-def _coarse(fine: Grey) -> Grey:
-    rows, columns = (n // _FINE for n in fine.shape)
+def _downsample(fine: Grey) -> Grey:
+    rows, columns = (n // _SAMPLES_PER_NODE for n in fine.shape)
     return np.asarray(cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0) -> Grey:
     """Return the whiteness of the drawing projected by H (3, 3), at the nodes and `margin` nodes
     around."""
-    step = lattice.step / _FINE
+    step = lattice.step / _SAMPLES_PER_NODE
     start = lattice.first - 0.5 * (lattice.step - step) - margin * lattice.step
     G = np.array(
         [[1.0 / step, 0.0, -start[0] / step], [0.0, 1.0 / step, -start[1] / step], [0.0, 0.0, 1.0]]
@@ -318,7 +337,7 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
     white, T = texture
     M = G @ H @ np.linalg.inv(T)
     rows, columns = lattice.inside.shape
-    size = (_FINE * (columns + 2 * margin), _FINE * (rows + 2 * margin))
+    size = (_SAMPLES_PER_NODE * (columns + 2 * margin), _SAMPLES_PER_NODE * (rows + 2 * margin))
     fine = cv2.warpPerspective(
         white,
         M,
@@ -327,35 +346,38 @@ def render_drawing(H: Array, texture: Texture, lattice: Lattice, margin: int = 0
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=1.0,
     )
-    return _coarse(np.asarray(fine, np.float32))
+    return _downsample(np.asarray(fine, np.float32))
 
 
-def drawing_likeness(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
+def correlate_drawing(H: Array, texture: Texture, view: Overview) -> tuple[float, float]:
     """Return the view's correlation with the drawing projected by H (3, 3), and the contrast in
     grey levels."""
     lattice = view.lattice
     rows, columns = np.nonzero(view.seen)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
-    on = np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1) < PAPER
-    if np.count_nonzero(on) < _LEAST_NODES:
+    on = (
+        np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1)
+        < LARGE_PAPER_HALF_SIDES
+    )
+    if np.count_nonzero(on) < _MIN_PAPER_NODES:
         return 0.0, 0.0
     white = render_drawing(H, texture, lattice)[rows[on], columns[on]].astype(np.float64)
     grey = view.grey[rows[on], columns[on]].astype(np.float64)
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
-    return likeness(grey, grey - A @ light), float(light[3])
+    return fit_correlation(grey, grey - A @ light), float(light[3])
 
 
 # --- The drawing of the whole target: its edges between black and white, and its texture ---
 
 
-PAPER = 1.25  # half sides of the large marker that are certainly paper
+LARGE_PAPER_HALF_SIDES = 1.25  # half sides of the large marker that are certainly paper
 _LARGE_PLACES, _SMALL_CELL_PLACES = 24, 6  # points along a cell's side
 # share of a cell's side near its ends, where the next cell's corner blurs the edge
-_FROM_END = 0.15
-_HIDDEN = 1.2  # half sides of the central marker, which hides the large one
-_TEXELS = 320
+_END_MARGIN_CELLS = 0.15
+_CENTRAL_MARKER_HALF_SIDES = 1.2  # half sides of the central marker, which hides the large one
+_TEXTURE_SIZE = 320
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,15 +403,15 @@ pixels."""
 def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: float) -> Outline:
     """Return the edges of both markers; tolerances are print errors of an edge's position, in
     cells."""
-    hidden = _HIDDEN * drawing.ratio
+    hidden = _CENTRAL_MARKER_HALF_SIDES * drawing.ratio
     edges = [
         edge
-        for edge in _edges(drawing.cells, 1.0, _LARGE_PLACES)
+        for edge in _iterate_edges(drawing.cells, 1.0, _LARGE_PLACES)
         if np.abs(edge[0]).max(axis=1).min() > hidden
     ]
     large = len(edges)
     if drawing.centre is not None:
-        edges += _edges(drawing.centre, drawing.ratio, _SMALL_CELL_PLACES)
+        edges += _iterate_edges(drawing.centre, drawing.ratio, _SMALL_CELL_PLACES)
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
     places = np.array([len(each) for each in at])
@@ -407,22 +429,23 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
 
 @lru_cache(maxsize=8)
 def make_texture(drawing: Drawing) -> Texture:
-    """Return a picture of the drawing up to `PAPER`, and the homography (3, 3) to its pixels."""
-    axis = make_grid(_TEXELS, PAPER).axis
-    wide = render_cells(drawing, axis, PAPER / _TEXELS)
-    more = (len(wide) - _TEXELS) // 2
-    scale = _TEXELS / (2.0 * PAPER)
-    first = PAPER * scale - 0.5 + more
+    """Return a picture of the drawing up to `LARGE_PAPER_HALF_SIDES`, and the homography (3, 3) to
+    its pixels."""
+    axis = make_grid(_TEXTURE_SIZE, LARGE_PAPER_HALF_SIDES).axis
+    wide = render_cells(drawing, axis, LARGE_PAPER_HALF_SIDES / _TEXTURE_SIZE)
+    more = (len(wide) - _TEXTURE_SIZE) // 2
+    scale = _TEXTURE_SIZE / (2.0 * LARGE_PAPER_HALF_SIDES)
+    first = LARGE_PAPER_HALF_SIDES * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
     return np.clip(wide, 0.0, 1.0), T
 
 
-def _edges(
+def _iterate_edges(
     cells: Array, half: float, places: int
 ) -> Iterator[tuple[Array, tuple[float, float], tuple[float, int, int], float]]:
     """Yield the sides between cells of different colour, in the form of `Outline`."""
     width = 2.0 * half / len(cells)
-    s = _FROM_END + (1.0 - 2.0 * _FROM_END) * (np.arange(places) + 0.5) / places
+    s = _END_MARGIN_CELLS + (1.0 - 2.0 * _END_MARGIN_CELLS) * (np.arange(places) + 0.5) / places
     for across in (0, 1):
         rows = cells if across == 0 else cells.T
         padded = np.pad(rows, 1, constant_values=1.0)[1:-1]
@@ -445,19 +468,34 @@ def _edges(
 
 # Half lengths of the profiles per round. An ascent blurs edges near the picture's border by several
 # pixels.
-_REACH_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
+_PROFILE_HALF_LENGTHS_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _PROFILE_REACH_CELLS, _LEAST_REACH_PX = 0.4, 3.0
 # below the first, no further round; above the second, the fit has failed
 _CUT_STILL_PX, _CUT_SETTLED_PX = 0.02, 0.5
 _LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE = 8.0, 0.35  # grey levels; share of the median
-_LEAST_PLACES = 24
-_TUKEY, _LEAST_SCALE_PX = 3.5, 0.15
-_TAILS = 1.3  # compensates the reduction of squared residuals by robust weights
-_LINE_OFF_PX = 0.02  # error of a whole line, due to lens and light
+_MIN_EDGE_POINTS = 24
+_TUKEY_SCALE, _LEAST_SCALE_PX = 3.5, 0.15
+_ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
+_LINE_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
 # standard deviations of a prediction
-_TILT_RAD, _TURN_RAD, _PLACE = math.radians(2.0), math.radians(20.0), 1.0
-_SHIFT_PX = 0.15  # standard deviation of the growth of white over black
-_PRIOR: Array = np.array([_TILT_RAD, _TILT_RAD, _TURN_RAD, *3 * [_PLACE], _SHIFT_PX]) ** -2.0
+_TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
+    math.radians(2.0),
+    math.radians(20.0),
+    1.0,
+)
+_EDGE_SHIFT_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
+_PRIOR_INFORMATION: Array = (
+    np.array(
+        [
+            _TILT_SIGMA_RAD,
+            _TILT_SIGMA_RAD,
+            _ROTATION_SIGMA_RAD,
+            *3 * [_TRANSLATION_SIGMA],
+            _EDGE_SHIFT_SIGMA_PX,
+        ]
+    )
+    ** -2.0
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -489,7 +527,7 @@ class PoseFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
+class _EdgePoints:
     """Edge points of an outline in the picture: `at` (n, 2) px and unit normal (n, 2) from black to
     white. `J` (n, 7) is their motion along the normal with rotation, translation and the shift of
     all edges (white over black), `px_per_unit` (n,) the scale across the edge, and `index` (n,)
@@ -502,7 +540,7 @@ class _Places:
     index: NDArray[np.intp]
 
 
-_Round = tuple[Array, Array, Array, float]
+_FitStep = tuple[Array, Array, Array, float]
 """Step of all unknowns (7,), inverse of their normal matrix, weights of the points (n,), and
 variance of one point, px^2."""
 
@@ -516,16 +554,16 @@ def fit_pose(
 ) -> PoseFit | None:
     """Fit the pose in which the drawing's edges match the picture's; None if the fit fails."""
     pose, total, found, moved_px = start, np.zeros(7), None, math.inf
-    for reach_px in _REACH_PX:
-        places = _in_view(pose, outline, reach_px, image.shape, camera, mask)
-        if len(places.index) < _LEAST_PLACES:
+    for reach_px in _PROFILE_HALF_LENGTHS_PX:
+        places = _edge_points_in_view(pose, outline, reach_px, image.shape, camera, mask)
+        if len(places.index) < _MIN_EDGE_POINTS:
             return None
         reach_cells_px = _PROFILE_REACH_CELLS * outline.cell[places.index] * places.px_per_unit
         half_px = np.minimum(reach_px, reach_cells_px)
-        offset_px, shows = _offsets(image, places, half_px)
-        if np.count_nonzero(shows) < _LEAST_PLACES:
+        offset_px, shows = _measure_offsets(image, places, half_px)
+        if np.count_nonzero(shows) < _MIN_EDGE_POINTS:
             return None
-        found = _solved(places, offset_px, shows, total)
+        found = _solve_step(places, offset_px, shows, total)
         if found is None:
             return None
         step = found[0][:6]
@@ -537,28 +575,30 @@ def fit_pose(
             break
     if found is None or not (moved_px <= _CUT_SETTLED_PX and pose.t[2] > 0.0):  # also for NaN
         return None
-    return _visible(pose, found, places, outline)
+    return _make_pose_fit(pose, found, places, outline)
 
 
 def predict_fit(pose: RigidPose, outline: Outline, camera: CameraModel) -> PoseFit | None:
     """Return the result of `fit_pose` for a perfect picture at that pose; None if too little is
     visible."""
-    places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
+    places = _edge_points_in_view(
+        pose, outline, _PROFILE_HALF_LENGTHS_PX[0], camera.size_px[::-1], camera, None
+    )
     n = len(places.index)
-    if n < _LEAST_PLACES:
+    if n < _MIN_EDGE_POINTS:
         return None
-    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
-    return None if found is None else _visible(pose, found, places, outline)
+    found = _solve_step(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7))
+    return None if found is None else _make_pose_fit(pose, found, places, outline)
 
 
-def _in_view(
+def _edge_points_in_view(
     pose: RigidPose,
     outline: Outline,
     reach_px: float,
     shape: tuple[int, ...],
     camera: CameraModel,
     mask: NDArray[np.uint8] | None,
-) -> _Places:
+) -> _EdgePoints:
     h, w = shape[:2]
     X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
@@ -600,18 +640,18 @@ def _in_view(
             x_px, y_px = np.rint(at + way * reach_px * normal).astype(np.intp).T
             free &= mask[y_px, x_px] == 0
     J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
-    return _Places(at[free], normal[free], J[free], np.abs(px)[free], near[free])
+    return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
 
-def _offsets(
-    image: NDArray[np.uint8], places: _Places, half_px: Array
+def _measure_offsets(
+    image: NDArray[np.uint8], places: _EdgePoints, half_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the offset of each point's edge along its normal, (n,) px, and whether an edge was
     found."""
     half_px = np.maximum(half_px, _LEAST_REACH_PX)
     grey = sample_profiles(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
-    u = half_px[:, None] * MIDDLES.astype(np.float64)
+    u = half_px[:, None] * GRADIENT_POSITIONS.astype(np.float64)
     mass = gradient * np.exp(-0.5 * (u / (0.5 * half_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
@@ -621,9 +661,9 @@ def _offsets(
     return np.clip(offset_px, -half_px, half_px), shows
 
 
-def _solved(
-    places: _Places, offset_px: Array, shows: NDArray[np.bool_], total: Array
-) -> _Round | None:
+def _solve_step(
+    places: _EdgePoints, offset_px: Array, shows: NDArray[np.bool_], total: Array
+) -> _FitStep | None:
     """Return a robust step, given the sum `total` (7,) of the previous steps."""
     J, weight = places.J, shows.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
@@ -631,25 +671,27 @@ def _solved(
         error = offset_px - J @ step
         size = np.abs(error)
         scale = max(1.4826 * float(np.median(size[shows])), _LEAST_SCALE_PX)
-        weight = np.maximum(1.0 - (size / (_TUKEY * scale)) ** 2, 0.0) ** 2 * shows
+        weight = np.maximum(1.0 - (size / (_TUKEY_SCALE * scale)) ** 2, 0.0) ** 2 * shows
         mass = float(weight.sum())
-        if mass < 0.5 * _LEAST_PLACES:
+        if mass < 0.5 * _MIN_EDGE_POINTS:
             return None
-        variance = max(_TAILS * float(weight @ error**2) / mass, 1e-3)
-        N = (J * weight[:, None]).T @ J / variance + np.diag(_PRIOR)
+        variance = max(_ROBUST_VARIANCE_FACTOR * float(weight @ error**2) / mass, 1e-3)
+        N = (J * weight[:, None]).T @ J / variance + np.diag(_PRIOR_INFORMATION)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
-        step = inverse @ (J.T @ (weight * offset_px) / variance - _PRIOR * total)
+        step = inverse @ (J.T @ (weight * offset_px) / variance - _PRIOR_INFORMATION * total)
     return step, inverse, weight, variance
 
 
-def _visible(pose: RigidPose, found: _Round, places: _Places, outline: Outline) -> PoseFit:
+def _make_pose_fit(
+    pose: RigidPose, found: _FitStep, places: _EdgePoints, outline: Outline
+) -> PoseFit:
     J, (_, inverse, w, variance) = places.J, found
     line = outline.line[places.index]
-    common_px = np.hypot(outline.print_sigma[places.index] * places.px_per_unit, _LINE_OFF_PX)
+    common_px = np.hypot(outline.print_sigma[places.index] * places.px_per_unit, _LINE_SIGMA_PX)
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
     middle = variance * (J * (w**2)[:, None]).T @ J + by_line.T @ by_line
-    cov = inverse @ (middle / variance**2 + np.diag(_PRIOR)) @ inverse
+    cov = inverse @ (middle / variance**2 + np.diag(_PRIOR_INFORMATION)) @ inverse
     shown = w > 0.0
     return PoseFit(
         pose=pose,

@@ -1,9 +1,9 @@
 """Detect the corners of the target's two markers in a picture.
 
-`METHODS` lists the methods that find corners in the order in which they are tried, with the
+`CORNER_METHODS` lists the methods that find corners in the order in which they are tried, with the
 requirements, cost and use of each; ``docs/corners.md`` shows examples of all.
 
-    frame -> Prior -> METHODS, one by one -> Findings -> Detections
+    frame -> Prior -> CORNER_METHODS, one by one -> CornerFindings -> Detections
              (expected corners, kinds of search)
 
 Corners are (4, 2) px, top left, top right, bottom right, bottom left as printed; (0, 0) is the
@@ -25,32 +25,42 @@ from perchctl.values import replace
 from perchctl.vision.fields import field_frames, interpolated_sigma_px
 from perchctl.vision.markers.blurred import align_marker, find_blurred, find_expected_blurred
 from perchctl.vision.markers.corners import (
-    NESTED_SIGMA_PX,
+    DERIVED_CORNER_SIGMA_PX,
     RefinedCorners,
+    add_missing_marker,
+    is_inside_picture,
     mean_side_px,
     refine_subpix,
     side_lengths_px,
-    with_missing_marker,
-    within,
 )
-from perchctl.vision.markers.cut import MOST_AGE_S, fit_cut_markers, is_target_cut, may_be_whole
+from perchctl.vision.markers.cut import (
+    MAX_CUT_FIT_AGE_S,
+    can_be_whole,
+    fit_cut_markers,
+    is_target_cut,
+)
 from perchctl.vision.markers.detector import (
     DetectorSetup,
     Picture,
-    fill_hidden,
-    hidden_area,
+    fill_hidden_pixels,
     is_hidden,
+    make_hidden_mask,
 )
 from perchctl.vision.markers.edge_fit import refine_lines
-from perchctl.vision.markers.partial import ROOM_PX, KnownBy, fit_partly_seen, is_wholly_seen
-from perchctl.vision.markers.pattern import (
-    LEAST_SIDE_PX,
-    Pattern,
-    cells_agree,
-    cells_mostly_agree,
-    fits_pattern,
+from perchctl.vision.markers.partial import (
+    PICTURE_MARGIN_PX,
+    IdentifiedBy,
+    fit_partly_visible,
+    is_fully_visible,
 )
-from perchctl.vision.markers.search import FoundMarkers, Look, search, search_halved
+from perchctl.vision.markers.pattern import (
+    MIN_MARKER_SIDE_PX,
+    Pattern,
+    has_matching_cells,
+    has_mostly_matching_cells,
+    is_correlated_with_pattern,
+)
+from perchctl.vision.markers.search import FoundMarkers, SearchMode, search, search_half_size
 from perchctl.vision.target_selection import OwnOffset
 from perchctl.vision.types import (
     MARKERS,
@@ -63,10 +73,10 @@ from perchctl.vision.types import (
     PictureKind,
 )
 
-_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
+_MIN_SEARCHED_SIDE_PX = 13.0  # a search does not find smaller markers
 # pictures for which a measured shift of all edges is valid, since light changes slowly
-_SHIFT_PICTURES = 5
-_Found = dict[MarkerName, RefinedCorners]
+_MAX_EDGE_SHIFT_AGE = 5
+_FoundCorners = dict[MarkerName, RefinedCorners]
 
 
 # --- The methods that find corners, in the order in which they are tried ---
@@ -79,10 +89,10 @@ class Prior:
     Attributes:
         expected: the markers' predicted corners, each (4, 2) px; empty if no target is expected.
         both: `expected`, with a missing marker derived from the other one.
-        look: the kinds of search for this frame.
+        search_mode: the kinds of search for this frame.
         turn: its parity selects the first guess of the blur; None tries all.
-        was_recent: a marker was found at most `MOST_AGE_S` before this frame; False without edge
-            fits.
+        was_recent: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; False without
+            edge fits.
         was_cut: `was_recent`, and no marker can have been completely in that picture.
         edge_shift: the shift of all edges measured in the last frames; None measures it.
         own: selects one of several targets if none is expected; None uses the picture alone.
@@ -90,7 +100,7 @@ class Prior:
 
     expected: Mapping[MarkerName, Array]
     both: Mapping[MarkerName, Array]
-    look: Look
+    search_mode: SearchMode
     turn: int | None
     was_recent: bool
     was_cut: bool
@@ -99,7 +109,7 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class CornerFindings:
     """Results of the methods tried so far: the markers' `corners`, and the result of the last
     `search`."""
 
@@ -109,7 +119,7 @@ class Findings:
 
 @dataclass(frozen=True, eq=False)
 class CornerMethod:
-    """One method to find corners: a row of `METHODS`.
+    """One method to find corners: a row of `CORNER_METHODS`.
 
     Attributes:
         name: its heading in ``docs/corners.md``.
@@ -125,82 +135,82 @@ class CornerMethod:
     needs: str
     cost: str
     used_when: str
-    is_used: Callable[[Picture, Prior, Findings], bool]
-    find: Callable[[Picture, Prior, Findings], Findings]
+    is_used: Callable[[Picture, Prior, CornerFindings], bool]
+    find: Callable[[Picture, Prior, CornerFindings], CornerFindings]
 
 
-def _is_tracked(picture: Picture, prior: Prior, found: Findings) -> bool:
-    return prior.look != "fits" and bool(prior.both) and picture.setup.fits_lines
+def _is_target_expected(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+    return prior.search_mode != "fits" and bool(prior.both) and picture.setup.fits_lines
 
 
-def _fit_edges(picture: Picture, prior: Prior, found: Findings) -> Findings:
-    return replace(found, corners=follow_markers(picture, prior.both, prior.edge_shift))
+def _fit_edges(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
+    return replace(found, corners=refine_expected_markers(picture, prior.both, prior.edge_shift))
 
 
-def _is_off_its_track(picture: Picture, prior: Prior, found: Findings) -> bool:
-    return _is_tracked(picture, prior, found) and not found.corners
+def _is_edge_fit_empty(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+    return _is_target_expected(picture, prior, found) and not found.corners
 
 
-def _search_halved(picture: Picture, prior: Prior, found: Findings) -> Findings:
+def _search_half_size(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     # If no side was found, a close target has usually moved further than a profile reaches.
-    searched = search_halved(picture, prior.both)
+    searched = search_half_size(picture, prior.both)
     if searched is None:
         return found
     corners = _refine_found(picture, searched)
-    return Findings(corners, searched) if corners else found
+    return CornerFindings(corners, searched) if corners else found
 
 
-def _is_on_its_track(picture: Picture, prior: Prior, found: Findings) -> bool:
-    return _is_tracked(picture, prior, found) and not found.search.corners_px
+def _is_half_size_search_empty(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+    return _is_target_expected(picture, prior, found) and not found.search.corners_px
 
 
-def _fit_visible_part(picture: Picture, prior: Prior, found: Findings) -> Findings:
+def _fit_visible_part(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     corners = add_partly_visible(picture, prior.both, found.corners, prior.edge_shift)
     return replace(found, corners=corners)
 
 
-def _is_tracked_vaguely(picture: Picture, prior: Prior, found: Findings) -> bool:
+def _needs_photometric_fit(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     patterns = picture.setup.patterns
-    return _is_on_its_track(picture, prior, found) and not any(
-        lines_suffice(r, patterns[name]) for name, r in found.corners.items()
+    return _is_half_size_search_empty(picture, prior, found) and not any(
+        is_line_fit_sufficient(r, patterns[name]) for name, r in found.corners.items()
     )
 
 
-def _fit_drawing(picture: Picture, prior: Prior, found: Findings) -> Findings:
+def _fit_drawing(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     return replace(found, corners=improve_corners(picture, found.corners))
 
 
-def _may_be_cut(picture: Picture, prior: Prior, found: Findings) -> bool:
+def _can_be_cut(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     if found.corners or not prior.was_recent:
         return False
     return is_target_cut(prior.both, picture.image.shape, picture.hidden)
 
 
-def _fit_cut_target(picture: Picture, prior: Prior, found: Findings) -> Findings:
+def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     return replace(found, corners=fit_cut_markers(picture, prior.expected))
 
 
-def _is_searched(picture: Picture, prior: Prior, found: Findings) -> bool:
-    if prior.look in ("blurred", "fits"):
+def _should_search(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+    if prior.search_mode in ("blurred", "fits"):
         return False
-    if not found.corners and (not prior.was_cut or may_be_whole(prior.both, picture.image.shape)):
+    if not found.corners and (not prior.was_cut or can_be_whole(prior.both, picture.image.shape)):
         return True
-    return _missing(picture, found.corners, prior.expected)
+    return _is_marker_missing(picture, found.corners, prior.expected)
 
 
-def _search(picture: Picture, prior: Prior, found: Findings) -> Findings:
-    searched = search(picture, prior.expected, prior.look, prior.own)
+def _search(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
+    searched = search(picture, prior.expected, prior.search_mode, prior.own)
     if len(searched.corners_px) < len(found.corners):
         return replace(found, search=searched)
-    return Findings(_refine_found(picture, searched), searched)
+    return CornerFindings(_refine_found(picture, searched), searched)
 
 
-def _may_be_blurred(picture: Picture, prior: Prior, found: Findings) -> bool:
-    has_turn = prior.look not in ("sharp", "window")
+def _can_be_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
+    has_turn = prior.search_mode not in ("sharp", "window")
     return not found.corners and has_turn and picture.setup.fits_lines
 
 
-def _search_blurred(picture: Picture, prior: Prior, found: Findings) -> Findings:
+def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     bare = replace(picture, hidden=None)
     if prior.expected:
         seen = find_expected_blurred(bare, prior.expected, prior.turn)
@@ -209,13 +219,13 @@ def _search_blurred(picture: Picture, prior: Prior, found: Findings) -> Findings
     return replace(found, corners=improve_corners(bare, seen))
 
 
-METHODS: tuple[CornerMethod, ...] = (
+CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
         needs="an expected marker, whole, with cells of 2.5 px and straight sides",
         cost="0.7 ms",
         used_when="the target is expected; after a loss in three pictures of four",
-        is_used=_is_tracked,
+        is_used=_is_target_expected,
         find=_fit_edges,
     ),
     CornerMethod(
@@ -223,8 +233,8 @@ METHODS: tuple[CornerMethod, ...] = (
         needs="both markers expected, those in view with sides above 60 px",
         cost="5 ms, with the measurement of what it finds",
         used_when="the edge fit was tried and found no marker",
-        is_used=_is_off_its_track,
-        find=_search_halved,
+        is_used=_is_edge_fit_empty,
+        find=_search_half_size,
     ),
     CornerMethod(
         name="Partial-view fit",
@@ -232,7 +242,7 @@ METHODS: tuple[CornerMethod, ...] = (
         cost="3 ms for each marker",
         used_when="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
-        is_used=_is_on_its_track,
+        is_used=_is_half_size_search_empty,
         find=_fit_visible_part,
     ),
     CornerMethod(
@@ -241,7 +251,7 @@ METHODS: tuple[CornerMethod, ...] = (
         cost="1.3 ms for each marker",
         used_when="the edge fit was tried, and no marker's edges suffice: its cells are smaller "
         "than 6 px or than six times the blur; not if the half-size search found one",
-        is_used=_is_tracked_vaguely,
+        is_used=_needs_photometric_fit,
         find=_fit_drawing,
     ),
     CornerMethod(
@@ -249,7 +259,7 @@ METHODS: tuple[CornerMethod, ...] = (
         needs="a measurement at most 0.5 s old, and small-marker cells of 8 px",
         cost="7 ms",
         used_when="nothing was found, and each expected marker may be cut by the picture or hidden",
-        is_used=_may_be_cut,
+        is_used=_can_be_cut,
         find=_fit_cut_target,
     ),
     CornerMethod(
@@ -258,7 +268,7 @@ METHODS: tuple[CornerMethod, ...] = (
         cost="4 to 9 ms, with the measurement of what it finds",
         used_when="nothing was found, unless the target was cut and still is; or an expected "
         "marker with sides above 13 px is missing; after a loss in three pictures of four",
-        is_used=_is_searched,
+        is_used=_should_search,
         find=_search,
     ),
     CornerMethod(
@@ -266,7 +276,7 @@ METHODS: tuple[CornerMethod, ...] = (
         needs="a whole marker with sides of 7 px that resembles its drawing",
         cost="5 to 10 ms",
         used_when="nothing was found; after a loss in one picture of four",
-        is_used=_may_be_blurred,
+        is_used=_can_be_blurred,
         find=_search_blurred,
     ),
 )
@@ -274,10 +284,10 @@ METHODS: tuple[CornerMethod, ...] = (
 search is used."""
 
 
-def find_corners(picture: Picture, prior: Prior) -> Findings:
+def find_corners(picture: Picture, prior: Prior) -> CornerFindings:
     """Apply the methods to a picture; each one that is used starts from the previous findings."""
-    found = Findings()
-    for method in METHODS:
+    found = CornerFindings()
+    for method in CORNER_METHODS:
         if method.is_used(picture, prior, found):
             found = method.find(picture, prior, found)
     return found
@@ -302,7 +312,7 @@ def detect_markers(
     prior = make_prior(frame, previous, setup, camera, expected, empty_frames, own)
     if frame.fields == "woven":
         first, second = (_detect(each, setup, camera, prior) for each in field_frames(frame))
-        return add_marker_flow(mean_of_fields(first, second), previous)
+        return add_marker_flow(average_fields(first, second), previous)
     return add_marker_flow(_detect(frame, setup, camera, prior), previous)
 
 
@@ -316,49 +326,49 @@ def make_prior(
     own: OwnOffset | None = None,
 ) -> Prior:
     """Return the knowledge before the frame; arguments as in `detect_markers`."""
-    expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
-    look = _look(empty_frames, bool(expected), setup.fits_lines)
+    expected = dict(expected) if expected else extrapolate_corners(previous, frame.t_s)
+    search_mode = _choose_search_mode(empty_frames, bool(expected), setup.fits_lines)
     turn = None
-    if empty_frames is not None and look in ("near", "fits"):
+    if empty_frames is not None and search_mode in ("near", "fits"):
         turn = (empty_frames + 2) // 4
     # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
-    was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MOST_AGE_S
+    was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_CUT_FIT_AGE_S
     was_recent = was_recent and setup.fits_lines and bool(last)
     shift = None if previous is None else previous.edge_shift
     if shift is not None:
         age = shift.age + 1
-        shift = replace(shift, age=age) if age < _SHIFT_PICTURES else None
+        shift = replace(shift, age=age) if age < _MAX_EDGE_SHIFT_AGE else None
     return Prior(
         expected=expected,
-        both=with_missing_marker(expected, setup.ratio, camera),
-        look=look,
+        both=add_missing_marker(expected, setup.ratio, camera),
+        search_mode=search_mode,
         turn=turn,
         was_recent=was_recent,
-        was_cut=was_recent and not may_be_whole(last, frame.image.shape),
+        was_cut=was_recent and not can_be_whole(last, frame.image.shape),
         edge_shift=shift,
         own=own,
     )
 
 
 def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prior) -> Detections:
-    hidden = hidden_area(frame, setup.mask)
-    image = frame.image if hidden is None else fill_hidden(frame.image, hidden)
+    hidden = make_hidden_mask(frame, setup.mask)
+    image = frame.image if hidden is None else fill_hidden_pixels(frame.image, hidden)
     found = find_corners(Picture(image, hidden, setup, camera), prior)
     seen = found.corners
     shifts = (r.edge_shift for r in seen.values())
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
-        large=_detection("large", seen, frame.fields),
-        small=_detection("small", seen, frame.fields),
+        large=_make_detection("large", seen, frame.fields),
+        small=_make_detection("small", seen, frame.fields),
         mirrored=found.search.mirrored and not seen,
         targets=found.search.targets,
         edge_shift=next((each for each in shifts if each is not None), None),
     )
 
 
-def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
+def _choose_search_mode(empty_frames: int | None, expected: bool, fits_lines: bool) -> SearchMode:
     """Return the kind of search for this frame. After a loss, the kinds alternate."""
     if empty_frames is None:
         return "all"
@@ -373,17 +383,19 @@ def _look(empty_frames: int | None, expected: bool, fits_lines: bool) -> Look:
     return "blurred" if empty_frames and empty_frames % every == 0 else "sharp"
 
 
-def _missing(picture: Picture, seen: _Found, expected: Mapping[MarkerName, Array]) -> bool:
+def _is_marker_missing(
+    picture: Picture, seen: _FoundCorners, expected: Mapping[MarkerName, Array]
+) -> bool:
     return any(
         name not in seen
-        and within(corners, picture.image.shape)
-        and side_lengths_px(corners).min() > _SEARCHED_SIDE_PX
+        and is_inside_picture(corners, picture.image.shape)
+        and side_lengths_px(corners).min() > _MIN_SEARCHED_SIDE_PX
         and not is_hidden(picture.hidden, corners)
         for name, corners in expected.items()
     )
 
 
-def _refine_found(picture: Picture, found: FoundMarkers) -> _Found:
+def _refine_found(picture: Picture, found: FoundMarkers) -> _FoundCorners:
     """Measure the raw corners of a search: by the edge fit, otherwise by subpixel refinement.
     Markers that are not completely in view are measured by the partial-view fit because a search
     takes the picture's edge for a side. The photometric fit follows where edges do not suffice."""
@@ -398,24 +410,26 @@ def _refine_found(picture: Picture, found: FoundMarkers) -> _Found:
         return seen
     fitted, small = dict(seen), seen.get("small")
     for name, r in seen.items():
-        if r.refined and is_wholly_seen(picture, r):
+        if r.refined and is_fully_visible(picture, r):
             continue
         starts = [r.corners_px]
         if name == "large" and not r.refined and small is not None and small.refined:
             starts.insert(0, picture.other_corners(small.corners_px, "large"))
-        known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        tried = (fit_partly_seen(picture, name, start, known_by) for start in starts)
+        identified_by: IdentifiedBy = "other" if len(seen) == 2 else "bits"
+        tried = (fit_partly_visible(picture, name, start, identified_by) for start in starts)
         partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not within(r.corners_px, image.shape, ROOM_PX) or is_hidden(
+        elif not is_inside_picture(r.corners_px, image.shape, PICTURE_MARGIN_PX) or is_hidden(
             picture.hidden, r.corners_px, 1.0
         ):
             del fitted[name]
     return improve_corners(picture, fitted, searched=True)
 
 
-def _detection(name: MarkerName, seen: _Found, fields: PictureKind | None) -> Detection | None:
+def _make_detection(
+    name: MarkerName, seen: _FoundCorners, fields: PictureKind | None
+) -> Detection | None:
     r = seen.get(name)
     if r is None:
         return None
@@ -428,24 +442,24 @@ def _detection(name: MarkerName, seen: _Found, fields: PictureKind | None) -> De
         r.shift_sigma_px,
         cov_px2=r.cov_px2,
         row_sigma_px=r.row_sigma_px,
-        lying_sigma_px=interpolated_sigma_px(r.least_blur_px) if interpolated else 0.0,
+        horizontal_side_sigma_px=interpolated_sigma_px(r.min_blur_px) if interpolated else 0.0,
     )
 
 
 # --- Motion of the markers from picture to picture, and their predicted positions ---
 
 
-_QUARTERS: Array = np.full(4, 0.25)
-_MAX_GAP_S = 0.25  # older motion does not predict positions
+_MEAN_OF_FOUR: Array = np.full(4, 0.25)
+_MAX_FLOW_AGE_S = 0.25  # older motion does not predict positions
 
 
-def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
+def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
     """Return the corners (4, 2) px in `previous`, extrapolated to `t_s` by their flow; may be
     empty."""
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
-    moves = 0.0 < gap_s <= _MAX_GAP_S
+    moves = 0.0 < gap_s <= _MAX_FLOW_AGE_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
         flow = previous.flow_px_s.get(d.marker)
@@ -455,7 +469,7 @@ def predicted_corners(previous: Detections | None, t_s: float) -> dict[MarkerNam
 
 def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
     """Return `now` with the image velocity, px/s, of its markers' corners since `previous`."""
-    if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_GAP_S:
+    if previous is None or not 0.0 < now.t_s - previous.t_s <= _MAX_FLOW_AGE_S:
         return now
     flow: dict[MarkerName, Array] = {}
     for name in MARKERS:
@@ -464,56 +478,62 @@ def add_marker_flow(now: Detections, previous: Detections | None) -> Detections:
             flow[name] = (b.corners_px - a.corners_px) / (now.t_s - previous.t_s)
     if not flow:
         return now
-    mean = _QUARTERS @ next(iter(flow.values()))
+    mean = _MEAN_OF_FOUR @ next(iter(flow.values()))
     return replace(now, flow_px_s=dict.fromkeys(MARKERS, mean) | flow)
 
 
 # --- Photometric fits for markers that the edge fit measured poorly or missed ---
 
 
-_GOOD_CELL_PX = 6.0  # from this size on, lines are as accurate as the drawing, and faster
+_MIN_ACCURATE_CELL_PX = 6.0  # from this size on, lines are as accurate as the drawing, and faster
 # the same limit as a ratio of a cell's width to the blur's standard deviation
-_GOOD_CELL_BLURS = 6.0
-_ALIGN_REACH = 0.3  # share of the side
+_MIN_ACCURATE_CELL_BLURS = 6.0
+_ALIGN_RANGE = 0.3  # share of the side
 # A marker whose position follows from the other one may have a larger standard deviation.
 _MOST_SIGMA_ALONE, _MOST_TRACKED_SIGMA = 0.06, 0.12  # share of the side
-_UNKNOWN_BLUR_PX = 1.5  # initial guess if the blur is unknown
-_ACROSS_PX = 0.37
+_DEFAULT_BLUR_PX = 1.5  # initial guess if the blur is unknown
+_SIDE_BLUR_SIGMA_PX = 0.37
 """Standard deviation that pixels and interpolation add to the blur of sides but not to that of a
 drawing, px."""
-_OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
+_OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
-def lines_suffice(seen: RefinedCorners, pattern: Pattern) -> bool:
+def is_line_fit_sufficient(seen: RefinedCorners, pattern: Pattern) -> bool:
     """True if a marker's edge fit is as accurate as a photometric fit would be: with cells of at
     least 6 px and 6 times the blur."""
     cell_px = mean_side_px(seen.corners_px) / pattern.rim.cells
-    return seen.refined and cell_px >= max(_GOOD_CELL_PX, _GOOD_CELL_BLURS * seen.blur_px)
+    return seen.refined and cell_px >= max(
+        _MIN_ACCURATE_CELL_PX, _MIN_ACCURATE_CELL_BLURS * seen.blur_px
+    )
 
 
-def improve_corners(picture: Picture, seen: _Found, searched: bool = False) -> _Found:
+def improve_corners(picture: Picture, seen: _FoundCorners, searched: bool = False) -> _FoundCorners:
     """Return the `seen` markers, with a photometric fit of those whose edges do not suffice, and
     any other visible marker derived from the first. If `searched`, a single marker is dropped
     unless its edges suffice or the drawing confirms it."""
     image, patterns, better = picture.image, picture.setup.patterns, dict(seen)
     if "small" in better and "large" not in better:
-        large = large_around(picture, better["small"])
+        large = find_large_around(picture, better["small"])
         if large is not None:
             better["large"] = large
     for name in MARKERS:
-        start = _start(picture, name, better)
-        if start is None or not within(start, image.shape) or is_hidden(picture.hidden, start):
+        start = _initial_corners(picture, name, better)
+        if (
+            start is None
+            or not is_inside_picture(start, image.shape)
+            or is_hidden(picture.hidden, start)
+        ):
             continue
-        alone = _OTHER[name] not in better
+        alone = _OTHER_MARKER[name] not in better
         max_sigma = _MOST_SIGMA_ALONE if alone else _MOST_TRACKED_SIGMA
         blur_px = _blur_px(better.get(name))
-        exact = align_marker(picture, name, start, _ALIGN_REACH, blur_px, max_sigma, alone)
+        exact = align_marker(picture, name, start, _ALIGN_RANGE, blur_px, max_sigma, alone)
         if exact is not None:
             better[name] = exact
         elif alone and searched:
             better.pop(name, None)
-        elif name not in better and fits_pattern(image, start, patterns[name]):
-            better[name] = RefinedCorners(start, NESTED_SIGMA_PX, False)
+        elif name not in better and is_correlated_with_pattern(image, start, patterns[name]):
+            better[name] = RefinedCorners(start, DERIVED_CORNER_SIGMA_PX, False)
     return better
 
 
@@ -521,17 +541,17 @@ def _blur_px(seen: RefinedCorners | None) -> float:
     """Return the first guess of the blur's standard deviation, px: that of the sides if lines were
     fitted."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
-        return _UNKNOWN_BLUR_PX
-    return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _UNKNOWN_BLUR_PX)
+        return _DEFAULT_BLUR_PX
+    return min(math.sqrt(max(seen.blur_px**2 - _SIDE_BLUR_SIGMA_PX**2, 0.0)), _DEFAULT_BLUR_PX)
 
 
-def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
-    this, other = seen.get(name), seen.get(_OTHER[name])
+def _initial_corners(picture: Picture, name: MarkerName, seen: _FoundCorners) -> Array | None:
+    this, other = seen.get(name), seen.get(_OTHER_MARKER[name])
     if this is not None:
         if this.cov_px2 is not None:
             return None  # an obstacle in front of the marker would spoil the drawing, too
         # Small cells matter only if no larger ones were measured.
-        enough = lines_suffice(this, picture.setup.patterns[name])
+        enough = is_line_fit_sufficient(this, picture.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px
     if name == "small" and other is not None and other.refined:
@@ -542,13 +562,13 @@ def _start(picture: Picture, name: MarkerName, seen: _Found) -> Array | None:
 # --- Markers at their expected positions: no search, only verification ---
 
 
-_LEAST_LINE_CELL_PX = 2.5  # least cell size for line fits
-_ANCHOR = 0.12  # share of the small marker's side
+_MIN_LINE_CELL_PX = 2.5  # least cell size for line fits
+_MAX_CENTRE_OFFSET = 0.12  # share of the small marker's side
 
 
 def fit_lines(
     picture: Picture, places: Mapping[MarkerName, Array], shift: EdgeShift | None = None
-) -> _Found:
+) -> _FoundCorners:
     """Return the markers near corners `places` (4, 2) px whose four sides are straight edges, by
     `refine_lines`: all at once because they share the shift of all edges. The cells are not
     examined. `shift` None measures the shift of all edges."""
@@ -560,9 +580,9 @@ def fit_lines(
     return {name: found for name, found in zip(places, fitted, strict=True) if found is not None}
 
 
-def follow_markers(
+def refine_expected_markers(
     picture: Picture, expected: Mapping[MarkerName, Array], shift: EdgeShift | None = None
-) -> _Found:
+) -> _FoundCorners:
     """Return the expected markers, corners (4, 2) px, whose sides and cells the picture confirms,
     measured by edge fits. Markers beyond the reach of the profiles (0.85 cells, at most 7 px), cut
     or hidden markers, and markers with cells below 2.5 px are omitted."""
@@ -571,23 +591,25 @@ def follow_markers(
         name: expected[name]
         for name in MARKERS
         if name in expected
-        and within(expected[name], image.shape, ROOM_PX)
-        and side_lengths_px(expected[name]).min() > _LEAST_LINE_CELL_PX * patterns[name].rim.cells
+        and is_inside_picture(expected[name], image.shape, PICTURE_MARGIN_PX)
+        and side_lengths_px(expected[name]).min() > _MIN_LINE_CELL_PX * patterns[name].rim.cells
     }
     return {
         name: found
         for name, found in fit_lines(picture, places, shift).items()
-        if is_wholly_seen(picture, found) and cells_agree(image, found.corners_px, patterns[name])
+        if is_fully_visible(picture, found)
+        and has_matching_cells(image, found.corners_px, patterns[name])
     }
 
 
 def add_partly_visible(
     picture: Picture,
     expected: Mapping[MarkerName, Array],
-    seen: _Found,
+    seen: _FoundCorners,
     shift: EdgeShift | None = None,
-) -> _Found:
-    """Return the `seen` markers of `follow_markers` plus those fitted to their visible part.
+) -> _FoundCorners:
+    """Return the `seen` markers of `refine_expected_markers` plus those fitted to their visible
+    part.
 
     If the small marker was seen, the large one is expected around it.
     """
@@ -596,21 +618,21 @@ def add_partly_visible(
         places["large"] = picture.other_corners(seen["small"].corners_px, "large")
     for name in MARKERS:
         if name in places and name not in seen:
-            partly = fit_partly_seen(picture, name, places[name], "track", shift)
+            partly = fit_partly_visible(picture, name, places[name], "track", shift)
             if partly is not None:
                 seen[name] = partly
     if "large" in seen and "small" not in seen:
         # Too small for lines, but its position follows from the large marker: a similar pattern is
         # enough.
         small_px = picture.other_corners(seen["large"].corners_px, "small")
-        if mean_side_px(small_px) > LEAST_SIDE_PX and fits_pattern(
+        if mean_side_px(small_px) > MIN_MARKER_SIDE_PX and is_correlated_with_pattern(
             picture.image, small_px, picture.setup.patterns["small"]
         ):
-            seen["small"] = RefinedCorners(small_px, NESTED_SIGMA_PX, False)
+            seen["small"] = RefinedCorners(small_px, DERIVED_CORNER_SIGMA_PX, False)
     return seen
 
 
-def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
+def find_large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | None:
     """Return the large marker around a detected small one; the large one may be partly covered or
     cut. None if the picture does not confirm it."""
     image, pattern = picture.image, picture.setup.patterns["large"]
@@ -621,29 +643,29 @@ def large_around(picture: Picture, small: RefinedCorners) -> RefinedCorners | No
     def is_centred(large: RefinedCorners) -> bool:
         centre = picture.other_corners(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
-        return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+        return off_px <= max(_MAX_CENTRE_OFFSET * mean_side_px(small.corners_px), 1.0)
 
-    if within(start, image.shape, ROOM_PX):
+    if is_inside_picture(start, image.shape, PICTURE_MARGIN_PX):
         # A small marker yields a rough position only, so the fit is repeated from the first result.
         found = fit_lines(picture, {"large": start}).get("large")
         if found is not None:
             found = fit_lines(picture, {"large": found.corners_px}).get("large")
         if found is not None:
             start = found.corners_px
-            good = is_wholly_seen(picture, found) and is_centred(found)
-            if good and cells_mostly_agree(image, start, pattern):
+            good = is_fully_visible(picture, found) and is_centred(found)
+            if good and has_mostly_matching_cells(image, start, pattern):
                 return found
-    partly = fit_partly_seen(picture, "large", start, "other")
+    partly = fit_partly_visible(picture, "large", start, "other")
     return partly if partly and is_centred(partly) else None
 
 
 # --- Mean of the markers in two fields, at the time half way between them ---
 
 
-_MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
+_MAX_FIELD_MOTION_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 
 
-def mean_of_fields(first: Detections, second: Detections) -> Detections:
+def average_fields(first: Detections, second: Detections) -> Detections:
     """Return the mean of both fields' corners, valid for either order of the fields. If one marker
     is in both fields, a marker in only one field is omitted."""
     both: dict[MarkerName, Detection] = {}
@@ -652,15 +674,15 @@ def mean_of_fields(first: Detections, second: Detections) -> Detections:
         if one is None or other is None:
             continue
         way_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
-        if float(np.linalg.norm(way_px)) < _MOST_SIDES * mean_side_px(one.corners_px):
-            both[name] = _middle(one, other)
+        if float(np.linalg.norm(way_px)) < _MAX_FIELD_MOTION_SIDES * mean_side_px(one.corners_px):
+            both[name] = _average_detections(one, other)
     if not both:
         alone = first if first.markers else second
         return replace(alone, mirrored=alone.mirrored or second.mirrored)
     return replace(first, large=both.get("large"), small=both.get("small"), mirrored=False)
 
 
-def _middle(a: Detection, b: Detection) -> Detection:
+def _average_detections(a: Detection, b: Detection) -> Detection:
 
     def half(one: float, other: float) -> float:
         return float(((one**2 + other**2) / 4.0) ** 0.5)
@@ -677,5 +699,5 @@ def _middle(a: Detection, b: Detection) -> Detection:
         max(a.shift_sigma_px, b.shift_sigma_px),
         cov_px2=cov_px2,
         row_sigma_px=half(a.row_sigma_px, b.row_sigma_px),
-        lying_sigma_px=half(a.lying_sigma_px, b.lying_sigma_px),
+        horizontal_side_sigma_px=half(a.horizontal_side_sigma_px, b.horizontal_side_sigma_px),
     )

@@ -22,7 +22,8 @@ from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
 """Index of the mirror image in a marker's dictionary."""
-_PRINT_M = 1e-6  # error of an edge: the errors of its hundreds of printed dots average out
+# error of an edge: the errors of its hundreds of printed dots average out
+_PRINT_EDGE_SIGMA_M = 1e-6
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, at 640 px
 _LOOSE_PERIMETER_RATE = 0.05
 _LOOSE_ACCURACY_RATE = 0.1
@@ -40,7 +41,7 @@ _LOOSE_THRESHOLDS: Thresholds = (15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """Constants of `detect_markers`, made by `make_aruco_detector`.
+    """Constants of `detect_markers`, made by `make_detector_setup`.
 
     `dictionaries` are those of the large and the small marker; `ratio` is the small side over the
     large side; `mask` marks the pixels covered by the vehicle. Without `fits_lines`, markers are
@@ -51,27 +52,31 @@ class DetectorSetup:
     patterns: dict[MarkerName, Pattern]
     ratio: float
     fits_lines: bool
-    mask: Covered | None = None
+    mask: HiddenMask | None = None
 
 
-def make_aruco_detector(
-    config: DetectorConfig, target: TargetConfig, mask: Covered | None = None
+def make_detector_setup(
+    config: DetectorConfig, target: TargetConfig, mask: HiddenMask | None = None
 ) -> DetectorSetup:
     """Return the setup for a target, with dictionaries that contain only its markers' ids."""
-    large_bits, small_bits = _bits(target.large), _bits(target.small)
+    large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
         dictionaries=(
-            _dictionary(large_bits, config.correction_bits_large),
-            _dictionary(small_bits, config.correction_bits_small),
+            _make_dictionary(large_bits, config.correction_bits_large),
+            _make_dictionary(small_bits, config.correction_bits_small),
         ),
         patterns={
             "large": make_pattern(
-                make_rim(large_bits, _PRINT_M * (len(large_bits) + 2) / target.large.side_m),
+                make_rim(
+                    large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
+                ),
                 make_drawing(large_bits, small_bits, ratio),
             ),
             "small": make_pattern(
-                make_rim(small_bits, _PRINT_M * (len(small_bits) + 2) / target.small.side_m),
+                make_rim(
+                    small_bits, _PRINT_EDGE_SIGMA_M * (len(small_bits) + 2) / target.small.side_m
+                ),
                 make_drawing(small_bits),
             ),
         },
@@ -81,7 +86,7 @@ def make_aruco_detector(
     )
 
 
-def make_marker_decoder(
+def make_aruco_detector(
     setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds
 ) -> Any:
     """Return OpenCV's marker detector for pictures of the size (width, height)."""
@@ -94,7 +99,7 @@ def make_marker_decoder(
     return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
 
 
-def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
+def make_quad_detector(setup: DetectorSetup) -> Any:
     """Return OpenCV's marker detector, configured to accept nearly any quadrilateral."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
@@ -106,14 +111,14 @@ def make_quadrilateral_finder(setup: DetectorSetup) -> Any:
     return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
 
 
-def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
+def _marker_bits(marker: MarkerConfig) -> NDArray[np.uint8]:
     """Return the inner bits (n, n) of the profile's marker, 1 = white."""
     source = aruco_dictionary(marker.dictionary)
     rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 
 
-def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
+def _make_dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
     distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
     if distance > 2 * correction_bits + 1:
@@ -129,25 +134,25 @@ def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
 # connects the gear to a marker's border; no side or cell is measured there.
 
 
-Covered = NDArray[np.bool_]
-WITH_WHITE = 1.25
+HiddenMask = NDArray[np.bool_]
+WHITE_BORDER_HALF_SIDES = 1.25
 """Half sides from a marker's centre within which any object disturbs the measurement of its
 sides."""
-_FIELD_ROWS = 7  # rows of a field's picture to which a covered row contributes
+_MASK_SPREAD_ROWS = 7  # rows of a field's picture to which a covered row contributes
 # reduction factor, and standard deviation of the fill in the reduced picture
 _REDUCED, _SPREAD = 8, 2.0
-_TINY = 1e-4
+_MIN_FILL_WEIGHT = 1e-4
 
 
-def hidden_area(frame: Frame, mask: Covered | None) -> Covered | None:
+def make_hidden_mask(frame: Frame, mask: HiddenMask | None) -> HiddenMask | None:
     """Return the mask (h, w) of the vehicle in a frame; widened for a single field because the
     missing rows are interpolated."""
     if mask is None or frame.fields not in ("top", "bottom"):
         return mask
-    return cv2.dilate(mask.astype(np.uint8), np.ones((_FIELD_ROWS, 1), np.uint8)) > 0
+    return cv2.dilate(mask.astype(np.uint8), np.ones((_MASK_SPREAD_ROWS, 1), np.uint8)) > 0
 
 
-def fill_hidden(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
+def fill_hidden_pixels(image: NDArray[np.uint8], hidden: HiddenMask) -> NDArray[np.uint8]:
     """Return the picture with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
@@ -158,12 +163,14 @@ def fill_hidden(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
         return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _SPREAD), np.float32)
 
     mean = cv2.mean(image, (~hidden).astype(np.uint8))[0]
-    grey = (around(image * free) + _TINY * mean) / (around(free) + _TINY)
+    grey = (around(image * free) + _MIN_FILL_WEIGHT * mean) / (around(free) + _MIN_FILL_WEIGHT)
     smooth = cv2.resize(grey, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.where(hidden, np.rint(smooth).astype(np.uint8), image)
 
 
-def is_hidden(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
+def is_hidden(
+    hidden: HiddenMask | None, corners_px: Array, reach: float = WHITE_BORDER_HALF_SIDES
+) -> bool:
     """True if any pixel up to `reach` half sides from the marker's centre is hidden."""
     if hidden is None:
         return False
@@ -188,7 +195,7 @@ class Picture:
     pixels where the vehicle covers the view."""
 
     image: NDArray[np.uint8]
-    hidden: Covered | None
+    hidden: HiddenMask | None
     setup: DetectorSetup
     camera: CameraModel
 

@@ -42,14 +42,14 @@ from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import (
     BEFORE,
     NEXT,
-    OUT,
-    UNIT,
+    OUTWARD_NORMALS,
+    UNIT_SQUARE,
     RefinedCorners,
     apply_homography,
-    doubled_area,
-    homography_from_unit,
-    homography_to_unit,
+    homography_from_unit_square,
+    homography_to_unit_square,
     side_lengths_px,
+    signed_double_area,
 )
 from perchctl.vision.markers.pattern import Rim
 from perchctl.vision.types import CameraModel, EdgeShift
@@ -57,32 +57,38 @@ from perchctl.vision.types import CameraModel, EdgeShift
 # --- Grey profiles across the sides of markers ---
 
 
-PROFILES = 24  # number across each side
-STEPS = 16  # gradient samples per profile
+PROFILES_PER_SIDE = 24  # number across each side
+SAMPLES_PER_PROFILE = 16  # gradient samples per profile
 Floats = NDArray[np.float32]
 
-ALONG: Array = np.linspace(-1.0, 1.0, PROFILES)  # positions along a side, between its margins
-_OFFSETS: Floats = np.linspace(-1.0, 1.0, STEPS + 1).astype(np.float32)
-_ALONG_PROFILE: Floats = np.stack([np.ones_like(_OFFSETS), _OFFSETS])
-MIDDLES: Floats = (_OFFSETS[1:] + _OFFSETS[:-1]) * np.float32(0.5)  # positions of the gradients
+SIDE_POSITIONS: Array = np.linspace(
+    -1.0, 1.0, PROFILES_PER_SIDE
+)  # positions along a side, between its margins
+_PROFILE_OFFSETS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(np.float32)
+_PROFILE_BASIS: Floats = np.stack([np.ones_like(_PROFILE_OFFSETS), _PROFILE_OFFSETS])
+GRADIENT_POSITIONS: Floats = (_PROFILE_OFFSETS[1:] + _PROFILE_OFFSETS[:-1]) * np.float32(
+    0.5
+)  # positions of the gradients
 # Values and slopes at the profiles from a polynomial through the nodes.
-_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
-_INVERSE: Array = np.linalg.inv(_NODES[:, None] ** np.arange(5.0))
-_VALUES: Array = (ALONG[:, None] ** np.arange(5)) @ _INVERSE
-_SLOPES: Array = (np.arange(1, 5) * ALONG[:, None] ** np.arange(4)) @ _INVERSE[1:]
+_SIDE_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
+_INVERSE_VANDERMONDE: Array = np.linalg.inv(_SIDE_NODES[:, None] ** np.arange(5.0))
+_NODES_TO_VALUES: Array = (SIDE_POSITIONS[:, None] ** np.arange(5)) @ _INVERSE_VANDERMONDE
+_NODES_TO_SLOPES: Array = (
+    np.arange(1, 5) * SIDE_POSITIONS[:, None] ** np.arange(4)
+) @ _INVERSE_VANDERMONDE[1:]
 
 
-_TO_THE_LEFT = np.array(-1j)
+_ROTATE_90_LEFT = np.array(-1j)
 
 
-def profile_places(lengths_px: Array) -> Array:
+def profile_positions(lengths_px: Array) -> Array:
     """Return the positions of the profiles along sides of `lengths_px` (rows,), as shares (rows, n)
     of a side. They keep away from the corners, where the next side blurs the edge."""
     margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
-    return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
+    return np.asarray(margin + (0.5 - margin) * (1.0 + SIDE_POSITIONS))
 
 
-def side_profiles(
+def make_side_profiles(
     starts: Array, ends: Array, shares: Array, camera: CameraModel
 ) -> tuple[Array, Array]:
     """Return the points where profiles cross the sides, px, and the unit normals there, to the left
@@ -90,17 +96,17 @@ def side_profiles(
     corners): each (rows, n, 2).
 
     `starts`, `ends` (rows, 2) are the normalised ends of the sides; `shares` (rows, n) come from
-    `profile_places`. The image of a side through the lens is smooth, so a few nodes define all of
-    it.
+    `profile_positions`. The image of a side through the lens is smooth, so a few nodes define all
+    of it.
     """
     first, last = shares[:, :1], shares[:, -1:]
-    at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODES)[..., None]
+    at = (0.5 * (first + last) + (0.5 * (last - first)) * _SIDE_NODES)[..., None]
     points = starts[:, None] + at * (ends - starts)[:, None]
     nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
-    origin = np.matmul(_VALUES, nodes)
+    origin = np.matmul(_NODES_TO_VALUES, nodes)
     # As complex numbers x + iy, a quarter turn is a single product.
-    tangent = np.matmul(_SLOPES, nodes).view(np.complex128)
-    normal = tangent * (_TO_THE_LEFT / np.maximum(np.abs(tangent), 1e-12))
+    tangent = np.matmul(_NODES_TO_SLOPES, nodes).view(np.complex128)
+    normal = tangent * (_ROTATE_90_LEFT / np.maximum(np.abs(tangent), 1e-12))
     return origin, normal.view(np.float64)
 
 
@@ -127,9 +133,9 @@ def sample_profiles(
     np.subtract(origin[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
     np.multiply(normal[..., 0], half_px[:, None], out=lines[0, ..., 1], casting="same_kind")
     np.multiply(normal[..., 1], half_px[:, None], out=lines[1, ..., 1], casting="same_kind")
-    x, y = (lines.reshape(-1, 2) @ _ALONG_PROFILE).reshape(2, rows, n * (STEPS + 1))
+    x, y = (lines.reshape(-1, 2) @ _PROFILE_BASIS).reshape(2, rows, n * (SAMPLES_PER_PROFILE + 1))
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
+    return np.asarray(grey, dtype=np.float32).reshape(rows, n, SAMPLES_PER_PROFILE + 1)
 
 
 # --- Lines fitted to a marker's sides, and their intersections ---
@@ -140,30 +146,32 @@ MIN_LINE_SIGMA_PX = 0.015
 
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
-_MIN_INLIERS = 0.5
-_LINE_TAILS = 1.7  # compensates the reduction of squared residuals and samples by the weights
+_MIN_INLIER_FRACTION = 0.5
+# compensates the reduction of squared residuals and samples by the weights
+_LINE_VARIANCE_FACTOR = 1.7
 _BEND, _BEND_BLURS = 0.6, 2.0  # bend of an edge by the next one, a cell away, in units of blur
-_CURVED_REACH = 0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
+_BLUR_ERROR_PER_PX2 = 0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
 CLIPPED_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
-CLIPPED_SHARE = 0.05  # share of the profiles
+CLIPPED_FRACTION = 0.05  # share of the profiles
 _WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off a wide edge that is not central
-_NEAR_END_PX = 4.0  # of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
-_LEAST_ROWS = 2.0  # ratio of variances of the sides that shows jittering rows
-_LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1) required to distinguish them
+# of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
+_MAX_EDGE_OFFSET_PX = 4.0
+_MIN_ROW_JITTER_RATIO = 2.0  # ratio of variances of the sides that shows jittering rows
+_MIN_SLANT_VARIANCE = 0.05  # variance of the sides' slants (0 to 1) required to distinguish them
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
-_SHIFT_FLOOR_PX = 0.01
+_MIN_SHIFT_SIGMA_PX = 0.01
 _MAX_SHIFT_PX = 1.0
 _MAX_EDGE_BLUR_CELLS = 0.45  # beyond it, the two edges of a border merge
-_MIN_PROFILES = 3.0  # total weight required of a side
+_MIN_SIDE_WEIGHT = 3.0  # total weight required of a side
 _SHIFT_PRIOR_PX = 0.15  # standard deviation due to glare and gamma
 _CLIPPED_PRIOR_PX = 0.4  # standard deviation due to clipping
 CLIPPED_GREY = 248.0
 """Grey level above which white counts as clipped."""
-_ONES: Array = np.ones(PROFILES)
-_ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
-_QUARTERS: Array = np.full(4, 0.25)
-_PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
-_BOWED = 3.0  # standard deviations
+_ONES: Array = np.ones(PROFILES_PER_SIDE)
+_ONES32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
+_MEAN_OF_FOUR: Array = np.full(4, 0.25)
+_PARABOLA: Array = SIDE_POSITIONS**2 - (SIDE_POSITIONS**2).mean()
+_MIN_BOW_SIGMAS = 3.0  # standard deviations
 
 
 def refine_lines(
@@ -178,21 +186,21 @@ def refine_lines(
     The shift of all edges is measured unless it is `known`. A marker with wide edges, or with edges
     near the ends of the profiles, is fitted again with the profiles centred on its edges.
     """
-    found = _refined_once(image, raw_px, rims, camera, known)
+    found = _refine_lines_once(image, raw_px, rims, camera, known)
     centred = raw_px.copy()
     for i, each in enumerate(found):
         if each is None:
             continue
         off_px = float(np.abs(each.corners_px - raw_px[i]).max())
-        if off_px > (_CENTRED_PX if each.blur_px > _WIDE_BLUR_PX else _NEAR_END_PX):
+        if off_px > (_CENTRED_PX if each.blur_px > _WIDE_BLUR_PX else _MAX_EDGE_OFFSET_PX):
             centred[i] = each.corners_px
     if (centred == raw_px).all():
         return found
-    again = _refined_once(image, centred, rims, camera, known)
+    again = _refine_lines_once(image, centred, rims, camera, known)
     return [second or first for first, second in zip(found, again, strict=True)]
 
 
-def _refined_once(
+def _refine_lines_once(
     image: NDArray[np.uint8],
     raw_px: Array,
     rims: Sequence[Rim],
@@ -200,15 +208,15 @@ def _refined_once(
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
     found: list[RefinedCorners | None] = [None] * len(raw_px)
-    markers = prepare_markers(raw_px, rims, camera)
+    markers = prepare_marker_sides(raw_px, rims, camera)
     if markers is None:
         return found
     sides, inner = measure_edges(image, markers, camera, with_inner=known is None)
-    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES
-    clipped = glaring.reshape(-1, 4) @ _QUARTERS > CLIPPED_SHARE
+    glaring = np.count_nonzero(sides.grey[:, :, -1] > CLIPPED_GREY, axis=1) / PROFILES_PER_SIDE
+    clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR > CLIPPED_FRACTION
     if known is not None and clipped.any():
         # The edge shift due to clipping changes with the light.
-        return _refined_once(image, raw_px, rims, camera, None)
+        return _refine_lines_once(image, raw_px, rims, camera, None)
     lines, residual_px = _fit_lines(markers, sides)
     shift = known
     if shift is None:
@@ -219,15 +227,15 @@ def _refined_once(
     applied = shift or EdgeShift(0.0, shift_prior_px(float(sides.grey[:, :, -1].mean())))
     if applied.shift_px != 0.0:
         lines = lines.copy()
-        lines[:, 2] += _outwards(markers, lines) * (applied.shift_px / markers.px_per_unit)
+        lines[:, 2] += _outward_signs(markers, lines) * (applied.shift_px / markers.px_per_unit)
     corners = _intersect(lines)
     if not is_finite(corners):
         return found
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
-    accepted = _accepted(markers, sides, residual_px, corners_px)
+    accepted = _is_accepted(markers, sides, residual_px, corners_px)
     # A line fitted to n samples has twice the standard deviation at its ends as in its middle.
     independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
-    ends_px2 = (4.0 * _LINE_TAILS * residual_px * residual_px / independent).tolist()
+    ends_px2 = (4.0 * _LINE_VARIANCE_FACTOR * residual_px * residual_px / independent).tolist()
     blurs_px, normals_x = sides.blur_px.tolist(), lines[:, 0].tolist()
     for i, rim in enumerate(rims):
         if not accepted[i]:
@@ -237,18 +245,20 @@ def _refined_once(
         cell_px, blur_px = float(markers.cell_px[i]), sum(blurs) / 4.0
         found[i] = RefinedCorners(
             corners_px=corners_px[i],
-            sigma_px=_sigma_px(cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.tolerance),
+            sigma_px=_corner_sigma_px(
+                cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.tolerance
+            ),
             refined=True,
             shift_sigma_px=applied.sigma_px,
             blur_px=max(blurs),
             edge_shift=shift,
-            row_sigma_px=_row_px(normals_x[four], ends),
-            least_blur_px=min(blurs),
+            row_sigma_px=_row_jitter_sigma_px(normals_x[four], ends),
+            min_blur_px=min(blurs),
         )
     return found
 
 
-def _fit_lines(markers: Sides, sides: EdgeData) -> tuple[Array, Array]:
+def _fit_lines(markers: MarkerSides, sides: EdgeData) -> tuple[Array, Array]:
     """Return the normalised lines (4m, 3): nx, ny, c with n.x = c and |n| = 1; and the weighted RMS
     distance of the points from them, px (4m,)."""
     w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
@@ -285,7 +295,7 @@ def shift_prior_px(white_grey: float) -> float:
 
 
 def _measure_edge_shift(
-    markers: Sides,
+    markers: MarkerSides,
     sides: EdgeData,
     inner: EdgeData | None,
     lines: Array,
@@ -303,13 +313,13 @@ def _measure_edge_shift(
     k, prior_px = markers.widest, shift_prior_px(float(sides.grey[:, :, -1].mean()))
     rim, depth_px, cell_px = markers.rims[k], markers.depth_px[k], float(markers.cell_px[k])
     r = 1.0 - 2.0 / rim.cells
-    own = apply_homography(homography_to_unit(corners[k]), inner.points)
-    far = np.matmul(own, OUT[:, :, None])[..., 0] - r
+    own = apply_homography(homography_to_unit_square(corners[k]), inner.points)
+    far = np.matmul(own, OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
     w = inner.weight * (inner.blur_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
     w *= np.abs(far_px) < _MAX_SHIFT_PX
     mass = w.sum(axis=1)
-    some = mass > _MIN_PROFILES
+    some = mass > _MIN_SIDE_WEIGHT
     if not some.any():
         return EdgeShift(0.0, prior_px)
     # A curled sheet moves outer edges further than inner ones, and ends further than middles.
@@ -318,11 +328,11 @@ def _measure_edge_shift(
     share = w / np.maximum(mass, 1e-9)[:, None]
     mean = (share * far_px).sum(axis=1)
     scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
-    least = _SHIFT_FLOOR_PX**2 + bent_px**2
+    least = _MIN_SHIFT_SIGMA_PX**2 + bent_px**2
     information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
-    # Sides that disagree reduce the weight.
+    # MarkerSides that disagree reduce the weight.
     chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
@@ -334,47 +344,47 @@ def _measure_edge_shift(
     )
 
 
-def _bow_px(markers: Sides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
+def _bow_px(markers: MarkerSides, sides: EdgeData, lines: Array, residual_px: Array) -> float:
     """Return how far the ends of the widest marker's sides are further out than their middles,
     beyond the noise; 0 if noise explains it."""
     four = slice(4 * markers.widest, 4 * markers.widest + 4)
     away = np.matmul(sides.points[four], lines[four, :2, None])[..., 0] - lines[four, 2:]
-    scale = _outwards(markers, lines)[four] * markers.px_per_unit[four]
+    scale = _outward_signs(markers, lines)[four] * markers.px_per_unit[four]
     mass = np.maximum(sides.weight[four] @ (_PARABOLA * _PARABOLA), 1e-9)
     bow_px = scale * ((sides.weight[four] * away) @ _PARABOLA) / mass
-    mean_px = float(bow_px @ _QUARTERS)
+    mean_px = float(bow_px @ _MEAN_OF_FOUR)
     noise_px = 0.25 * math.sqrt(float((residual_px[four] ** 2 / mass).sum()))
-    return mean_px if abs(mean_px) > _BOWED * noise_px else 0.0
+    return mean_px if abs(mean_px) > _MIN_BOW_SIGMAS * noise_px else 0.0
 
 
-def _outwards(markers: Sides, lines: Array) -> Array:
+def _outward_signs(markers: MarkerSides, lines: Array) -> Array:
     """Return +1 if a line's normal points out of its marker, else -1, (4m,)."""
     corners = markers.corners
-    out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
+    out = (corners - (_MEAN_OF_FOUR @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1]))
 
 
-def _accepted(
-    markers: Sides, sides: EdgeData, residual_px: Array, corners_px: Array
+def _is_accepted(
+    markers: MarkerSides, sides: EdgeData, residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(sides.weight > 0.0, axis=1)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
-    lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIERS * PROFILES)
-    lines &= (contrast > _MIN_CONTRAST * PROFILES) & (sides.blur_px < 0.9 * sides.near_px)
+    lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE)
+    lines &= (contrast > _MIN_CONTRAST * PROFILES_PER_SIDE) & (sides.blur_px < 0.9 * sides.near_px)
     way = corners_px - markers.raw_px
     moved_px = np.hypot(way[..., 0], way[..., 1]).max(axis=1)
     good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
     return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px)))
 
 
-def _sigma_px(
+def _corner_sigma_px(
     cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
 ) -> float:
     blur_px = max(blur_px, 1e-3)
     # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
     bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
-    reach_px = _CURVED_REACH * blur_px**3
+    reach_px = _BLUR_ERROR_PER_PX2 * blur_px**3
     clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
     # Printed edges deviate from their nominal positions.
     print_px = tolerance * cell_px
@@ -382,18 +392,18 @@ def _sigma_px(
     return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
-def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
+def _row_jitter_sigma_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
     """Return the standard deviation of corners due to jittering rows, which affects upright sides
     only."""
     upright = [x * x for x in normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
-    if aspect <= _LEAST_ASPECT:
+    if aspect <= _MIN_SLANT_VARIANCE:
         return 0.0
     both = zip(ends_px2, upright, strict=True)
     slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
     still = sum(ends_px2) / 4.0 - slope * mean
-    return math.sqrt(slope) if slope > (_LEAST_ROWS - 1.0) * max(still, 0.0) else 0.0
+    return math.sqrt(slope) if slope > (_MIN_ROW_JITTER_RATIO - 1.0) * max(still, 0.0) else 0.0
 
 
 # --- Measurement of the markers' sides: position of the edge on profiles across each side ---
@@ -401,16 +411,16 @@ def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
 
 
 _MIN_SHIFT_CELL_PX = 6.0  # cell of a border whose inner edge is measured too
-_SIDES = np.arange(4)[:, None]
+_SIDE_INDICES = np.arange(4)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class Sides:
-    """Sides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; `rims`, the cells
-    next to each marker's border; the side lengths `sides_px` and the depths of the cells behind
-    them `depth_px` (m, 4); mean cell width `cell_px` (m,); index of the marker with the `widest`
-    cells; `winding` of the corners, +1 or -1 (m,); and pixels per normalised unit along each side
-    `px_per_unit` (4m,)."""
+class MarkerSides:
+    """MarkerSides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; `rims`, the
+    cells next to each marker's border; the side lengths `sides_px` and the depths of the cells
+    behind them `depth_px` (m, 4); mean cell width `cell_px` (m,); index of the marker with the
+    `widest` cells; `winding` of the corners, +1 or -1 (m,); and pixels per normalised unit along
+    each side `px_per_unit` (4m,)."""
 
     raw_px: Array
     rims: Sequence[Rim]
@@ -435,20 +445,22 @@ class EdgeData:
     blur_px: Array
 
 
-def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Sides | None:
+def prepare_marker_sides(
+    raw_px: Array, rims: Sequence[Rim], camera: CameraModel
+) -> MarkerSides | None:
     """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
     quadrilateral."""
     sides_px = side_lengths_px(raw_px)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
-    turn = np.sign(doubled_area(raw_px))
+    turn = np.sign(signed_double_area(raw_px))
     is_square = turn.all() and sides_px.min() > 1e-6
     if not (is_square and is_finite(corners)):
         return None
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
-    cell_px = sides_px @ _QUARTERS / cells
-    return Sides(
+    cell_px = sides_px @ _MEAN_OF_FOUR / cells
+    return MarkerSides(
         raw_px=raw_px,
         rims=rims,
         corners=corners,
@@ -463,7 +475,7 @@ def prepare_markers(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> 
 
 
 def measure_edges(
-    image: NDArray[np.uint8], markers: Sides, camera: CameraModel, with_inner: bool
+    image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner: bool
 ) -> tuple[EdgeData, EdgeData | None]:
     """Return the edges of all sides (4m rows), and the inner edges (4 rows) of the black border of
     marker `markers.widest`; None without `with_inner`, or if the marker's cells are too narrow."""
@@ -474,7 +486,9 @@ def measure_edges(
     with_inner = with_inner and float(markers.cell_px[widest]) > _MIN_SHIFT_CELL_PX
     if with_inner:
         r = 1.0 - 2.0 / rim.cells
-        inner = apply_homography(homography_from_unit(markers.corners[widest]), r * UNIT)[None]
+        inner = apply_homography(
+            homography_from_unit_square(markers.corners[widest]), r * UNIT_SQUARE
+        )[None]
         starts = np.concatenate([starts, inner])
         lengths_px = np.concatenate([lengths_px, r * lengths_px[widest : widest + 1]])
         depth_px = np.concatenate([depth_px, depth_px[widest : widest + 1]])
@@ -483,16 +497,16 @@ def measure_edges(
     sign = markers.winding[of]
     if with_inner:
         sign[-4:] *= -1.0
-    s = profile_places(lengths_px.ravel())
+    s = profile_positions(lengths_px.ravel())
     ends = starts.take(NEXT, axis=1).reshape(-1, 2)
-    origin, normal = side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
-    near_px, half_px = (each[of] for each in profile_reaches_px(markers.cell_px))
+    near_px, half_px = (each[of] for each in profile_half_lengths_px(markers.cell_px))
     grey = sample_profiles(image, origin, normal, half_px)
-    around = neighbour_edges(s, markers.rims, rim, depth_px.ravel())
+    around = find_neighbour_edges(s, markers.rims, rim, depth_px.ravel())
     offset_px, weight, blur_px = locate_edges(grey, half_px, near_px, around)
     points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
-    points = points.reshape(-1, PROFILES, 2)
+    points = points.reshape(-1, PROFILES_PER_SIDE, 2)
     points = points if is_finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_px)
     sides, inner_edges = (
@@ -502,14 +516,14 @@ def measure_edges(
     return sides, inner_edges if with_inner else None
 
 
-def profile_reaches_px(cell_px: Array) -> tuple[Array, Array]:
+def profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
     """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
     size."""
     near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
     return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
-def neighbour_edges(
+def find_neighbour_edges(
     shares: Array, rims: Sequence[Rim], inner_rim: Rim, cell_depth_px: Array
 ) -> NeighbourEdges:
     """Return the neighbours of the edges at `shares` (rows, n) of sides: four rows per rim, then,
@@ -519,12 +533,12 @@ def neighbour_edges(
     possible = np.ones(shares.shape, np.bool_)
     for i, rim in enumerate(rims):
         four = slice(4 * i, 4 * i + 4)
-        inside[four] = rim.white[_SIDES, (shares[four] * rim.cells).astype(np.intp)]
+        inside[four] = rim.white[_SIDE_INDICES, (shares[four] * rim.cells).astype(np.intp)]
     if len(shares) > 4 * len(rims):
         at = 1.0 + shares[-4:] * (inner_rim.cells - 2)  # in cells from the border's corner
         # Near a black cell of the rim, or with a black cell behind it, blur bends the edge.
-        free = inner_rim.white_behind[_SIDES, (at - 0.3).astype(np.intp)]
-        free = free * inner_rim.white_behind[_SIDES, (at + 0.3).astype(np.intp)]
+        free = inner_rim.white_behind[_SIDE_INDICES, (at - 0.3).astype(np.intp)]
+        free = free * inner_rim.white_behind[_SIDE_INDICES, (at + 0.3).astype(np.intp)]
         possible[-4:] = free > 0.0
         outside[-4:] = 1.0
     return NeighbourEdges(cell_depth_px, inside, outside, possible)
@@ -535,26 +549,32 @@ def neighbour_edges(
 # on the side's own line. Values per side are (rows,), values per profile (rows, n).
 
 
-_ALONG32 = ALONG.astype(np.float32)
+_SIDE_POSITIONS_F32 = SIDE_POSITIONS.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
 _WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81
 _MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
-_PER_NEAR = 1.0 / 0.6  # inverse standard deviation of the wide window, times its half length
-_TUKEY = 3.5 * 1.4826
-_POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
-_STEP_ONES: Floats = np.ones(STEPS, dtype=np.float32)
-_LEAST_SHARE = 0.3  # share of the row's mean gradient that a profile requires to count
-_TUKEY_FLOOR_PX = 3.5 * 0.05  # scatter that counts as noise
-_ONE_ROUND_PX = 0.2  # a wide window that is off by less needs only one narrow round
-_SETTLED_PX = 0.06
-_LINE_ROUNDS = 3
-_FAR = 1e6
-_QUARTER = PROFILES // 4
-_QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
+_WINDOW_LENGTH_SIGMAS = (
+    1.0 / 0.6
+)  # inverse standard deviation of the wide window, times its half length
+_TUKEY_SCALE = 3.5 * 1.4826
+_SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
+_SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
+_MIN_GRADIENT_FRACTION = 0.3  # share of the row's mean gradient that a profile requires to count
+_MIN_TUKEY_SCALE_PX = 3.5 * 0.05  # scatter that counts as noise
+_MAX_ONE_ROUND_ERROR_PX = 0.2  # a wide window that is off by less needs only one narrow round
+_CONVERGED_LINE_PX = 0.06
+_LINE_FIT_ITERATIONS = 3
+_OUT_OF_RANGE = 1e6
+_QUARTER_PROFILES = PROFILES_PER_SIDE // 4
+_QUARTER_ONES: Floats = np.ones(_QUARTER_PROFILES, dtype=np.float32)
 # The line through the values in the middles of both halves of the profiles, (2, n).
-_SLOPE: Floats = _ALONG32 * (0.5 / float(ALONG[PROFILES // 2 :].mean()))
-_THROUGH_HALVES: Floats = np.stack([0.5 - _SLOPE, 0.5 + _SLOPE])
-_HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
+_HALVES_SLOPE: Floats = _SIDE_POSITIONS_F32 * (
+    0.5 / float(SIDE_POSITIONS[PROFILES_PER_SIDE // 2 :].mean())
+)
+_HALVES_BASIS: Floats = np.stack([0.5 - _HALVES_SLOPE, 0.5 + _HALVES_SLOPE])
+_ALTERNATING_OUT_OF_RANGE: Floats = np.where(
+    np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE, -_OUT_OF_RANGE
+).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -586,15 +606,15 @@ def locate_edges(
     profiles = _Profiles(grey, half_px, near_px, neighbours)
     edge, usable = profiles.wide()
     blur2 = np.ones(len(near_px), dtype=np.float32)
-    line = weight = _halves_line(edge, usable)
+    line = weight = _fit_line_to_halves(edge, usable)
     moved_px = np.inf
-    for k in range(_LINE_ROUNDS):
-        if k == 1 and moved_px < _ONE_ROUND_PX:
+    for k in range(_LINE_FIT_ITERATIONS):
+        if k == 1 and moved_px < _MAX_ONE_ROUND_ERROR_PX:
             continue
         edge, usable, blur2 = profiles.narrow(line, blur2)
-        centre, weight = _robust_line(edge, usable, 2 if k == _LINE_ROUNDS - 1 else 1)
+        centre, weight = _fit_robust_line(edge, usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1)
         moved_px, line = float(np.abs(centre - line).max()), centre
-        if moved_px < _SETTLED_PX:
+        if moved_px < _CONVERGED_LINE_PX:
             break
     return edge.astype(np.float64), weight.astype(np.float64), np.sqrt(blur2).astype(np.float64)
 
@@ -606,18 +626,18 @@ class _Profiles:
         self, grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
     ) -> None:
         self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
-        self.u = half_px.astype(np.float32)[:, None] * MIDDLES  # position, (rows, steps)
+        self.u = half_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS  # position, (rows, steps)
         self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
         self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
         # Neighbouring edges on the flanks: number on both, and outside minus inside.
         self.both, self.side = around.inside + around.outside, around.outside - around.inside
         self.can = around.possible.astype(np.float32)
         # Factor for the sum over a row's profiles: a share of the mean over the possible ones.
-        self.part = _LEAST_SHARE / np.maximum(self.can.dot(_ONES32), 1.0)
+        self.part = _MIN_GRADIENT_FRACTION / np.maximum(self.can.dot(_ONES32), 1.0)
 
     def wide(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the edges from one window around all middles, and which ones count."""
-        spread = self.u * (_PER_NEAR / self.near)[:, None]
+        spread = self.u * (_WINDOW_LENGTH_SIGMAS / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
         np.exp(-0.5 * spread, out=window[..., 0])
@@ -636,7 +656,7 @@ class _Profiles:
         mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
         mass *= self.gradient
-        total = (mass @ _STEP_ONES) * self.can
+        total = (mass @ _SAMPLE_ONES) * self.can
         usable = total > np.maximum(total.dot(_ONES32) * self.part, 1e-9)[:, None]
         # Share, position and spread of a neighbour seen through the window.
         wide2 = w2 + blur2
@@ -645,9 +665,9 @@ class _Profiles:
         share = np.minimum(self.both * lost[:, None], _MOST_SHARE)
         total = np.where(usable, total / (1.0 - share), 1.0)
         relative *= mass
-        first = relative @ _STEP_ONES + total * self.side * (lost * place)[:, None]
+        first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
         mass *= squared
-        second = mass @ _STEP_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
+        second = mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
         moment = (second * usable).dot(_ONES32)
         moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
         moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
@@ -658,43 +678,45 @@ class _Profiles:
         return line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2
 
 
-def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
+def _fit_line_to_halves(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Return lines (rows, n) through the middle of each row's halves, robust to a bad quarter of
     either."""
-    halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
+    halves = np.where(usable, edge, _ALTERNATING_OUT_OF_RANGE).reshape(-1, 2, 2 * _QUARTER_PROFILES)
     halves.sort(axis=2)
-    first = _QUARTER // 2
-    middle = halves[:, :, first : first + _QUARTER]
+    first = _QUARTER_PROFILES // 2
+    middle = halves[:, :, first : first + _QUARTER_PROFILES]
     # Excluded before the sum: next to huge values, an edge's position would be rounded away.
-    shown = np.abs(middle) < _FAR
+    shown = np.abs(middle) < _OUT_OF_RANGE
     count = shown @ _QUARTER_ONES
     mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, 1.0)
-    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _THROUGH_HALVES)
+    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALVES_BASIS)
 
 
-def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
+def _fit_robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
     """Return straight lines (rows, n) fitted with Tukey's weights, and the weights."""
-    line = row_medians(edge, usable)[:, None]
+    line = median_per_row(edge, usable)[:, None]
     for _ in range(rounds):
         size = np.abs(edge - line)
-        size /= np.maximum(_TUKEY * row_medians(size, usable), _TUKEY_FLOOR_PX)[:, None]
+        size /= np.maximum(_TUKEY_SCALE * median_per_row(size, usable), _MIN_TUKEY_SCALE_PX)[
+            :, None
+        ]
         size *= size
         weight = np.maximum(1.0 - size, 0.0)
         weight *= weight
         weight *= usable
-        w = weight.dot(_POWERS)
-        e = (weight * edge).dot(_POWERS)
+        w = weight.dot(_SIDE_POWERS)
+        e = (weight * edge).dot(_SIDE_POWERS)
         w0, w1 = np.maximum(w[:, 0], 1e-9), w[:, 1]
         mean, middle = e[:, 0] / w0, w1 / w0
         slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, 1e-9)
-        line = slope[:, None] * (_ALONG32 - middle[:, None])
+        line = slope[:, None] * (_SIDE_POSITIONS_F32 - middle[:, None])
         line += mean[:, None]
     return line, weight
 
 
-def row_medians(values: Floats, usable: NDArray[np.bool_]) -> Floats:
+def median_per_row(values: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Return each row's median over its usable values, (rows,); 0 if it has none."""
-    values = np.where(usable, values, _HIGH_LOW)
-    values.partition(PROFILES // 2, axis=1)
-    found = values[:, PROFILES // 2]
-    return np.asarray(np.where(np.abs(found) < _FAR, found, 0.0))
+    values = np.where(usable, values, _ALTERNATING_OUT_OF_RANGE)
+    values.partition(PROFILES_PER_SIDE // 2, axis=1)
+    found = values[:, PROFILES_PER_SIDE // 2]
+    return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE, found, 0.0))

@@ -12,16 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import apply_homography, homography_from_unit, within
+from perchctl.vision.markers.corners import (
+    apply_homography,
+    homography_from_unit_square,
+    is_inside_picture,
+)
 
-LEAST_SIDE_PX = 7.0  # a smaller marker is only a spot
+MIN_MARKER_SIDE_PX = 7.0  # a smaller marker is only a spot
 MIN_CONTRAST = 10.0  # grey levels
-CELL_MARGIN = 0.1  # margin of a cell to the threshold, as a share of the contrast
-MOST_CELLS = 0.8
+CELL_THRESHOLD_MARGIN = 0.1  # margin of a cell to the threshold, as a share of the contrast
+MIN_MATCHING_CELL_FRACTION = 0.8
 """Share of the cells that must have the right colour."""
-_MIN_RESEMBLANCE = 0.6
-_COVERED = 1.25  # half sides of a central marker that may hide cells
-_SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
+_MIN_PATTERN_CORRELATION = 0.6
+_CENTRAL_COVER_HALF_SIDES = 1.25  # half sides of a central marker that may hide cells
+_SPOT_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +91,13 @@ def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    spots = (centres[:, None] + _SPOTS * 2.0 / n).reshape(-1, 2)
-    owner = np.repeat(np.arange(n * n), len(_SPOTS))
-    free = np.abs(spots).max(axis=1) > _COVERED * drawing.ratio
+    spots = (centres[:, None] + _SPOT_OFFSETS * 2.0 / n).reshape(-1, 2)
+    owner = np.repeat(np.arange(n * n), len(_SPOT_OFFSETS))
+    free = np.abs(spots).max(axis=1) > _CENTRAL_COVER_HALF_SIDES * drawing.ratio
     kept = np.unique(owner[free])
     turns, at = [], spots[free]
     for _ in range(4):
-        soft = _softened(drawing, at)
+        soft = _blur_spots(drawing, at)
         soft -= soft.mean()
         turns.append(soft / math.sqrt(float(soft @ soft)))
         at = np.stack([-at[:, 1], at[:, 0]], axis=1)
@@ -110,7 +114,7 @@ def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
     )
 
 
-def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
     """True if the picture clearly has the pattern's colour in every cell."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
@@ -120,31 +124,36 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), CELL_MARGIN * contrast
+    middle, margin = 0.5 * (high + low), CELL_THRESHOLD_MARGIN * contrast
     return bool(
         contrast >= MIN_CONTRAST and white.min() > middle + margin and black.max() < middle - margin
     )
 
 
-def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
-    """True if the picture has the pattern's colour in more than `MOST_CELLS` of the cells."""
+def has_mostly_matching_cells(
+    image: NDArray[np.uint8], corners_px: Array, pattern: Pattern
+) -> bool:
+    """True if the picture has the pattern's colour in more than `MIN_MATCHING_CELL_FRACTION` of the
+    cells."""
     means = _cell_means(image, corners_px, pattern)
     if means is None:
         return False
     high, low = np.median(means[pattern.is_white]), np.median(means[~pattern.is_white])
     right = (means > 0.5 * (high + low)) == pattern.is_white
-    return bool(high - low >= MIN_CONTRAST and right.mean() > MOST_CELLS)
+    return bool(high - low >= MIN_CONTRAST and right.mean() > MIN_MATCHING_CELL_FRACTION)
 
 
-def fits_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+def is_correlated_with_pattern(
+    image: NDArray[np.uint8], corners_px: Array, pattern: Pattern
+) -> bool:
     """True if the grey values in the cells correlate clearly with the pattern."""
-    return float(correlations(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
+    return float(correlate_pattern(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
 
 
-def correlations(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+def correlate_pattern(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
     """Return the correlation (4,) of the cells' grey values with the pattern for corners (4, 2)
     rolled by 0 to 3; 0 without contrast."""
-    grey = _read(image, corners_px, pattern)
+    grey = _read_spots(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
     grey -= grey.mean()
@@ -156,23 +165,23 @@ def correlations(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) 
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    grey = _read(image, corners_px, pattern)
+    grey = _read_spots(image, corners_px, pattern)
     if grey is None:
         return None
     return np.asarray(np.bincount(pattern.spot_cells, weights=grey) / pattern.spots_per_cell)
 
 
-def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+def _read_spots(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
     """Return the grey values (k,) at the spots; None outside the picture."""
-    at = apply_homography(homography_from_unit(corners_px), pattern.spots)
+    at = apply_homography(homography_from_unit_square(corners_px), pattern.spots)
     # Spots are inside the corners.
-    if not (within(corners_px, image.shape) or within(at, image.shape)):
+    if not (is_inside_picture(corners_px, image.shape) or is_inside_picture(at, image.shape)):
         return None
     nearest = (at + 0.5).astype(np.intp)
     return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
 
 
-def _softened(drawing: Drawing, spots: Array) -> Array:
+def _blur_spots(drawing: Drawing, spots: Array) -> Array:
     """Return the whiteness at the spots with a blur of half a cell."""
     n, fine = len(drawing.cells), 8
     sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
@@ -184,8 +193,8 @@ def _softened(drawing: Drawing, spots: Array) -> Array:
 # --- A marker's drawing on a grid: whiteness of each node, sharp and blurred ---
 
 
-_REACH_CELLS = 0.6  # white around the border
-EDGE = 12
+_WHITE_MARGIN_CELLS = 0.6  # white around the border
+BLUR_MARGIN_NODES = 12
 """Number of additional nodes on all sides, for the blur."""
 
 
@@ -206,7 +215,7 @@ class Drawing:
     @property
     def reach(self) -> float:
         """Half the side of the compared square, in the marker's own coordinates."""
-        return 1.0 + _REACH_CELLS * 2.0 / len(self.cells)
+        return 1.0 + _WHITE_MARGIN_CELLS * 2.0 / len(self.cells)
 
 
 def make_drawing(
@@ -220,7 +229,7 @@ def make_drawing(
     return Drawing(cells, np.pad(centre.astype(np.float64), 1), ratio, 1.0 + 2.0 / len(cells))
 
 
-def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
+def _cell_coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
     """Return the share of each cell in each node, (nodes, cells)."""
     edges = size * np.linspace(-1.0, 1.0, n_cells + 1)
     low, high = axis[:, None] - half_node, axis[:, None] + half_node
@@ -228,9 +237,9 @@ def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array
     return np.asarray(np.maximum(overlap, 0.0) / (2.0 * half_node))
 
 
-def _wide(axis: Array, half_node: float) -> Array:
-    """Return the axis with `EDGE` additional nodes at both ends."""
-    more = 2.0 * half_node * np.arange(1, EDGE + 1)
+def _extend_axis(axis: Array, half_node: float) -> Array:
+    """Return the axis with `BLUR_MARGIN_NODES` additional nodes at both ends."""
+    more = 2.0 * half_node * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
 
 
@@ -243,35 +252,35 @@ def render_sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
     paper = render_cells(drawing, axis, half_node)
     if drawing.sheet is None:
         return (paper,)
-    on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
+    on = _cell_coverage(_extend_axis(axis, half_node), half_node, 1, drawing.sheet)
     return paper, (1.0 - on @ on.T).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
-def black_square(cells: int, n: int) -> NDArray[np.float32]:
+def render_black_square(cells: int, n: int) -> NDArray[np.float32]:
     """Return the whiteness of a black square with `cells` cells per side, at n by n nodes."""
     return render_sheets(Drawing(np.zeros((cells, cells))), n)[0]
 
 
 def render_cells(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Return the whiteness of the nodes at `axis` x `axis`, and of `EDGE` additional nodes on all
-    sides."""
-    wide = _wide(axis, half_node)
-    C = _coverage(wide, half_node, len(drawing.cells), 1.0)
+    """Return the whiteness of the nodes at `axis` x `axis`, and of `BLUR_MARGIN_NODES` additional
+    nodes on all sides."""
+    wide = _extend_axis(axis, half_node)
+    C = _cell_coverage(wide, half_node, len(drawing.cells), 1.0)
     black = C @ (1.0 - drawing.cells) @ C.T
     if drawing.centre is not None:
-        C = _coverage(wide, half_node, len(drawing.centre), drawing.ratio)
+        C = _cell_coverage(wide, half_node, len(drawing.centre), drawing.ratio)
         black += C @ (1.0 - drawing.centre) @ C.T
     return (1.0 - black).astype(np.float32)
 
 
-def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
+def blurred_cell_coverage(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
     """Return the share (n, cells) of each row of cells in each node, blurred by `sigma` nodes."""
-    wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
+    wide = _cell_coverage(_extend_axis(axis, half_node), half_node, len(drawing.cells), 1.0)
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
     )
-    return np.asarray(soft[EDGE : EDGE + len(axis)], dtype=np.float64)
+    return np.asarray(soft[BLUR_MARGIN_NODES : BLUR_MARGIN_NODES + len(axis)], dtype=np.float64)
 
 
 def blur_nodes(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:

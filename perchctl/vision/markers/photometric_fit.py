@@ -33,44 +33,44 @@ from perchctl.geometry import Array
 from perchctl.values import cached_property
 from perchctl.vision.lens import distort, undistort_px
 from perchctl.vision.markers.corners import (
-    UNIT,
+    UNIT_SQUARE,
     apply_homography,
-    homography_from_unit,
+    homography_from_unit_square,
     homography_jacobian,
     increment_homography,
 )
 from perchctl.vision.markers.pattern import (
-    EDGE,
+    BLUR_MARGIN_NODES,
     Drawing,
-    black_square,
     blur_nodes,
+    blurred_cell_coverage,
+    render_black_square,
     render_sheets,
-    soft_cells,
 )
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
-_GRID_PX = 0.8  # picture pixels between nodes
-_ROUNDS = 12
+_NODE_SPACING_PX = 0.8  # picture pixels between nodes
+_MAX_ITERATIONS = 12
 _HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
 """Number of rounds after which the fit fails unless its likeness reaches `_LEAST_HOPE`. The
 likeness of a marker is above 0.9 after two rounds."""
-_STILL_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
-_LENS_PX = 0.3  # motion after which the lens distortion is computed again
+_CONVERGED_STEP_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
+_MAX_LENS_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
 _MAX_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
 # Standard deviations of the shape from its start, in half sides: rotations and scales; the
 # perspective.
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
-_BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
+_TONE_CURVE_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
-_MOST_BLUR_STEP = 0.5  # per round, as a share of the blur's square; a node's square at least
+_MAX_BLUR_STEP = 0.5  # per round, as a share of the blur's square; a node's square at least
 _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
 """Changes of the blur below both limits do not render the drawing again: as a share, and in
 cells."""
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 _SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # indices of the unknowns: increment, blur, light
-_PRIOR: Array = (
+_PRIOR_INFORMATION: Array = (
     np.array(
         [_SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _VIEW_SIGMA, _VIEW_SIGMA]
     )
@@ -84,26 +84,26 @@ class Alignment:
 
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
-        likeness: correlation of the picture with the drawing.
+        fit_correlation: correlation of the picture with the drawing.
         pattern, strength: correlation and contrast of the inner bits, beyond a black square of the
             same size; the contrast is relative to the border's.
-        cell_departure: largest mean deviation of a cell, in units of the gain.
-        flip, flip_sigma: how far the worst-fitting cell has the opposite colour, 0 (as drawn) to 1
-            (wrong bit), and the standard deviation of the least certain cell.
+        cell_deviation: largest mean deviation of a cell, in units of the gain.
+        wrong_bit_degree, wrong_bit_sigma: how far the worst-fitting cell has the opposite colour, 0
+            (as drawn) to 1 (wrong bit), and the standard deviation of the least certain cell.
         blur_px: standard deviation of the blur.
-        moved_px: largest distance of a corner from its start.
+        motion_px: largest distance of a corner from its start.
     """
 
     corners_px: Array
     sigma_px: float
-    likeness: float
+    fit_correlation: float
     pattern: float
     strength: float
-    cell_departure: float
-    flip: float
-    flip_sigma: float
+    cell_deviation: float
+    wrong_bit_degree: float
+    wrong_bit_sigma: float
     blur_px: float
-    moved_px: float
+    motion_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,73 +138,73 @@ def align_drawing(
     side_px, reach = float(sides.mean()), drawing.reach
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
-    n = int(np.clip(math.ceil(reach * side_px / _GRID_PX), _MIN_GRID, _MAX_GRID))
+    n = int(np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID, _MAX_GRID))
     node_px, cell_px = reach * side_px / n, side_px / len(drawing.cells)
-    grid, H = make_grid(n, reach), homography_from_unit(start)
+    grid, H = make_grid(n, reach), homography_from_unit_square(start)
     lens_px = lens_shift_px(grid, H, camera)
-    patch = _patch_around(image, grid, H, lens_px)
+    patch = _extract_patch(image, grid, H, lens_px)
     if patch is None:
         return None
     around, first = patch
 
     def drawn(blur_px: float) -> RenderedDrawing:
-        return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _STEP))
+        return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_STEP))
 
-    def possible_px(blur_px: float) -> float:
+    def max_motion_px(blur_px: float) -> float:
         return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_px)
 
-    seen = drawn(possible_px(blur_px))
+    seen = drawn(max_motion_px(blur_px))
     offset_px, since_lens_px, total = lens_px - first, 0.0, np.zeros(8)
-    for k in range(_ROUNDS):
-        if since_lens_px > _LENS_PX:
+    for k in range(_MAX_ITERATIONS):
+        if since_lens_px > _MAX_LENS_REUSE_MOTION_PX:
             offset_px, since_lens_px = lens_shift_px(grid, H, camera) - first, 0.0
-        grey = _read(around, grid, H, offset_px)
-        equations = _equations(grey, seen, total)
+        grey = _sample_patch(around, grid, H, offset_px)
+        equations = _linearize_greys(grey, seen, total)
         if equations is None:
             return None
-        if k == _HOPE_ROUNDS and likeness(grey, equations.error) < _LEAST_HOPE:
+        if k == _HOPE_ROUNDS and fit_correlation(grey, equations.error) < _LEAST_HOPE:
             return None
         step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
         p = step[_SHAPE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
             return None
         H, total = increment_homography(H, p), total + p
-        moved_px = 0.5 * side_px * float(np.abs(p[:6]).max())
-        since_lens_px += moved_px
+        motion_px = 0.5 * side_px * float(np.abs(p[:6]).max())
+        since_lens_px += motion_px
         sigma2 = seen.sigma**2
-        most = max(1.0, _MOST_BLUR_STEP * sigma2)
+        most = max(1.0, _MAX_BLUR_STEP * sigma2)
         squared = sigma2 + float(np.clip(step[_BLUR], -most, most))
-        wanted_px = possible_px(math.sqrt(max(squared, 1e-3)) * node_px)
+        wanted_px = max_motion_px(math.sqrt(max(squared, 1e-3)) * node_px)
         drawn_px = seen.sigma * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
             seen = drawn(wanted_px)
-        elif moved_px < _STILL_PX and since_lens_px <= _LENS_PX:
+        elif motion_px < _CONVERGED_STEP_PX and since_lens_px <= _MAX_LENS_REUSE_MOTION_PX:
             break
     assert equations is not None
     # Residuals of the last round, whose step was negligible.
     gain, error = equations.gain, equations.error
-    corners_px = distort_px(apply_homography(H, UNIT).T, camera).T
-    pattern, strength = _pattern_seen(seen, grey, gain)
-    many = _repeated(error.reshape(n, n))
+    corners_px = distort_px(apply_homography(H, UNIT_SQUARE).T, camera).T
+    pattern, strength = _measure_inner_pattern(seen, grey, gain)
+    many = _count_redundant_nodes(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
-    flip, flip_sigma = _cells_seen(seen, equations, inverse, many)
+    wrong_bit_degree, wrong_bit_sigma = _measure_wrong_bits(seen, equations, inverse, many)
     J = homography_jacobian(H)
     variance = float(np.trace(J @ (inverse[_SHAPE, _SHAPE] * many) @ J.T)) / 8.0
     return Alignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
-        likeness=likeness(grey, error),
+        fit_correlation=fit_correlation(grey, error),
         pattern=pattern,
         strength=strength,
-        cell_departure=_cell_departure(error / gain, grid, len(drawing.cells)),
-        flip=flip,
-        flip_sigma=flip_sigma,
+        cell_deviation=_cell_deviation(error / gain, grid, len(drawing.cells)),
+        wrong_bit_degree=wrong_bit_degree,
+        wrong_bit_sigma=wrong_bit_sigma,
         blur_px=seen.sigma * node_px,
-        moved_px=float(np.abs(corners_px - start_px).max()),
+        motion_px=float(np.abs(corners_px - start_px).max()),
     )
 
 
-def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
+def _linearize_greys(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations | None:
     """Return the equations of the next increment; None without contrast. `total` (8,) is the sum of
     the increments so far."""
     rows, products = seen.illumination_basis
@@ -215,37 +215,37 @@ def _equations(grey: Array, seen: RenderedDrawing, total: Array) -> _Equations |
     if gain < _MIN_GAIN:
         return None
     error = grey - np.einsum("kn,k->n", rows, light)
-    J = np.concatenate([_lit_jacobian(seen, light), rows, error[None]])
+    J = np.concatenate([_illuminated_jacobian(seen, light), rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width per round
-    N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0
-    g[bend] -= light[BEND] * (_BEND_SIGMA * gain) ** -2.0
+    N[bend, bend] += (_TONE_CURVE_SIGMA * gain) ** -2.0
+    g[bend] -= light[BEND] * (_TONE_CURVE_SIGMA * gain) ** -2.0
     N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
-    N[range(8), range(8)] += _PRIOR
-    g[_SHAPE] -= _PRIOR * total
+    N[range(8), range(8)] += _PRIOR_INFORMATION
+    g[_SHAPE] -= _PRIOR_INFORMATION * total
     return _Equations(gain, error, J, noise, N, g)
 
 
 # --- How well the picture matches a fitted drawing ---
 
 
-def likeness(grey: Array, error: Array) -> float:
+def fit_correlation(grey: Array, error: Array) -> float:
     """Return the correlation of grey values (k,) with their fit, whose residual is `error` (k,)."""
     spread = grey - grey.mean()
     explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
 
 
-def _cells_seen(
+def _measure_wrong_bits(
     seen: RenderedDrawing, equations: _Equations, inverse: Array, many: float
 ) -> tuple[float, float]:
-    """Return `flip` and `flip_sigma` of an `Alignment`, using the inverse of N. A wrong bit is
-    tested in the form in which it would appear: blurred, and without the part that the unknowns of
-    the fit explain."""
-    soft, noise, gain = seen.soft_cells, equations.noise, equations.gain
+    """Return `wrong_bit_degree` and `wrong_bit_sigma` of an `Alignment`, using the inverse of N. A
+    wrong bit is tested in the form in which it would appear: blurred, and without the part that the
+    unknowns of the fit explain."""
+    soft, noise, gain = seen.blurred_cell_coverage, equations.noise, equations.gain
     n, m = soft.shape
     found = gain * (soft.T @ equations.error.reshape(n, n) @ soft).ravel()
     shared = gain * (soft.T @ equations.J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
@@ -257,7 +257,9 @@ def _cells_seen(
     return float(flips.max()), math.sqrt(many * noise / float(own.min()))
 
 
-def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[float, float]:
+def _measure_inner_pattern(
+    drawing: RenderedDrawing, grey: Array, gain: float
+) -> tuple[float, float]:
     """Return the correlation and the contrast of the inner pattern in `grey` (n * n,)."""
     rows, products = drawing.square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
@@ -272,7 +274,7 @@ def _pattern_seen(drawing: RenderedDrawing, grey: Array, gain: float) -> tuple[f
     return product / scale, product / max(energy, 1e-9) / gain
 
 
-def _repeated(error: Array) -> float:
+def _count_redundant_nodes(error: Array) -> float:
     """Return the number of neighbouring nodes with the same information."""
     energy = max(float((error * error).mean()), 1e-9)
     factor = 1.0
@@ -282,14 +284,14 @@ def _repeated(error: Array) -> float:
     return factor
 
 
-def _cell_departure(error: Array, grid: Grid, n_cells: int) -> float:
-    index, count = _cells_of(grid, n_cells)
+def _cell_deviation(error: Array, grid: Grid, n_cells: int) -> float:
+    index, count = _assign_nodes_to_cells(grid, n_cells)
     total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
     return float(np.abs(total / count).max())
 
 
 @lru_cache(maxsize=32)
-def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
+def _assign_nodes_to_cells(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
     """Return the cell number of each node, and the number of nodes in each cell."""
     x, y = (grid.uv1[:2] + 1.0) * 0.5 * n_cells
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
@@ -304,7 +306,7 @@ def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
 # edges.
 
 
-def _lit_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
+def _illuminated_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
     """Return the derivatives (9, n * n) of grey by the increment and the blur's square."""
     gain, (u, v, _) = float(light[GAIN]), drawing.grid.uv1
     (white, changes), *others = drawing.sheets
@@ -320,7 +322,7 @@ def _lit_jacobian(drawing: RenderedDrawing, light: Array) -> Array:
 # --- A grid over a marker in its own coordinates, and the picture at its nodes ---
 
 
-_FEW = 9  # per side
+_CHEBYSHEV_NODES = 9  # per side
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,10 +339,10 @@ class Grid:
 def make_grid(n: int, reach: float) -> Grid:
     """Return the nodes in the middle of n by n parts of a square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
-    return Grid(n, axis, _crossings(axis))
+    return Grid(n, axis, _grid_coordinates(axis))
 
 
-def _crossings(axis: Array) -> Array:
+def _grid_coordinates(axis: Array) -> Array:
     """Return u, v and 1 at the crossings of the grid's lines, (3, n * n)."""
     u, v = np.meshgrid(axis, axis)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
@@ -363,24 +365,24 @@ def distort_px(pin_px: Array, camera: CameraModel) -> Array:
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
     """Return the shift of each node by the lens, px (2, n * n), interpolated from a few nodes."""
-    uv1, between = _few(grid)
+    uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H, uv1)
-    shift = (distort_px(pin, camera) - pin).reshape(2, _FEW, _FEW)
+    shift = (distort_px(pin, camera) - pin).reshape(2, _CHEBYSHEV_NODES, _CHEBYSHEV_NODES)
     return np.asarray((between @ shift @ between.T).reshape(2, -1))
 
 
 @lru_cache(maxsize=64)
-def _few(grid: Grid) -> tuple[Array, Array]:
-    """Return Chebyshev nodes over the grid (3, _FEW^2), and the weights (n, _FEW) for the grid's
-    own nodes."""
+def _make_chebyshev_nodes(grid: Grid) -> tuple[Array, Array]:
+    """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES^2), and the weights (n,
+    _CHEBYSHEV_NODES) for the grid's own nodes."""
     reach = float(grid.axis[-1])
-    x = chebyshev.chebpts2(_FEW)
-    degree = _FEW - 1
+    x = chebyshev.chebpts2(_CHEBYSHEV_NODES)
+    degree = _CHEBYSHEV_NODES - 1
     through = np.linalg.inv(chebyshev.chebvander(x, degree))
-    return _crossings(reach * x), chebyshev.chebvander(grid.axis / reach, degree) @ through
+    return _grid_coordinates(reach * x), chebyshev.chebvander(grid.axis / reach, degree) @ through
 
 
-def _patch_around(
+def _extract_patch(
     image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the required part of the picture, and its first pixel (2, 1)."""
@@ -396,7 +398,7 @@ def _patch_around(
     return part, low[:, None].astype(np.float64)
 
 
-def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
+def _sample_patch(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) -> Array:
     """Return the grey values (n * n,) at the nodes of a patch, shifted by the lens (2, n * n)."""
     at = (project_nodes(H, grid.uv1) + offset_px).astype(np.float32)
     x, y = at.reshape(2, grid.n, grid.n)
@@ -408,14 +410,14 @@ def _read(patch: NDArray[np.float32], grid: Grid, H: Array, offset_px: Array) ->
 # They are computed block by block: large products wake threads, which cost more than they save.
 
 
-_BLOCK = 256  # values per row
+_GRAM_BLOCK_SIZE = 256  # values per row
 
 
 def gram_matrix(rows: Array) -> Array:
     """Return the Gram matrix (k, k), ``rows @ rows.T``, of rows (k, n)."""
     k, n = rows.shape
-    whole = n - n % _BLOCK
-    blocks = rows[:, :whole].reshape(k, -1, _BLOCK).transpose(1, 0, 2)
+    whole = n - n % _GRAM_BLOCK_SIZE
+    blocks = rows[:, :whole].reshape(k, -1, _GRAM_BLOCK_SIZE).transpose(1, 0, 2)
     rest = rows[:, whole:]
     total = np.matmul(blocks, blocks.transpose(0, 2, 1)).sum(axis=0)
     return np.asarray(total + rest.dot(rest.T))
@@ -424,7 +426,7 @@ def gram_matrix(rows: Array) -> Array:
 # --- A marker's drawing at the nodes of a grid, blurred ---
 
 
-_STEP = 0.02  # relative step of the blur
+_LOG_BLUR_STEP = 0.02  # relative step of the blur
 # Rows of the light: offset and its slopes, gain and its slopes, bend, grey beyond the sheet.
 OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 
@@ -458,23 +460,26 @@ class RenderedDrawing:
     def square_illumination_basis(self) -> tuple[Array, Array]:
         """Basis of a black square's grey values under any light except slopes of the gain and bend:
         rows (4 or 5, n * n), and their Gram matrix."""
-        soft = blur_nodes(black_square(len(self.drawing.cells), self.grid.n), self.sigma)
-        black = soft[EDGE:-EDGE, EDGE:-EDGE].reshape(1, -1)
+        soft = blur_nodes(render_black_square(len(self.drawing.cells), self.grid.n), self.sigma)
+        black = soft[
+            BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES, BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES
+        ].reshape(1, -1)
         lit, _ = self.illumination_basis
         rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
         return rows, gram_matrix(rows)
 
     @cached_property
-    def soft_cells(self) -> Array:
+    def blurred_cell_coverage(self) -> Array:
         """Share of each row (or column) of cells in each node, (n, cells)."""
         half_node = self.drawing.reach / self.grid.n
-        return soft_cells(self.drawing, self.grid.axis, half_node, self.sigma)
+        return blurred_cell_coverage(self.drawing, self.grid.axis, half_node, self.sigma)
 
 
 @lru_cache(maxsize=16)
 def render_blurred(drawing: Drawing, n: int, step: int) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_STEP * step)`` nodes."""
-    return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_STEP * step))
+    """Return the drawing at n by n nodes over its reach, blurred by ``exp(_LOG_BLUR_STEP * step)``
+    nodes."""
+    return RenderedDrawing(drawing, make_grid(n, drawing.reach), math.exp(_LOG_BLUR_STEP * step))
 
 
 def _blurred_with_slope(
@@ -482,7 +487,7 @@ def _blurred_with_slope(
 ) -> tuple[Array, Array]:
     soft = blur_nodes(sharp, sigma)
     step = float(axis[1] - axis[0])
-    e, n = EDGE, len(axis)
+    e, n = BLUR_MARGIN_NODES, len(axis)
     middle = slice(e, e + n)
     left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
     up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]

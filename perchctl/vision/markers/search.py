@@ -20,27 +20,27 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import mean_side_px, scale_square, within
+from perchctl.vision.markers.corners import is_inside_picture, mean_side_px, scale_square
 from perchctl.vision.markers.detector import (
     MIRROR_INDEX,
     OPENCV_THRESHOLDS,
     QUICK_THRESHOLDS,
     Picture,
     Thresholds,
-    make_marker_decoder,
+    make_aruco_detector,
 )
 from perchctl.vision.target_selection import OwnOffset
 from perchctl.vision.types import MARKERS, MarkerName
 
-Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
+SearchMode = Literal["near", "window", "fits", "sharp", "blurred", "all"]
 """Kinds of search: near the expected position by a search ("window"), by fits to a blurred target
 ("fits"), or by both ("near"); in the whole picture for a "sharp" or a "blurred" target; or
 "all"."""
 _WINDOW_MARGIN = 0.25  # share of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
-_MAX_WINDOW = 0.8  # share of the picture
-_HALVED_SIDE_PX = 60.0
+_MAX_WINDOW_FRACTION = 0.8  # share of the picture
+_MIN_HALVED_SIDE_PX = 60.0
 """Side above which markers are found in a picture of half the size, in a quarter of the time,
 px."""
 _CENTRE_TOLERANCE = 0.35  # share of the small marker's side
@@ -63,45 +63,45 @@ class FoundMarkers:
 def search(
     picture: Picture,
     expected: Mapping[MarkerName, Array],
-    look: Look = "all",
+    search_mode: SearchMode = "all",
     own: OwnOffset | None = None,
 ) -> FoundMarkers:
     """Search the window around the expected markers, then the whole picture if the window shows too
     little.
 
-    With `look` "near" or "window", only the window is searched; with "sharp", only the whole
+    With `search_mode` "near" or "window", only the window is searched; with "sharp", only the whole
     picture. `own` selects one of several targets if none is expected.
     """
     setup, shape = picture.setup, picture.image.shape
     whole = slice(0, shape[0]), slice(0, shape[1])
-    if setup.fits_lines and expected and look != "sharp":
-        quickly = search_halved(picture, expected, own)
+    if setup.fits_lines and expected and search_mode != "sharp":
+        quickly = search_half_size(picture, expected, own)
         if quickly is not None:
             return quickly
         window = search_window(expected, setup.ratio, shape) or whole
         found = FoundMarkers()
         if len(expected) == 2:
-            found = _pass(picture, window, expected, QUICK_THRESHOLDS, own)
+            found = _search_once(picture, window, expected, QUICK_THRESHOLDS, own)
         if len(found.corners_px) < 2 and window != whole:
-            found = _pass(picture, window, expected, OPENCV_THRESHOLDS, own)
+            found = _search_once(picture, window, expected, OPENCV_THRESHOLDS, own)
         if len(found.corners_px) >= (2 if window == whole else 1) or (
-            look in ("near", "window") and window != whole
+            search_mode in ("near", "window") and window != whole
         ):
             return found
-    return _pass(picture, whole, expected, OPENCV_THRESHOLDS, own)
+    return _search_once(picture, whole, expected, OPENCV_THRESHOLDS, own)
 
 
-def search_halved(
+def search_half_size(
     picture: Picture, expected: Mapping[MarkerName, Array], own: OwnOffset | None = None
 ) -> FoundMarkers | None:
     """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
     shape = picture.image.shape
-    in_view = [quad for quad in expected.values() if within(quad, shape)]
-    if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
+    in_view = [quad for quad in expected.values() if is_inside_picture(quad, shape)]
+    if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _MIN_HALVED_SIDE_PX:
         return None
     window = search_window(expected, picture.setup.ratio, shape)
     window = window or (slice(0, shape[0]), slice(0, shape[1]))
-    found = _pass(picture, window, expected, QUICK_THRESHOLDS, own, halved=True)
+    found = _search_once(picture, window, expected, QUICK_THRESHOLDS, own, halved=True)
     return found if len(found.corners_px) >= len(in_view) else None
 
 
@@ -124,12 +124,12 @@ def search_window(
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
     width, height = int(right - left), int(bottom - top)
-    if min(width, height) < _MIN_WINDOW_PX or width * height > _MAX_WINDOW * w * h:
+    if min(width, height) < _MIN_WINDOW_PX or width * height > _MAX_WINDOW_FRACTION * w * h:
         return None
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def _pass(
+def _search_once(
     picture: Picture,
     window: Window,
     expected: Mapping[MarkerName, Array],
@@ -140,7 +140,7 @@ def _pass(
     setup, part = picture.setup, picture.image[window]
     if halved:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    detector = make_marker_decoder(setup, (part.shape[1], part.shape[0]), thresholds)
+    detector = make_aruco_detector(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
         return FoundMarkers()
@@ -156,7 +156,7 @@ def _pass(
         at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
         # The centre of a pixel at half size is between two pixels.
         candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
-    targets = len(_wholes(candidates, setup.ratio))
+    targets = len(_pair_markers(candidates, setup.ratio))
     chosen = choose_markers(candidates, expected, setup.ratio, own)
     return FoundMarkers(chosen, mirrored, targets)
 
@@ -174,11 +174,11 @@ def choose_markers(
     closest by `own` is chosen.
     """
     if own is not None and not expected:
-        candidates = _nearest_first(candidates, own)
+        candidates = _sort_by_distance(candidates, own)
     large, small = candidates["large"], candidates["small"]
-    wholes = _wholes(candidates, ratio)
-    near_large = _nearest("large", large, expected, ratio)
-    near_small = _nearest("small", small, expected, ratio)
+    wholes = _pair_markers(candidates, ratio)
+    near_large = _nearest_candidate("large", large, expected, ratio)
+    near_small = _nearest_candidate("small", small, expected, ratio)
     if wholes:
         _, i, j = wholes[0]
         if expected:
@@ -187,7 +187,7 @@ def choose_markers(
             _, i, j = wholes[int(np.argmin(away_px))]
         elif own is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
-        elsewhere = _nearest("large", [large[i]], expected, ratio) is None
+        elsewhere = _nearest_candidate("large", [large[i]], expected, ratio) is None
         if not (elsewhere and (near_large is not None or near_small is not None)):
             return {"large": large[i], "small": small[j]}
     if near_large is not None:
@@ -204,7 +204,7 @@ def choose_markers(
     return {}
 
 
-def _nearest_first(
+def _sort_by_distance(
     candidates: Mapping[MarkerName, list[Array]], own: OwnOffset
 ) -> Mapping[MarkerName, list[Array]]:
     """Return the candidates sorted by their distance, without those that are too far away.
@@ -221,7 +221,7 @@ def _nearest_first(
     return kept if any(kept.values()) else candidates
 
 
-def _wholes(
+def _pair_markers(
     candidates: Mapping[MarkerName, list[Array]], ratio: float
 ) -> list[tuple[float, int, int]]:
     """Return the pairs of markers that form a target: error and indices, best first."""
@@ -245,7 +245,7 @@ def nesting_error(large_px: Array, small_px: Array, ratio: float) -> float:
     return float(np.linalg.norm(mapped - small_px, axis=1).max()) / allowed_px
 
 
-def _nearest(
+def _nearest_candidate(
     name: MarkerName, quads: list[Array], expected: Mapping[MarkerName, Array], ratio: float
 ) -> Array | None:
     if not expected or not quads:

@@ -22,9 +22,9 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.lens import distort, undistort, undistort_px
-from perchctl.vision.markers.corners import within
+from perchctl.vision.markers.corners import is_inside_picture
 from perchctl.vision.markers.cut import (
-    MOST_AGE_S,
+    MAX_CUT_FIT_AGE_S,
     RigidPose,
     fit_cut_markers,
     fit_pose,
@@ -33,7 +33,7 @@ from perchctl.vision.markers.cut import (
 )
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import Picture
-from perchctl.vision.markers.partial import seen_edges
+from perchctl.vision.markers.partial import find_visible_edges
 from perchctl.vision.types import Detection, Detections, MarkerName
 from tests.helpers.markers import SETUP, both, corners, frame, waved
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -68,7 +68,7 @@ def seen_before(name: str, age_s: float = 1 / 30) -> Detections:
     return Detections(-1, -age_s, large=large, small=small)
 
 
-def look(
+def search_mode(
     name: str, image: NDArray[np.uint8] | None = None, off_px: float = 0.0, age_s: float = 1 / 30
 ) -> Detections:
     expected = both(POSES[name], off_px)
@@ -83,8 +83,8 @@ def nothing(found: Detections) -> bool:
 @pytest.mark.parametrize(("name", "off_px"), [("height", 25.0), ("width", -30.0), ("under", 20.0)])
 def test_corners_follow_from_what_is_left(name: str, off_px: float) -> None:
     true = corners("small", POSES[name])
-    assert not within(true, SHAPE)
-    found = look(name, off_px=off_px).small
+    assert not is_inside_picture(true, SHAPE)
+    found = search_mode(name, off_px=off_px).small
     error = undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)
     assert float(error.ravel() @ np.linalg.solve(found.cov_px2, error.ravel())) < 20.0
     inside = (true >= 0).all(axis=1) & (true <= (639, 479)).all(axis=1)
@@ -92,7 +92,7 @@ def test_corners_follow_from_what_is_left(name: str, off_px: float) -> None:
 
 
 def test_the_large_marker_stands_for_what_shows_nothing_of_the_small_one() -> None:
-    found = look("aside", off_px=12.0)
+    found = search_mode("aside", off_px=12.0)
     assert found.small is None
     true = corners("large", ASIDE)
     error = (undistort_px(found.large.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
@@ -104,8 +104,8 @@ def test_it_is_never_a_first_sight_nor_one_after_a_while() -> None:
     assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
     assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
-    assert not nothing(look("height", age_s=MOST_AGE_S - 0.01))
-    assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
+    assert not nothing(search_mode("height", age_s=MAX_CUT_FIT_AGE_S - 0.01))
+    assert nothing(search_mode("height", age_s=MAX_CUT_FIT_AGE_S + 0.01))
 
 
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
@@ -138,7 +138,7 @@ def _bare(kind: str) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("name", ["height", "width", "under", "aside"])
 @pytest.mark.parametrize("kind", ["blank", "tiles", "seams", "blocks"])
 def test_what_is_not_the_target_is_refused(name: str, kind: str) -> None:
-    assert nothing(look(name, _bare(kind)))
+    assert nothing(search_mode(name, _bare(kind)))
 
 
 @pytest.mark.parametrize("name", ["height", "width", "under"])
@@ -147,7 +147,7 @@ def test_other_markers_in_its_place_are_refused(name: str) -> None:
         *POSES[name], blur_px=1.0, noise=4.0,
         markers=(("DICT_4X4_1000", 5, 0.150), ("DICT_ARUCO_ORIGINAL", 300, 0.025)),
     )  # fmt: skip
-    assert nothing(look(name, other))
+    assert nothing(search_mode(name, other))
 
 
 @pytest.mark.parametrize("name", ["height", "width"])
@@ -157,7 +157,7 @@ def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> Non
     rvec, tvec = POSES[name]
     square_px = project(square_corners(0.025), rvec, tvec, CAMERA)
     cv2.fillConvexPoly(image, np.rint(square_px).astype(np.int32), 30)
-    assert nothing(look(name, np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8)))
+    assert nothing(search_mode(name, np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8)))
 
 
 def test_what_leaves_a_direction_open_is_refused() -> None:
@@ -169,7 +169,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     assert found.points_shown == found.points_in_view
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert fit_cut_markers(Picture(image, None, SETUP, plain), expected) == {}
-    assert nothing(look("width", waved(picture("width")))), "nor do edges that fit badly"
+    assert nothing(search_mode("width", waved(picture("width")))), "nor do edges that fit badly"
 
 
 @pytest.mark.parametrize("name", ["height", "width"])
@@ -177,7 +177,7 @@ def test_the_target_elsewhere_is_refused(name: str) -> None:
     """Half a marker away from where it can be."""
     rvec, tvec = POSES[name]
     moved = render(rvec, tvec + np.array((0.011, 0.009, 0.0)), blur_px=1.0, noise=4.0)
-    assert nothing(look(name, moved))
+    assert nothing(search_mode(name, moved))
 
 
 def gear(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -247,7 +247,7 @@ def test_a_square_beyond_all_lenses_shows_no_edges(side_px: float) -> None:
     """Where a lens model throws a near target's far corners overflows a picture's coordinates."""
     square_px = np.array([[side_px, 0.0, 320.0], [0.0, side_px, 240.0], [0.0, 0.0, 1.0]])
     seen = Picture(picture("height"), None, SETUP, CAMERA)
-    assert seen_edges(seen, square_px, SETUP.patterns["large"]) is None
+    assert find_visible_edges(seen, square_px, SETUP.patterns["large"]) is None
 
 
 # --- The pipeline on the way to contact --------------------------------------------------------

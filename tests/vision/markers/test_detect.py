@@ -10,14 +10,14 @@ from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_d
 from perchctl.vision import project, square_corners
 from perchctl.vision.markers import detect
 from perchctl.vision.markers.detect import (
-    METHODS,
+    CORNER_METHODS,
+    average_fields,
     detect_markers,
     find_corners,
-    follow_markers,
-    large_around,
-    mean_of_fields,
+    find_large_around,
+    refine_expected_markers,
 )
-from perchctl.vision.markers.detector import Picture, make_aruco_detector
+from perchctl.vision.markers.detector import Picture, make_detector_setup
 from perchctl.vision.markers.search import nesting_error
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.corner_views import VIEWS, View, findings
@@ -86,7 +86,7 @@ def test_expected_markers_are_verified_and_refined(shift_px: float) -> None:
 
 def test_other_cells_other_turns_and_mirror_images_are_not_verified() -> None:
     image = render(*POSE)
-    other = make_aruco_detector(
+    other = make_detector_setup(
         DetectorConfig(),
         TargetConfig(
             large=MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150),
@@ -128,8 +128,10 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.small is not None
     assert found.large is None
-    seen = follow_markers(Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)})
-    assert large_around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
+    seen = refine_expected_markers(
+        Picture(image, None, SETUP, CAMERA), {"small": corners("small", pose)}
+    )
+    assert find_large_around(Picture(image, None, SETUP, CAMERA), seen["small"]) is None
 
 
 # --- Motion from picture to picture ------------------------------------------------------------
@@ -141,7 +143,7 @@ def test_nothing_is_between_two_targets() -> None:
         Detections(0, 0.0, large=Detection("large", box(x, 100, 60), 0.1, refined=True))
         for x in (100.0, 400.0)
     ]
-    mean = mean_of_fields(*fields)
+    mean = average_fields(*fields)
     assert mean.large.corners_px[:, 0].mean() == pytest.approx(100.0)
 
 
@@ -152,8 +154,8 @@ EACH_VIEW = pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.method)
 
 
 def test_each_method_has_a_name_and_a_view_of_its_own() -> None:
-    assert [view.method for view in VIEWS] == [method.name for method in METHODS]
-    assert len({method.name for method in METHODS}) == len(METHODS)
+    assert [view.method for view in VIEWS] == [method.name for method in CORNER_METHODS]
+    assert len({method.name for method in CORNER_METHODS}) == len(CORNER_METHODS)
 
 
 @EACH_VIEW
@@ -173,7 +175,7 @@ def test_each_method_finds_the_corners_in_its_view(view: View) -> None:
 )
 def test_without_its_row_a_method_is_missed(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
     with_it = find_corners(view.picture, view.prior).corners[view.marker]
-    rest = tuple(method for method in METHODS if method.name != view.method)
-    monkeypatch.setattr(detect, "METHODS", rest)
+    rest = tuple(method for method in CORNER_METHODS if method.name != view.method)
+    monkeypatch.setattr(detect, "CORNER_METHODS", rest)
     without = find_corners(view.picture, view.prior).corners.get(view.marker)
     assert without is None or not np.array_equal(without.corners_px, with_it.corners_px)

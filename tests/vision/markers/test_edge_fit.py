@@ -10,9 +10,13 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine_subpix
+from perchctl.vision.markers.corners import (
+    DETECTOR_CORNER_SIGMA_PX,
+    SUBPIX_CORNER_SIGMA_PX,
+    refine_subpix,
+)
 from perchctl.vision.markers.edge_fit import refine_lines
-from perchctl.vision.markers.pattern import cells_agree, make_rim
+from perchctl.vision.markers.pattern import has_matching_cells, make_rim
 from tests.helpers.markers import POSE, SETUP, corners, waved
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
@@ -145,7 +149,7 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
         result = refine_subpix(image, raw, 6)
         assert not result.refined
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
-        assert result.sigma_px in (RAW_SIGMA_PX, SUBPIX_SIGMA_PX)
+        assert result.sigma_px in (DETECTOR_CORNER_SIGMA_PX, SUBPIX_CORNER_SIGMA_PX)
     waves = waved(render(*POSE, noise=2.0))
     assert refine_lines(waves, corners("large")[None], [RIMS[6]], CAMERA) == [None]
 
@@ -156,7 +160,7 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
 def test_every_single_cell_counts() -> None:
     image = render(*POSE)
     pattern = SETUP.patterns["large"]
-    assert cells_agree(image, corners("large"), pattern)
+    assert has_matching_cells(image, corners("large"), pattern)
     H = cv2.getPerspectiveTransform(
         np.array([[0, 0], [6, 0], [6, 6], [0, 6]], dtype=np.float32),
         corners("large").astype(np.float32),
@@ -172,4 +176,4 @@ def test_every_single_cell_counts() -> None:
             quad = cv2.perspectiveTransform(cell[:, None], H)[:, 0]
             grey = int(image[tuple(np.rint(quad.mean(axis=0)[::-1]).astype(int))])
             cv2.fillConvexPoly(spoilt, np.rint(quad).astype(np.int32), 30 if grey > 120 else 205)
-            assert not cells_agree(spoilt, corners("large"), pattern), (row, column)
+            assert not has_matching_cells(spoilt, corners("large"), pattern), (row, column)

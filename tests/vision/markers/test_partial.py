@@ -17,10 +17,19 @@ from perchctl.profile import DetectorConfig, MarkerConfig, Profile, TargetConfig
 from perchctl.vision import Frame, make_pipeline
 from perchctl.vision.fields import interpolate_field
 from perchctl.vision.lens import undistort_px
-from perchctl.vision.markers.corners import RefinedCorners, apply_homography, homography_from_unit
+from perchctl.vision.markers.corners import (
+    RefinedCorners,
+    apply_homography,
+    homography_from_unit_square,
+)
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import Picture, hidden_area, is_hidden, make_aruco_detector
-from perchctl.vision.markers.partial import KnownBy, fit_partly_seen, seen_edges
+from perchctl.vision.markers.detector import (
+    Picture,
+    is_hidden,
+    make_detector_setup,
+    make_hidden_mask,
+)
+from perchctl.vision.markers.partial import IdentifiedBy, find_visible_edges, fit_partly_visible
 from perchctl.vision.markers.search import search
 from perchctl.vision.types import Detections, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame, waved
@@ -32,10 +41,15 @@ LARGE = SETUP.patterns["large"]
 
 
 def partly(
-    image: Grey, start_px: Array, known_by: KnownBy, hidden: NDArray[np.bool_] | None = None
+    image: Grey,
+    start_px: Array,
+    identified_by: IdentifiedBy,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> RefinedCorners | None:
     """The large marker by what is seen of it."""
-    return fit_partly_seen(Picture(image, hidden, SETUP, CAMERA), "large", start_px, known_by)
+    return fit_partly_visible(
+        Picture(image, hidden, SETUP, CAMERA), "large", start_px, identified_by
+    )
 
 
 def beyond(pose: tuple[Array, Array], name: MarkerName = "large") -> float:
@@ -122,7 +136,7 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     image = render(*pose, noise=2.0)
     assert set(search(Picture(image, None, SETUP, CAMERA), {}).corners_px) == {"large", "small"}
     large = MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150)
-    other = make_aruco_detector(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
+    other = make_detector_setup(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
     setup = replace(SETUP, patterns={**SETUP.patterns, "large": other})
     found = detect_markers(frame(image), None, setup, CAMERA)
     assert found.large is None
@@ -161,7 +175,9 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
 def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
     image, true = render(*POSE, noise=2.0), corners("large")
     black = np.flatnonzero(LARGE.is_inner & ~LARGE.is_white)[0]
-    spots = apply_homography(homography_from_unit(true), LARGE.spots[LARGE.spot_cells == black])
+    spots = apply_homography(
+        homography_from_unit_square(true), LARGE.spots[LARGE.spot_cells == black]
+    )
     side = float(np.linalg.norm(true[0] - true[1]))
     bright = glaring(image, spots.mean(axis=0), side / 9.0)
     found = partly(bright, true, "track")
@@ -173,9 +189,9 @@ def test_a_cell_in_glaring_light_is_unknown_and_not_wrong() -> None:
 def test_other_cells_are_not_the_marker_whatever_else_is_hidden() -> None:
     pose = pose_of(0.02, 0.01, 0.4, 0.3)
     image = render(*pose, markers=(("DICT_4X4_1000", 16, 0.150),))
-    ways: tuple[KnownBy, ...] = ("bits", "track", "other")
-    for known_by in ways:
-        assert partly(image, corners("large", pose), known_by) is None
+    ways: tuple[IdentifiedBy, ...] = ("bits", "track", "other")
+    for identified_by in ways:
+        assert partly(image, corners("large", pose), identified_by) is None
     turned = np.roll(corners("large", pose), 1, axis=0)
     right = render(*pose)
     assert partly(right, turned, "other") is None
@@ -226,8 +242,11 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     """Whatever grey the gear has, the same is found."""
     covered = LEGS[name]
     assert is_hidden(covered, TRUE)
-    bare, at = render(*POSE, noise=2.0), homography_from_unit(undistort_px(TRUE, CAMERA))
-    seen = [seen_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE) for gear in (None, covered)]
+    bare, at = render(*POSE, noise=2.0), homography_from_unit_square(undistort_px(TRUE, CAMERA))
+    seen = [
+        find_visible_edges(Picture(bare, gear, SETUP, CAMERA), at, LARGE)
+        for gear in (None, covered)
+    ]
     whole, rest = (edges.weight.sum() for edges in seen)
     assert (rest < 0.95 * whole) == (name != "corner"), "no side that is hidden counts"
     setup, found = replace(SETUP, mask=covered), []
@@ -248,10 +267,10 @@ def test_a_field_shows_the_gear_in_the_rows_beside_it_too() -> None:
     image = np.where(covered, 0, 200).astype(np.uint8)
     for first_row, name in ((0, "top"), (1, "bottom")):
         field = interpolate_field(image, first_row)
-        hidden = hidden_area(Frame(0, 0.0, field, fields=name), covered)
+        hidden = make_hidden_mask(Frame(0, 0.0, field, fields=name), covered)
         assert hidden is not None
         assert (field[~hidden] == 200).all()
-    whole = hidden_area(Frame(0, 0.0, image, fields="whole"), covered)
+    whole = make_hidden_mask(Frame(0, 0.0, image, fields="whole"), covered)
     assert whole is not None
     assert np.array_equal(whole, covered)
 
