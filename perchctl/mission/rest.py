@@ -83,9 +83,8 @@ def _find_rest_state_by_falls(c: Context) -> RestState:
     b, reckoning, since_s = c.belief, c.belief.reckoning, c.belief.in_reach_since_s
     felt_s = c.state.descent.floor_detected_s
     down_s = max(b.imu.fell_s, -math.inf if felt_s is None else felt_s)
-    unsure = reckoning.doubtful_gap_s > max(
-        down_s, reckoning.sighting_s
-    )  # a sighting resolves the doubt
+    # a sighting resolves the doubt
+    unsure = reckoning.doubtful_gap_s > max(down_s, reckoning.sighting_s)
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
     came_unheard = unsure and reckoning.doubtful_gap_s <= since_s

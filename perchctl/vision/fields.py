@@ -31,9 +31,8 @@ _MIN_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _CLASSIFICATION_PERIOD_FRAMES = 3
 _ALIAS_PX, _ALIAS_BLURS = 0.8, 2.45
-_INTERPOLATION_TAPS = (
-    np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
-)  # cubic interpolation at the midpoint
+# cubic interpolation at the midpoint
+_INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
 _STANDARD_PERIODS_S = (1 / 30, 1 / 25)  # frame periods of NTSC and PAL
 _STANDARD_PERIOD_RANGE_S = (0.029, 0.045)  # range of periods that are rounded to NTSC or PAL

@@ -454,9 +454,8 @@ _SIDE_MATRIX_ROWS = np.concatenate([2 * np.tile(_SIDE_START, 4), 2 * np.tile(_SI
 _SIDE_MATRIX_COLUMNS = np.concatenate(
     [2 * _SIDE_START, 2 * _SIDE_START + 1, 2 * _SIDE_END, 2 * _SIDE_END + 1] * 2
 )
-_SIDE_MATRIX_INDICES = (
-    8 * _SIDE_MATRIX_ROWS + _SIDE_MATRIX_COLUMNS
-)  # indices into a flattened (8, 8) matrix
+# indices into a flattened (8, 8) matrix
+_SIDE_MATRIX_INDICES = 8 * _SIDE_MATRIX_ROWS + _SIDE_MATRIX_COLUMNS
 
 
 @dataclass(frozen=True, eq=False)

@@ -111,17 +111,14 @@ class DeadReckoning:
     estimate_only_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
     imu_only_mps: tuple[float, float] = (0.0, 0.0)
-    distance_below_m: float = (
-        math.inf
-    )  # distance of the gear below the target; inf if unseen or fallen
+    # distance of the gear below the target; inf if unseen or fallen
+    distance_below_m: float = math.inf
     # lower bound of `distance_below_m`: allows for climbs in silences, and falls only add to it
     min_distance_below_m: float = math.inf
     # end of the newest silence after which the magnet may hold the vehicle
     doubtful_gap_s: float = -math.inf
-    lateral_offset_m: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # lateral offset from the gear to the target's axis
+    # lateral offset from the gear to the target's axis
+    lateral_offset_m: tuple[float, float] = (0.0, 0.0)
     lateral_sigma_m: float = math.inf  # standard deviation of `lateral_offset_m`; inf if unknown
     sighting_s: float = -math.inf  # exposure of the sighting from which the offset is integrated
     # sum of the steps of the estimated position since that sighting

@@ -81,9 +81,8 @@ def _find_touch_offset(before: Context, claims: Claim) -> ContactOffset | None:
     if old.phase is Phase.RECOVER:  # pressed again before it left the contact
         return b.contact if b.contact_z_m is not None else None
     proven = b.held_s(CONTACT) >= before.planner.perch.contact_dwell_s
-    carried = (
-        proven or b.held_s(SUPPORTED_BY_IMU) >= 0.0
-    )  # `SUPPORTED_BY_IMU` includes that dwell time
+    # `SUPPORTED_BY_IMU` includes that dwell time
+    carried = proven or b.held_s(SUPPORTED_BY_IMU) >= 0.0
     if old.phase is Phase.PERCH and carried and is_at_contact_height(b):
         return contact_offset(b)
     return None

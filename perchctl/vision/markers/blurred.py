@@ -165,7 +165,7 @@ def _render_template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np
 
 _MIN_SIGMA_PX = 0.015
 _BLUR_SIGMA = 0.012  # share of the blur: no picture equals its drawing with uniform blur
-_MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
+_MIN_PATTERN, _MIN_CORRELATION = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
 _MAX_CELL_DEVIATION = 0.3
 _MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
@@ -227,7 +227,7 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool
     """
     return (
         found.pattern > _MIN_PATTERN
-        and found.fit_correlation > _MIN_LIKENESS
+        and found.fit_correlation > _MIN_CORRELATION
         and _MIN_STRENGTH < found.strength < _MAX_STRENGTH
         and found.cell_deviation < _MAX_CELL_DEVIATION
         and found.sigma_px < max_sigma * mean_side_px(found.corners_px)

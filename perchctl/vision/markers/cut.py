@@ -55,16 +55,15 @@ _MIN_SMALL_CELL_PX = 8.0
 _MIN_OVERVIEW_CORRELATION = 0.6  # correlation required at the moved prediction
 _GOOD_OVERVIEW_CORRELATION = 0.95  # correlation at which no other size is tried
 _SCALE_CANDIDATES = (1.0, 0.94, 1.06)
-_MIN_LIKENESS, _MIN_CUT_GAIN = 0.9, 20.0
+_MIN_CORRELATION, _MIN_CUT_GAIN = 0.9, 20.0
 _MIN_SHOWN_FRACTION = 0.75  # share of the edge points in view
 _MAX_RESIDUAL_PX = 1.2
 _MAX_CENTRE_SIGMA = 0.04  # of the centre, in half sides
 _MIN_CORNER_SIGMA_PX = 0.02
 _MIN_SMALL_MARKER_POINTS = 12  # edge points that make the small marker the measured one
 _MAX_INVERSION_ERROR = 1e-3  # normalised; the lens model is valid where its inverse exists
-_R_AXES_COORDINATES = np.diag(
-    [1.0, -1.0, -1.0]
-)  # rotation from a marker's own coordinates to its axes
+# rotation from a marker's own coordinates to its axes
+_R_AXES_COORDINATES = np.diag([1.0, -1.0, -1.0])
 
 
 def warm_up_cut_marker_fit(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
@@ -114,7 +113,7 @@ def fit_cut_markers(
     if found is None or not _is_reliable(found):
         return {}
     like, gain = correlate_drawing(found.pose.H, texture, view)
-    if like < _MIN_LIKENESS or gain < _MIN_CUT_GAIN:
+    if like < _MIN_CORRELATION or gain < _MIN_CUT_GAIN:
         return {}
     name = _measured_marker(found)
     corners = _marker_corners(found, ratio if name == "small" else 1.0, camera)

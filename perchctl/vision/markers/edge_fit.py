@@ -61,14 +61,12 @@ PROFILES_PER_SIDE = 24  # number across each side
 SAMPLES_PER_PROFILE = 16  # gradient samples per profile
 Floats = NDArray[np.float32]
 
-SIDE_POSITIONS: Array = np.linspace(
-    -1.0, 1.0, PROFILES_PER_SIDE
-)  # positions along a side, between its margins
+# positions along a side, between its margins
+SIDE_POSITIONS: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
 _PROFILE_OFFSETS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(np.float32)
 _PROFILE_BASIS: Floats = np.stack([np.ones_like(_PROFILE_OFFSETS), _PROFILE_OFFSETS])
-GRADIENT_POSITIONS: Floats = (_PROFILE_OFFSETS[1:] + _PROFILE_OFFSETS[:-1]) * np.float32(
-    0.5
-)  # positions of the gradients
+# positions of the gradients
+GRADIENT_POSITIONS: Floats = (_PROFILE_OFFSETS[1:] + _PROFILE_OFFSETS[:-1]) * np.float32(0.5)
 # Values and slopes at the profiles from a polynomial through the nodes.
 _SIDE_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
 _INVERSE_VANDERMONDE: Array = np.linalg.inv(_SIDE_NODES[:, None] ** np.arange(5.0))
@@ -332,7 +330,7 @@ def _measure_edge_shift(
     information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
-    # MarkerSides that disagree reduce the weight.
+    # Sides that disagree reduce the weight.
     chi2 = float(information @ (mean - shift) ** 2) / max(int(np.count_nonzero(some)) - 1, 1)
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
@@ -416,7 +414,7 @@ _SIDE_INDICES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class MarkerSides:
-    """MarkerSides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; `rims`, the
+    """Sides of m markers: corners `raw_px` (m, 4, 2) and normalised, `corners`; `rims`, the
     cells next to each marker's border; the side lengths `sides_px` and the depths of the cells
     behind them `depth_px` (m, 4); mean cell width `cell_px` (m,); index of the marker with the
     `widest` cells; `winding` of the corners, +1 or -1 (m,); and pixels per normalised unit along
@@ -553,9 +551,8 @@ _SIDE_POSITIONS_F32 = SIDE_POSITIONS.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
 _WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81
 _MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
-_WINDOW_LENGTH_SIGMAS = (
-    1.0 / 0.6
-)  # inverse standard deviation of the wide window, times its half length
+# inverse standard deviation of the wide window, times its half length
+_WINDOW_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_SCALE = 3.5 * 1.4826
 _SIDE_POWERS: Floats = (SIDE_POSITIONS[:, None] ** np.arange(3)).astype(np.float32)
 _SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)

@@ -208,10 +208,8 @@ IdentifiedBy = Literal["bits", "track", "other"]
 _MIN_KNOWN_CELL_FRACTION = 0.6  # share of all cells
 # above white, as a share of the contrast; as bright as possible
 _GLARE, _BRIGHTEST_GREY = 0.25, 250.0
-_MAX_UNKNOWN_BITS: dict[IdentifiedBy, int] = {
-    "bits": 1,
-    "track": 4,
-}  # other codewords differ in two bits
+# other codewords differ in two bits
+_MAX_UNKNOWN_BITS: dict[IdentifiedBy, int] = {"bits": 1, "track": 4}
 _MAX_INVERSION_ERROR_PX = 0.5  # the lens model is valid where its inverse exists
 
 
