@@ -75,14 +75,14 @@ def decide(checkout: Path, log: Path) -> list[Any]:
 
 def print_decisions(log: Path) -> None:
     """The child's part of `decide`: a line of JSON for each decision."""
-    from perchctl.mission import step_mission, table_of
+    from perchctl.mission import load_table, step_mission
     from perchctl.record import read_log, to_exact_json
 
     found = read_log(log)
     profile, state = found.flown_profile, None
     if not found.has_position_variance:  # as a replay does
         profile = profile.with_({"link.unreported": ["variance", *profile.link.unreported]})
-    table = table_of(profile.planner.rows)
+    table = load_table(profile.planner.rows)
     for turn in found.turns:
         if turn.observation is None or turn.role == "waiting":
             continue

@@ -41,7 +41,10 @@ PARTS: dict[str, tuple[str, ...]] = {
         "perchctl.link.mock:MockLink.send",
         "perchctl.link.mock:MockLink.telemetry",
     ),
-    "planner": ("perchctl.flight.loop:step_mission", "perchctl.mission.records:Event.of_tick"),
+    "planner": (
+        "perchctl.flight.loop:step_mission",
+        "perchctl.mission.records:Event.list_from_tick",
+    ),
     "history, turns, log": (
         "perchctl.flight.inputs:add_samples",
         "perchctl.perception.perception:update_calibration",

@@ -2,7 +2,7 @@
 
 An older perchctl has no renderer for what a newer one can see through, so pictures and the
 pipeline that looks at them live in two processes: `Checkout` sends pictures to a child in which
-`perchctl` is the other checkout's. The child needs of it `Profile`, `camera_profile`,
+`perchctl` is the other checkout's. The child needs of it `Profile`, `make_camera_only_profile`,
 `make_pipeline`, `step` and, where there is one, `pictures`; keys of the profile that it does not
 know are left out.
 """
@@ -89,14 +89,14 @@ class Checkout:
 
 def _pipeline(keys: dict[str, dict[str, Any]], camera: Any) -> Any:
     from perchctl.profile import Profile
-    from perchctl.vision import camera_profile, make_pipeline
+    from perchctl.vision import make_camera_only_profile, make_pipeline
 
     sections = {}
     for name, values in keys.items():
         known = type(getattr(Profile(), name)).model_fields
         sections[name] = {key: value for key, value in values.items() if key in known}
     profile = Profile.model_validate(sections)
-    bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
+    bare = make_camera_only_profile(profile).model_copy(update={"pose": profile.pose})
     return make_pipeline(bare, camera)
 
 

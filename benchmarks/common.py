@@ -43,7 +43,7 @@ from perchctl.sim import (  # noqa: E402
 from perchctl.vision import (  # noqa: E402  # noqa: E402
     CameraModel,
     Pipeline,
-    camera_profile,
+    make_camera_only_profile,
     make_pipeline,
     project,
     square_corners,
@@ -84,7 +84,7 @@ def setup_with(
         kalman=kalman or KalmanConfig(),
         merge=merge or MergeConfig(),
     )
-    bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
+    bare = make_camera_only_profile(profile).model_copy(update={"pose": profile.pose})
     return make_pipeline(bare, camera)
 
 

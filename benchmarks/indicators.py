@@ -59,13 +59,13 @@ def largest_state() -> tuple[str, int]:
 
 def press() -> tuple[int, int, int, int]:
     """Functions, files, calls and contexts of the tick in the middle of the recorded press."""
-    from perchctl.mission import step_mission, table_of
+    from perchctl.mission import load_table, step_mission
     from perchctl.record import read_log
 
     log = read_log(LOG)
     profile, state, ticks = log.flown_profile, None, []
     profile = profile.with_({"link.unreported": ["variance", *profile.link.unreported]})
-    table = table_of(profile.planner.rows)
+    table = load_table(profile.planner.rows)
     for turn in log.turns:
         if turn.observation is None or turn.role != "flown":
             continue

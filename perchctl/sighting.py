@@ -41,7 +41,7 @@ from perchctl.vision import (
     PipelineOutput,
     PipelineState,
     camera_covariance,
-    camera_profile,
+    make_camera_only_profile,
     make_pipeline,
     to_grey,
 )
@@ -223,7 +223,7 @@ class Tracker:
         stills: bool,
         attitude: AttitudeAt | None = None,
     ) -> None:
-        bare = profile if attitude else camera_profile(profile)
+        bare = profile if attitude else make_camera_only_profile(profile)
         self.pipeline = make_pipeline(bare, camera)
         self._perception = Perception(self.pipeline, stills=stills, attitude=attitude)
         self._config, self._live, self._stills = profile.camera, live, stills

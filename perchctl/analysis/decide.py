@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.errors import InvalidValue
-from perchctl.mission import Observation, PlannerState, Turn, step_mission, table_of
+from perchctl.mission import Observation, PlannerState, Turn, load_table, step_mission
 from perchctl.profile import Profile
 from perchctl.record import FlightLog, to_exact_json
 from perchctl.vehicle import Command
@@ -80,7 +80,7 @@ def replay_decisions(
     """
     comparison = comparison or Comparison()
     state: PlannerState | None = None
-    table, tick = table_of(profile.planner.rows), 0
+    table, tick = load_table(profile.planner.rows), 0
     for turn in turns:
         obs = observation_of(turn)
         if obs is None or turn.role == "waiting":

@@ -53,10 +53,10 @@ def _battery_text(tick: Tick) -> str:
     if not battery_v >= NO_BATTERY_READING_V:
         return "unknown"
     text = f"{battery_v:.2f} V"
-    if not tick.state.phase.is_before_contact or battery.remaining_s is None:
+    if not tick.state.phase.is_before_contact or battery.left_s is None:
         return text
     if battery.attempts is None:
-        return f"{text}, {_whole(battery.remaining_s)} left"
+        return f"{text}, {_whole(battery.left_s)} left"
     if battery.attempts == 0:
         return f"{text}, not enough for an attempt"
     return f"{text}, enough for {battery.attempts} attempt{'s' if battery.attempts > 1 else ''}"

@@ -22,7 +22,7 @@ from perchctl.mission import (
     Transition,
     Watcher,
     add_rows,
-    table_of,
+    load_table,
 )
 from perchctl.positioning import PositionFeed, VehiclePose
 from perchctl.profile import Profile
@@ -185,7 +185,7 @@ def fly_lockstep(
 
     Errors: NotFound, InvalidValue (calibration, log file, rows).
     """
-    table = add_rows(rows, table_of(profile.planner.rows))
+    table = add_rows(rows, load_table(profile.planner.rows))
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
     opened: LogWatcher | None = None
     if isinstance(log, (Path, str)):

@@ -43,8 +43,8 @@ from perchctl.mission import (
     Tick,
     Transition,
     Watcher,
+    load_table,
     step_mission,
-    table_of,
 )
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
@@ -84,7 +84,7 @@ class FlightParts:
     operator: Callable[[], Operator] = lambda: Operator.NONE
     positions: PositionStatus | None = None
     remarks: Callable[[], Sequence[str]] = tuple
-    table: tuple[Transition, ...] = table_of(None)
+    table: tuple[Transition, ...] = load_table(None)
     judges: tuple[Watcher, ...] = ()
     begin_turn: Callable[[], None] = lambda: None
     simulated: bool = False
@@ -144,7 +144,7 @@ def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:
         with contextlib.suppress(Exception):  # what failed may fail again
             turns.report_failure(inputs, error)
         with contextlib.suppress(Exception):  # of a judge: the error to raise is the first one
-            watchers.event(Event.of_rescue(parts.clock.now(), error, rest.state, rest.text))
+            watchers.event(Event.from_rescue(parts.clock.now(), error, rest.state, rest.text))
         raise
 
 
@@ -266,7 +266,7 @@ def _mission(
         ):
             parts.positions.stop()
             drops_sightings = True
-        events = Event.of_tick(before, state, obs, parts.profile)
+        events = Event.list_from_tick(before, state, obs, parts.profile)
         notes = watchers.take_notes()
         if obs.log_problem is not None and not log_noted:
             log_noted = True
@@ -291,7 +291,7 @@ def _mission(
         watchers.tick(tick)
         if state.phase.is_over:
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
-            return FlightReport.of(
+            return FlightReport.from_state(
                 state,
                 obs,
                 parts.profile,

@@ -33,7 +33,7 @@ from perchctl.link import (
     is_own_uri,
     vehicle_uri,
 )
-from perchctl.mission import FlightReport, Transition, Watcher, add_rows, table_of
+from perchctl.mission import FlightReport, Transition, Watcher, add_rows, load_table
 from perchctl.positioning import PositionFeed, load_comparison, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vision import CameraModel, make_pipeline
@@ -70,7 +70,7 @@ class FlyOptions:
 
 def check_options(options: FlyOptions) -> None:
     """Check the options before anything is opened. Errors: InvalidValue, UsageError."""
-    table_of(options.profile.planner.rows)
+    load_table(options.profile.planner.rows)
     if not options.has_own_link:
         check_uri(options.uri)
     elif load_extension(options.uri, "link.uri") and not options.profile.positioning.source.is_deck:
@@ -121,7 +121,7 @@ def fly_session(
     profile, switch = options.profile, switch or OperatorSwitch()
     camera = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, camera)
-    table = add_rows(rows, table_of(profile.planner.rows))
+    table = add_rows(rows, load_table(profile.planner.rows))
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         clock: WallClock | SimulatedClock = WallClock()

@@ -25,7 +25,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
-    Rest,
+    RestReport,
     RestState,
     SentCommand,
     VisualInertialMotion,
@@ -252,7 +252,7 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
-) -> Rest:
+) -> RestReport:
     """Land whatever still flies, without planner, camera and log, bounded by the landing's time.
     Returns where the vehicle came to rest.
 
@@ -275,7 +275,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return Rest(RestState.UNSEEN)
+            return RestReport(RestState.UNSEEN)
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         problem: str | None = "the link fails"
@@ -300,4 +300,4 @@ def rescue(
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return Rest(RestState.UNSEEN)
+    return RestReport(RestState.UNSEEN)

@@ -23,12 +23,12 @@ from .records import UnfilteredPose as UnfilteredPose
 from .records import Watcher as Watcher
 from .report import Findings as Findings
 from .report import FlightReport as FlightReport
-from .report import Rest as Rest
+from .report import RestReport as RestReport
 from .report import Touchdown as Touchdown
-from .report import claims_of as claims_of
 from .report import find_rest as find_rest
+from .report import find_row_claims as find_row_claims
 from .rest import RestState as RestState
 from .state import PlannerState as PlannerState
 from .table import add_rows as add_rows
-from .table import table_of as table_of
+from .table import load_table as load_table
 from .transition import Transition as Transition

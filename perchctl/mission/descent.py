@@ -68,7 +68,7 @@ from perchctl.profile import PlannerConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, HL_ACTIVE, Command, Idle, Land, RawThrust
 
-MANEUVER = Maneuver(descends=True)
+DESCENT_MANEUVER = Maneuver(descends=True)
 """Maneuver of a descent, for all of its policies."""
 
 # --- by setpoints, and off the magnet ---
@@ -119,7 +119,7 @@ def step_landing(
     call begins the landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
-    state = observe(begin_landing(state), obs, profile, MANEUVER)
+    state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
     return record_command(*act(Context(state)))
 
 
@@ -263,7 +263,7 @@ def _is_falling_free(c: Context) -> bool:
 def _is_standing(c: Context) -> bool:
     """True if the vehicle is proven to stand on the floor."""
     b = c.belief
-    if b.proves and c.held_s(ON_FLOOR) >= FLOOR_DWELL_S:
+    if b.is_telemetry_fresh and c.held_s(ON_FLOOR) >= FLOOR_DWELL_S:
         return True
     placed = b.is_target_positioned and b.is_position_valid and b.dead_reckoned_s is None
     low = b.height_m < MAX_LANDED_HEIGHT_M and not b.is_in_magnet_reach

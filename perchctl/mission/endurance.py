@@ -38,7 +38,7 @@ BACK_OFF_DURATION_S = 3.0
 def compute_battery_outlook(c: Context) -> BatteryOutlook:
     """Return how long the battery lasts, and for how many attempts. An unknown charge counts for at
     most the time that a vehicle without a reading may fly (fault 7)."""
-    energy = c.belief.energy
+    energy = c.belief.battery_fit
     used_mah = energy.counted_discharge * c.profile.vehicle.battery_mah
     load = (c.belief.hover_thrust or FULL_THRUST * energy.mean_load) / FULL_THRUST
     counted_s = predict_hover_time_s(energy, c.profile, load, identify_drive(c.telemetry))
@@ -111,7 +111,7 @@ def is_charge_too_low(c: Context) -> bool:
 def battery_shortfall_text(c: Context) -> str:
     """Return the remaining time, and the times that an attempt, the landing and the reserve
     take."""
-    seconds, (attempt_s, _, landing_s) = c.state.battery.remaining_s, predict_durations_s(c)
+    seconds, (attempt_s, _, landing_s) = c.state.battery.left_s, predict_durations_s(c)
     has = "what the battery has left is not known"
     if seconds is not None:
         has = f"the battery has {seconds:.0f} s left"
@@ -123,7 +123,7 @@ def battery_shortfall_text(c: Context) -> str:
 
 def _no_reading_grace_s(c: Context) -> float:
     """Return the time, s, after which `battery-unknown` lands a vehicle without a reading."""
-    return c.safety.battery_stale_s - max(c.belief.energy.no_reading_s, c.obs.battery_age_s)
+    return c.safety.battery_stale_s - max(c.belief.battery_fit.no_reading_s, c.obs.battery_age_s)
 
 
 def _climb_duration_s(profile: Profile, up_m: float) -> float:

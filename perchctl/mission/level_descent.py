@@ -204,7 +204,7 @@ def descend_level(c: Context) -> Action:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
     thrust = max(MIN_THRUST_FRACTION * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the orders since the newest sample have caused.
-    shown_s = 0.0 if b.last is None else max(0.0, measured_s - descent.climb_measured_s)
+    shown_s = 0.0 if b.last_telemetry is None else max(0.0, measured_s - descent.climb_measured_s)
     gained_mps = GRAVITY_MPS2 * (thrust / hover_thrust - 1.0) * dt_s
     pending_climb_mps = descent.pending_climb_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
     state = _clear_contact_after_fall(c)

@@ -21,7 +21,7 @@ def observe(
         # The setpoint of a catch is far above; keeping it would make the vehicle press.
         setpoint = state.setpoint if state.catch_above_m is None else None
         state = replace(state, since={}, catch_above_m=None, setpoint=setpoint)
-    known = state.belief.last is not None
+    known = state.belief.last_telemetry is not None
     belief = update_belief(state.belief, obs, state.sent(maneuver), profile)
     state = replace(state, belief=belief)
     return _apply_frame_shift(state) if obs.jumped and known else state

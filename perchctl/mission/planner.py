@@ -25,7 +25,7 @@ from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.approach import MIN_HEIGHT_CONTROL_M
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
-from perchctl.mission.table import CONDITIONS, PHASES, TABLE, first_transition
+from perchctl.mission.table import PHASE_CONDITIONS, PHASES, TABLE, first_transition
 from perchctl.mission.transition import Transition
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -66,7 +66,7 @@ def _update_before_decision(
         measured = target is not None and target.measured and target.world_m is not None
         confirmed_frames = confirmed_frames + 1 if measured else 0
     hold = hold_reason(state.belief, maneuver)
-    since = update_since(state.since, CONDITIONS, Context(state), obs.t_s)
+    since = update_since(state.since, PHASE_CONDITIONS, Context(state), obs.t_s)
     state = replace(
         state, confirmed_frames=confirmed_frames, hold=hold, since={} if hold else since
     )

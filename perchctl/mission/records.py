@@ -45,14 +45,14 @@ class Event:
     claims: Claim = Claim.NONE  # claims of the transition
 
     @classmethod
-    def of_rescue(cls, t_s: float, error: BaseException, rest: RestState, text: str) -> Event:
+    def from_rescue(cls, t_s: float, error: BaseException, rest: RestState, text: str) -> Event:
         """Return the note on the vehicle's rest state after an error in flight, as the rescue found
         it."""
         reason = f"{type(error).__name__} in flight: {text}"
         return cls(t_s, EventKind.NOTE, reason, rest=rest)
 
     @classmethod
-    def of_tick(
+    def list_from_tick(
         cls, before: PlannerState | None, state: PlannerState, obs: Observation, profile: Profile
     ) -> list[Event]:
         """Return the events of one tick; `before` is the previous state, None in the first tick."""

@@ -36,7 +36,7 @@ ROTATION_GATE_DEG = 2.0
 ascent allows."""
 
 
-def claims_of(row_name: str) -> Claim:
+def find_row_claims(row_name: str) -> Claim:
     """Return the claims of the built-in row with this name, as a log stores it; none for any other
     name, for example that of your own row."""
     return next((row.claims for row in TABLE if row.name == row_name), Claim.NONE)
@@ -75,12 +75,14 @@ class Findings:
     advice: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False) -> Findings:
+    def from_camera_errors(
+        cls, seen: CameraErrors, camera: CameraConfig, *, simulated: bool = False
+    ) -> Findings:
         """Return the findings from a flight's estimates, with advice on each error that is beyond
         its limit and significant at 95 %; no advice if the flight was `simulated`."""
         latency_s = camera.start_latency_s + seen.delay_s
-        x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
-        sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)
+        x, y, z = (math.degrees(turn) for turn in seen.rotation_rad)
+        sx, sy, sz = (math.degrees(sigma) for sigma in seen.rotation_sigma_rad)
         found, advice = cls(latency_s, seen.delay_sigma_s, (x, y, z), (sx, sy, sz)), []
         if simulated:
             return found
@@ -142,7 +144,7 @@ class FlightReport:
         return any(Claim.PROFILE_SUSPECT in event.claims for event in self.history)
 
     @classmethod
-    def of(
+    def from_state(
         cls,
         state: PlannerState,
         obs: Observation,
@@ -172,14 +174,14 @@ class FlightReport:
             history=history,
             findings=None
             if consistency is None
-            else Findings.of(consistency, profile.camera, simulated=simulated),
+            else Findings.from_camera_errors(consistency, profile.camera, simulated=simulated),
             contact=contact if placed else None,
             touchdown=find_touchdown(Context(replace(state, belief=b))),
         )
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestReport:
     """The rest state of a vehicle, and its touchdown if there was one."""
 
     state: RestState
@@ -193,14 +195,16 @@ class Rest:
         return f"{self.state.value}; it {self.touchdown.text}"
 
 
-def find_rest(state: PlannerState, obs: Observation, profile: Profile, off_s: float) -> Rest | None:
+def find_rest(
+    state: PlannerState, obs: Observation, profile: Profile, off_s: float
+) -> RestReport | None:
     """Return the rest state; None until telemetry has shown the motors off for `off_s`."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
     if c.held_s(MOTORS_STOPPED) < off_s:
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
-    return Rest(found, None if hangs else find_touchdown(c))
+    return RestReport(found, None if hangs else find_touchdown(c))
 
 
 def find_touchdown(c: Context) -> Touchdown | None:

@@ -190,7 +190,7 @@ def latency_reason(c: Context) -> str:
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.delay_s
     found = f"the pictures are {1e3 * (assumed_s + b.mismatch.later_s):.0f} ms old"
-    if not b.proves:  # with late telemetry, pictures in time seem late
+    if not b.is_telemetry_fresh:  # with late telemetry, pictures in time seem late
         return (
             f"pictures and telemetry do not fit each other, by {1e3 * b.mismatch.later_s:.0f} ms; "
             f"the telemetry is {b.telemetry_age_s:.1f} s old"
@@ -216,7 +216,7 @@ def mounting_reason(c: Context) -> str:
     b = c.belief
     turn_rad = b.mismatch.turn_rad
     if turn_rad or b.mounting.is_wrong:
-        turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.turn_rad) / 10.0)
+        turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.rotation_rad) / 10.0)
         turn_deg = 180 if turn_deg == -180 else turn_deg
         text = (
             f"camera seems turned by about {turn_deg} deg from what the profile says: the target "

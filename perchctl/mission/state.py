@@ -19,7 +19,7 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 class BatteryOutlook:
     """Prediction of the energy model: remaining time and attempts; None means unknown."""
 
-    remaining_s: float | None = None  # hover time until `battery-low` would land the vehicle
+    left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # including the landing after the last one; None before the first sighting
     attempts: int | None = None
     used_mah: float = 0.0  # charge consumed by the assumed current

@@ -52,7 +52,7 @@ EXIT_ROWS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for r
 """The phases' own rows, in the order of `PHASES`."""
 TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXIT_ROWS)
 """The built-in table: safety rows first, then the exits of the phases."""
-CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.conditions)
+PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.conditions)
 """The phases' own conditions; `update_belief` updates those of the belief."""
 
 
@@ -155,7 +155,7 @@ def _wrap_row_function(name: str, function: Callable[[Context], T]) -> Callable[
     return call
 
 
-def table_of(name: str | None) -> tuple[Transition, ...]:
+def load_table(name: str | None) -> tuple[Transition, ...]:
     """Return the table of one flight, with the rows that a profile's `planner.rows` names: rows, or
     a function that returns rows. Raises InvalidValue as `add_rows` does, and NotFound."""
     if name is None:

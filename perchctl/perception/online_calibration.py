@@ -317,6 +317,6 @@ def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Camer
     return CameraErrors(
         delay_s=float(found[DELAY - 1]),
         delay_sigma_s=math.hypot(sigma[DELAY - 1], STAMPS_S),
-        turn_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
-        turn_sigma_rad=(tilt_x, tilt_y, math.hypot(sigma[TURN - 1], LARGE_TURN * turn)),
+        rotation_rad=(float(found[TILT_X - 1]), float(found[TILT_Y - 1]), turn),
+        rotation_sigma_rad=(tilt_x, tilt_y, math.hypot(sigma[TURN - 1], LARGE_TURN * turn)),
     )

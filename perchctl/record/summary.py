@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.mission import Claim, ContactOffset, Findings, Touchdown, claims_of
+from perchctl.mission import Claim, ContactOffset, Findings, Touchdown, find_row_claims
 from perchctl.record.read import FlightLog
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -97,7 +97,8 @@ class FlightSummary:
             log_problem=end.get("problem"),
             simulated=simulated,
             is_profile_suspect=any(
-                Claim.PROFILE_SUSPECT in claims_of(str(event.get("row"))) for event in log.events
+                Claim.PROFILE_SUSPECT in find_row_claims(str(event.get("row")))
+                for event in log.events
             ),
         )
 

@@ -6,9 +6,9 @@ from .markers.edge_fit import refine_lines as refine_lines
 from .pipeline import Detector as Detector
 from .pipeline import Pipeline as Pipeline
 from .pipeline import Step as Step
-from .pipeline import camera_profile as camera_profile
 from .pipeline import deinterlace as deinterlace
 from .pipeline import estimate as estimate
+from .pipeline import make_camera_only_profile as make_camera_only_profile
 from .pipeline import make_pipeline as make_pipeline
 from .pipeline import step as step
 from .pose import PoseSetup as PoseSetup

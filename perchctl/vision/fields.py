@@ -30,7 +30,7 @@ _STRONG_DIFFERENCE_RATIO = 5.0
 _MIN_DIFFERENCE_GREY = 8.0
 _NOISE_FLOOR_GREY2 = 0.25  # grey^2 per pixel: strong differences that noise may leave
 _CLASSIFICATION_PERIOD_FRAMES = 3
-_ALIAS_PX, _ALIAS_BLURS = 0.8, 2.45
+_ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
 # cubic interpolation at the midpoint
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
@@ -98,7 +98,7 @@ def interpolate_field(image: Grey, first_row: int) -> Grey:
 def interpolated_sigma_px(blur_px: float) -> float:
     """Return the standard deviation, px, of an edge along interpolated rows with a blur of
     `blur_px`."""
-    return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
+    return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_px * blur_px)
 
 
 def classify_fields(frame: Frame) -> Frame:
@@ -133,15 +133,15 @@ def separate_fields(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[
     kind = state.kind if state.kind == "woven" else frame.fields
     periods_s = _update_periods_s(state, frame)
     if frame.fields == "whole":
-        new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
+        new = FieldState(kind, skipped, state.order_votes, state.is_top_first, periods_s, frame.t_s)
         return new, (frame,)
     state = _vote_on_field_order(
         replace(state, kind=kind, skipped=skipped, periods_s=periods_s), frame
     )
-    if frame.fields != "woven" or state.top_first is None:
+    if frame.fields != "woven" or state.is_top_first is None:
         return state, (frame,)
     top, bottom = field_frames(frame)
-    early, late = (top, bottom) if state.top_first else (bottom, top)
+    early, late = (top, bottom) if state.is_top_first else (bottom, top)
     apart_s = _estimate_period_s(state.periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
@@ -162,16 +162,16 @@ def _estimate_period_s(periods_s: tuple[float, ...]) -> float:
 
 
 def _update_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
-    if state.last_s is not None:
-        gap_s = frame.t_s - state.last_s
+    if state.last_woven_s is not None:
+        gap_s = frame.t_s - state.last_woven_s
         if _VALID_PERIOD_RANGE_S[0] < gap_s < _VALID_PERIOD_RANGE_S[1]:
             return (*state.periods_s[1 - _MAX_KEPT_PERIODS :], gap_s)
     return state.periods_s
 
 
 def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
-    before, votes, top_first = state.previous, state.votes, state.top_first
-    near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
+    before, order_votes, is_top_first = state.previous, state.order_votes, state.is_top_first
+    near = state.last_woven_s is not None and 0.0 < frame.t_s - state.last_woven_s < _MAX_GAP_S
     if near and before is not None and before.shape == frame.image.shape:
         rows = (len(before) - 2) // 2 * 2
         tops = [image[0:rows:2] for image in (before, frame.image)]
@@ -181,9 +181,18 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
         high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
-        votes = min(max(votes + vote, -_MAX_ORDER_VOTES), _MAX_ORDER_VOTES)
-    if top_first is None and abs(votes) > _MIN_ORDER_VOTES:
-        top_first = votes > 0.0
-    elif top_first is not None and (votes if not top_first else -votes) > _MIN_REVERSAL_VOTES:
-        top_first = not top_first
-    return replace(state, last_s=frame.t_s, votes=votes, top_first=top_first, previous=frame.image)
+        order_votes = min(max(order_votes + vote, -_MAX_ORDER_VOTES), _MAX_ORDER_VOTES)
+    if is_top_first is None and abs(order_votes) > _MIN_ORDER_VOTES:
+        is_top_first = order_votes > 0.0
+    elif (
+        is_top_first is not None
+        and (order_votes if not is_top_first else -order_votes) > _MIN_REVERSAL_VOTES
+    ):
+        is_top_first = not is_top_first
+    return replace(
+        state,
+        last_woven_s=frame.t_s,
+        order_votes=order_votes,
+        is_top_first=is_top_first,
+        previous=frame.image,
+    )

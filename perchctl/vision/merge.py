@@ -26,7 +26,7 @@ from perchctl.vision.types import (
     Stage,
 )
 
-CONSISTENT_CHI2 = 4.0
+MAX_CONSISTENT_CHI2 = 4.0
 """Chi-squared per degree of freedom below which the two markers cannot contradict each other."""
 _POSITION_AND_YAW = [X, Y, Z, YAW]
 _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
@@ -34,13 +34,14 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame: `vector` (x, y, z, yaw), velocity (3,), covariance (3, 3) of
-    the position, variance of the yaw, number of frames `unseen`, and the stage of the newest frame.
+    """The target in the tracks' frame: `xyz_yaw` (x, y, z, yaw), velocity (3,), covariance (3, 3)
+    of the position, variance of the yaw, number of frames `unseen`, and the stage of the newest
+    frame.
 
     `bias_m` (3, 4) is the shift of the position by one standard deviation of each constant error.
     """
 
-    vector: Array
+    xyz_yaw: Array
     velocity_mps: Array
     cov_m2: Array
     bias_m: Array
@@ -66,7 +67,7 @@ def measure_markers(
     joint = None
     if config.method == "joint" and len(seen) == 2:
         joint = estimate_pose(seen, t_s, attitude, setup, normal_cam, near)
-    clear = joint is not None and joint.chi2 < CONSISTENT_CHI2
+    clear = joint is not None and joint.chi2 < MAX_CONSISTENT_CHI2
     enough = clear and config.stages == "seen"
     poses: dict[str, MarkerPose] = {} if joint is None else {"joint": joint}
     singles: dict[str, MarkerPose] = {}
@@ -115,7 +116,7 @@ def merge_tracks(
     if len(used) == 1:
         ((name, track),) = used.items()
         return MergedTarget(
-            vector=track.x[_POSITION_AND_YAW],
+            xyz_yaw=track.x[_POSITION_AND_YAW],
             velocity_mps=track.x[VELOCITY],
             cov_m2=track.P[POSITION, POSITION],
             bias_m=track.bias[POSITION],
@@ -130,7 +131,7 @@ def merge_tracks(
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
     return MergedTarget(
-        vector=merge_pair(large.x[order], small.x[order], weights),
+        xyz_yaw=merge_pair(large.x[order], small.x[order], weights),
         velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
         cov_m2=np.diag(variance[:3]),
         bias_m=w[:, None] * large.bias[POSITION] + (1.0 - w[:, None]) * small.bias[POSITION],
@@ -143,7 +144,7 @@ def merge_tracks(
 def widen_covariance(merged: MergedTarget, rival: Array) -> MergedTarget:
     """Return the target with a covariance that covers a second possible position: the state (8,) of
     a contradicting `rival`. With the difference d between both, the covariance grows by d d^T."""
-    off = rival[_POSITION_AND_YAW] - merged.vector
+    off = rival[_POSITION_AND_YAW] - merged.xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
         merged,
@@ -157,9 +158,9 @@ def widen_covariance(merged: MergedTarget, rival: Array) -> MergedTarget:
 # motion to the time of the middle row, which is the frame's time.
 
 
-UNKNOWN_READOUT_S = 0.012
+UNKNOWN_READOUT_SIGMA_S = 0.012
 """Standard deviation of a camera's readout time if the profile does not specify it, s."""
-FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
+FLOW_SIGMA_FRACTION, FLOW_ROTATION_SIGMA = 0.05, 0.015
 """Errors along and across a corner's motion, as shares of it, since the motion was measured one
 frame earlier."""
 
@@ -173,7 +174,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
     readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
-    late = UNKNOWN_READOUT_S if readout_s is None else readout_s
+    late = UNKNOWN_READOUT_SIGMA_S if readout_s is None else readout_s
     out = []
     for d in detections.markers:
         flow = detections.flow_px_s.get(d.marker)
@@ -188,7 +189,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
         if readout_s is None:
             out.append(replace(d, common_px=moved_px))
         else:
-            turned_px = TURN_SIGMA * float(np.abs(moved_px).max())
+            turned_px = FLOW_ROTATION_SIGMA * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
             out.append(
                 replace(
@@ -196,7 +197,7 @@ def undo_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detec
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    common_px=FLOW_SIGMA * moved_px,
+                    common_px=FLOW_SIGMA_FRACTION * moved_px,
                 )
             )
     return out

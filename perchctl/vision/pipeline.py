@@ -136,7 +136,7 @@ def make_pipeline(
             world=make_filter(profile.kalman, in_world=True),
             pose=pose,
             has_gate=profile.kalman.gate,
-            own_place=own,
+            own_target=own,
         ),
         kalman=profile.kalman,
         camera=camera,
@@ -146,7 +146,7 @@ def make_pipeline(
     )
 
 
-def camera_profile(profile: Profile) -> Profile:
+def make_camera_only_profile(profile: Profile) -> Profile:
     """Return the profile for tracking with a camera alone: without mounting and gear, so that poses
     are in the camera frame, and with a pose of each marker."""
     bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
@@ -185,13 +185,19 @@ def step(
         detections = _own_detections(frame, pipeline.own_detector)
     else:
         # The first picture is searched by all methods.
-        first = state.last is None and state.rival is None and state.empty_frames == 0
+        first = state.last_detections is None and state.rival is None and state.empty_frames == 0
         empty = None if first else state.empty_frames
-        place = pipeline.tracks.own_place
+        place = pipeline.tracks.own_target
         own = partial(marker_offset_m, place, frame.t_s, attitude, pipeline.pose)
-        with nullcontext() if state.last is None else one_thread():
+        with nullcontext() if state.last_detections is None else one_thread():
             detections = detect_markers(
-                frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
+                frame,
+                state.last_detections,
+                pipeline.detector,
+                pipeline.camera,
+                expected,
+                empty,
+                own,
             )
     return step_detections(state, detections, attitude, pipeline, near, frame.fields or "whole")
 
@@ -257,7 +263,7 @@ def step_detections(
     if most_certain_pose is not None and sees:
         last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose)
     target = _estimate_at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
-    last = state.last
+    last = state.last_detections
     if anything and verdict.accepted:
         last = detections
     elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S:
@@ -267,7 +273,7 @@ def step_detections(
         in_world=in_world,
         measured=measured,
         target=target or state.target,
-        last=last,
+        last_detections=last,
         last_pose=last_pose if sees or followed.tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
@@ -281,7 +287,7 @@ def step_detections(
         target=target,
         stage=stage,
         disagreeing_frames=disagreeing,
-        lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.targets > 1 else ""),
+        lock_note=verdict.text or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
         fields=fields,
         refused=verdict.is_foreign_target,
     )
@@ -345,7 +351,7 @@ def _estimate_at_frame(
     merged = merge_tracks(tracks, used_poses, pipeline.merge.weights)
     if merged is None:
         return None
-    constants = pipeline.tracks.constants(in_world)
+    constants = pipeline.tracks.select_filter(in_world)
     rival = predict_rival_state(followed.lock, followed.rival, in_world, t_s, constants)
     merged = merged if rival is None else widen_covariance(merged, rival)
     measured = any(n in tracks and tracks[n].t_s == t_s for n in used_poses)
@@ -370,7 +376,7 @@ def _convert_to_frames(
     pipeline: Pipeline,
     spread: bool = True,
 ) -> dict[str, Any]:
-    place_m, yaw_rad = merged.vector[:3], float(merged.vector[3])
+    place_m, yaw_rad = merged.xyz_yaw[:3], float(merged.xyz_yaw[3])
     cov_m2, bias_m = merged.cov_m2, merged.bias_m
     seen: dict[str, Any] = {"velocity_mps": merged.velocity_mps}
     if attitude is not None and in_world:

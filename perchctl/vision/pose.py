@@ -105,7 +105,7 @@ def estimate_pose(
         return pose  # sides between interpolated rows look curled
     # No flat sheet explains the positions of both markers. A curled sheet may, or the corners are
     # wrong.
-    points = replace(points, curled=True)
+    points = replace(points, is_curled=True)
     settled = _refine_from_start(points, solution, prior, most_px)
     if settled is None:
         return pose
@@ -209,7 +209,7 @@ _MAX_STEPS = 8
 # weight of the claimed spread against the residuals, in degrees of freedom
 _CLAIMED_SPREAD_DOF = 8.0
 
-_SMALL_GAIN, _SMALL_STEP = 1.0, 0.005  # rad and m
+_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # rad and m
 # The nonlinearity is the square of the motion over the distance between corners, 20 px or more.
 _MAX_LINEAR_MOTION_PX = 0.3
 
@@ -276,7 +276,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         scored = _score(candidate, points)
         A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
-        if points.curled:
+        if points.is_curled:
             weight = curl_weight(_whiten_curl(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
@@ -291,8 +291,8 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         # reduction of the cost by the step, in squared standard deviations
         gain = float(step.dot(g))
         moved_px = scored.jacobian.dot(step).reshape(-1, 2)
-        small = gain < _SMALL_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEAR_MOTION_PX
-        if small and max(map(abs, step.tolist())) < _SMALL_STEP:
+        small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEAR_MOTION_PX
+        if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
             # Errors are linear in a step of this size.
             error_px = scored.error_px - moved_px
             rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
@@ -319,7 +319,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
     curl = _whiten_curl(points, scored)
-    weight = curl_weight(curl) if points.curled else None
+    weight = curl_weight(curl) if points.is_curled else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
@@ -330,10 +330,10 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> tuple[Array,
     common = gain.dot(points.shift)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
-    curled, twisted = gain.dot(curl).T
+    is_curled, twisted = gain.dot(curl).T
     if weight is not None:
         cov += np.multiply.outer(twisted, twisted)
-    return cov, chi2 / freedom, curled
+    return cov, chi2 / freedom, is_curled
 
 
 def _whiten_curl(points: WeightedCorners, scored: ScoredPose) -> Array:
@@ -464,7 +464,7 @@ class WeightedCorners:
     standard deviations sigma_px (n,). whitening (2n, 2n) makes the errors independent and of unit
     variance. shift (2n, k) holds one whitened standard deviation of each common error: the shift of
     all edges, the detections' `common_px`, and the jitter of a detection's rows. `curl_lift_m` (2n,
-    2) is the result of `curl_lift`, and `curled` is True if the curl changes the weights of the
+    2) is the result of `curl_lift`, and `is_curled` is True if the curl changes the weights of the
     corners."""
 
     object_m: Array
@@ -474,7 +474,7 @@ class WeightedCorners:
     shift: Array
     K: Array
     curl_lift_m: Array
-    curled: bool = False
+    is_curled: bool = False
 
 
 def weigh_corners(

@@ -24,13 +24,14 @@ _SEARCHED_CORNER_SIGMA_PX = 1.0  # standard deviation of corners from a search
 @dataclass(frozen=True)
 class OwnTargetPosition:
     """Position (x, y) of the vehicle's own target in the world frame of the state estimate, None if
-    unknown. A target further than `within_m` from this position belongs to another vehicle."""
+    unknown. A target further than `max_distance_m` from this position belongs to another
+    vehicle."""
 
     xy_m: tuple[float, float] | None = None
-    within_m: float = math.inf
+    max_distance_m: float = math.inf
 
 
-OwnOffset = Callable[[MarkerName, Array], float]
+OwnTargetOffset = Callable[[MarkerName, Array], float]
 """Function that returns the distance of a marker with corners (4, 2) px from the own target's
 position, or inf."""
 
@@ -49,12 +50,12 @@ def marker_offset_m(
     corners_px: Array,
 ) -> float:
     """Return `target_offset_m` for a marker's corners (4, 2) px; infinite beyond
-    `place.within_m`."""
+    `place.max_distance_m`."""
     seen = Detection(marker, corners_px, _SEARCHED_CORNER_SIGMA_PX, refined=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     away_m = _NO_POSE_OFFSET_M if pose is None else target_offset_m(pose, attitude, place, setup)
-    is_bounded = attitude is not None and math.isfinite(place.within_m)
-    return away_m if not is_bounded or away_m <= place.within_m else math.inf
+    is_bounded = attitude is not None and math.isfinite(place.max_distance_m)
+    return away_m if not is_bounded or away_m <= place.max_distance_m else math.inf
 
 
 def target_offset_m(
@@ -76,11 +77,11 @@ def refusal_text(
     if attitude is None or place.xy_m is None:
         return None
     away_m = target_offset_m(pose, attitude, place, setup)
-    if away_m <= place.within_m:
+    if away_m <= place.max_distance_m:
         return None
     return (
         f"a target {away_m:.2f} m from target.expected_xy_m is not followed "
-        f"(target.expected_within_m is {place.within_m:g} m)"
+        f"(target.expected_within_m is {place.max_distance_m:g} m)"
     )
 
 

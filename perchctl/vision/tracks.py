@@ -45,9 +45,9 @@ class TrackSetup:
     world: FilterSetup
     pose: PoseSetup
     has_gate: bool
-    own_place: OwnTargetPosition
+    own_target: OwnTargetPosition
 
-    def constants(self, in_world: bool) -> FilterSetup:
+    def select_filter(self, in_world: bool) -> FilterSetup:
         """Return the filters' constants in the world or the level frame."""
         return self.world if in_world else self.level
 
@@ -73,7 +73,7 @@ def update_tracks(
     setup: TrackSetup,
 ) -> TrackedFrame:
     """Return the tracks after a frame, updated with the poses that the gate accepts."""
-    constants = setup.constants(in_world)
+    constants = setup.select_filter(in_world)
     used_poses = {
         name: track_measurement(pose, attitude, in_world, constants, setup.pose)
         for name, pose in measured.used_poses.items()
@@ -95,14 +95,14 @@ def update_tracks(
             verdict = judge_pose(state.lock, state.rival, sight, constants)
         # A locked target stays locked, however far the estimate's world frame has drifted
         # meanwhile.
-        goes_on = not verdict.restarts or verdict.same_target
+        goes_on = not verdict.restarts_track or verdict.same_target
         goes_on = goes_on and drop_expired(state.lock, None, t_s)[0] is not None
-        another = None if goes_on else refusal_text(pose, attitude, setup.own_place, setup.pose)
+        another = None if goes_on else refusal_text(pose, attitude, setup.own_target, setup.pose)
         if another is not None and verdict.accepted:
             verdict = GateVerdict(False, rival=state.rival, text=another, is_foreign_target=True)
     if not verdict.accepted:
         measured, used_poses = replace(measured, used_poses={}), {}
-    begun = {} if verdict.restarts else old
+    begun = {} if verdict.restarts_track else old
     stepped = {
         n: step_track(begun.get(n), used_poses.get(n), t_s, constants)
         for n in {**begun, **used_poses}
@@ -196,7 +196,7 @@ class GateVerdict:
     """
 
     accepted: bool
-    restarts: bool = False
+    restarts_track: bool = False
     same_target: bool = False
     rival: RivalTrack | None = None
     text: str = ""
@@ -221,18 +221,18 @@ def judge_pose(
     theirs = other is not None and other.squared <= _GATE_CHI2
     if fit.squared <= _GATE_CHI2 and not (theirs and other is not None and other.cost < fit.cost):
         return GateVerdict(accepted=True, rival=rival)
-    if not theirs and _matches_last_view(lock, sight, fit.off):
+    if not theirs and _matches_last_view(lock, sight, fit.residual):
         return GateVerdict(
-            accepted=True, restarts=True, same_target=True, text=_ESTIMATE_JUMPED_TEXT
+            accepted=True, restarts_track=True, same_target=True, text=_ESTIMATE_JUMPED_TEXT
         )
-    if not theirs and _matches_previous_track(lock, sight, fit.off, constants):
+    if not theirs and _matches_previous_track(lock, sight, fit.residual, constants):
         return GateVerdict(
-            accepted=True, restarts=True, same_target=True, text=_PREVIOUS_POSE_WRONG_TEXT
+            accepted=True, restarts_track=True, same_target=True, text=_PREVIOUS_POSE_WRONG_TEXT
         )
     seen = _update_rival(rival if theirs else None, sight, fit, constants)
     if _is_rival_accepted(lock, seen, sight):
         text = f"target taken up anew, {fit.distance_m:.2f} m from where it was expected"
-        return GateVerdict(accepted=True, restarts=True, text=text)
+        return GateVerdict(accepted=True, restarts_track=True, text=text)
     return GateVerdict(accepted=False, rival=seen, text=f"not the tracked target: {seen.text}")
 
 
@@ -271,7 +271,7 @@ def update_lock(
     lock: Lock | None, track: MarkerTrack, sight: FramePose, verdict: GateVerdict
 ) -> Lock:
     """Return the lock after the accepted pose `sight`, with the track that the pose updated."""
-    anew = verdict.restarts and not verdict.same_target
+    anew = verdict.restarts_track and not verdict.same_target
     before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
         track=track,
@@ -290,12 +290,12 @@ def update_lock(
 class _Misfit:
     """The misfit of a pose in (yaw, x, y, z), (4,), and its covariance (4, 4)."""
 
-    off: Array
+    residual: Array
     S: Array
 
     @cached_property
     def squared(self) -> float:
-        return float(self.off @ np.linalg.solve(self.S, self.off))
+        return float(self.residual @ np.linalg.solve(self.S, self.residual))
 
     @property
     def cost(self) -> float:
@@ -304,29 +304,29 @@ class _Misfit:
 
     @property
     def distance_m(self) -> float:
-        return float(np.linalg.norm(self.off[1:]))
+        return float(np.linalg.norm(self.residual[1:]))
 
 
 def _compute_misfit(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> _Misfit:
     wanted, measured = predict_track(track, sight.t_s, constants), sight.measured
     # The largest drift counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(sight.t_s - track.t_s, 0.0)
-    off = measured.z - wanted.x[MEASURED]
-    off[0] = wrap_rad(float(off[0]))
+    residual = measured.z - wanted.x[MEASURED]
+    residual[0] = wrap_rad(float(residual[0]))
     # A constant error shifts both.
     bias = wanted.bias[MEASURED] if measured.bias is None else measured.bias - wanted.bias[MEASURED]
     R = constants.R if measured.R is None else measured.R
     S = wanted.P[MEASURED, MEASURED] + drift_m**2 * _POSITION_AXES + R + bias @ bias.T
-    return _Misfit(off, S + np.diag(_unmodelled_sigma(_range_m(sight)) ** 2))
+    return _Misfit(residual, S + np.diag(_unmodelled_sigma(_range_m(sight)) ** 2))
 
 
 def _is_clearly_consistent(track: MarkerTrack, sight: FramePose, constants: FilterSetup) -> bool:
     """True if errors outside any covariance explain the misfit, as in most frames: a fast check."""
     wanted = predict_track(track, sight.t_s, constants, with_cov=False)
-    off = sight.measured.z - wanted.x[MEASURED]
-    off[0] = wrap_rad(float(off[0]))
-    off /= _unmodelled_sigma(_range_m(sight))
-    return float(off @ off) <= _GATE_CHI2
+    residual = sight.measured.z - wanted.x[MEASURED]
+    residual[0] = wrap_rad(float(residual[0]))
+    residual /= _unmodelled_sigma(_range_m(sight))
+    return float(residual @ residual) <= _GATE_CHI2
 
 
 def _range_m(sight: FramePose) -> float:
@@ -349,29 +349,29 @@ def _matches_last_view(lock: Lock, sight: FramePose, off_in_world: Array) -> boo
     if not sight.in_world or dt_s > _MAX_CALM_DURATION_S:
         return False
     range_m = _range_m(sight)
-    off = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
-    off[1:] = sight.pose.e_m - lock.pose.e_m
+    residual = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
+    residual[1:] = sight.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
     unclaimed = _unmodelled_sigma(range_m)
-    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, off_in_world))
-    calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE_CHI2
+    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (residual, off_in_world))
+    calm = float((residual * residual / (unclaimed**2 + moved * moved)).sum()) <= _GATE_CHI2
     return calm and seen < _MAX_REMAINING_MISFIT_FRACTION * jumped
 
 
 def _matches_previous_track(
-    lock: Lock, sight: FramePose, off: Array, constants: FilterSetup
+    lock: Lock, sight: FramePose, residual: Array, constants: FilterSetup
 ) -> bool:
     """True if the pose fits the track before the lock's last pose much better than the present
-    track, from which it differs by `off`. At few pictures per second, a single wrong pose passes
-    the gate and gives the track of a camera alone a wrong velocity."""
+    track, from which it differs by `residual`. At few pictures per second, a single wrong pose
+    passes the gate and gives the track of a camera alone a wrong velocity."""
     if lock.before is None or sight.in_world:
         return False
     fit, unclaimed = (
         _compute_misfit(lock.before, sight, constants),
         _unmodelled_sigma(_range_m(sight)),
     )
-    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.off, off))
+    before, now = (float(((o / unclaimed) ** 2).sum()) for o in (fit.residual, residual))
     return fit.squared <= _GATE_CHI2 and before < _MAX_REMAINING_MISFIT_FRACTION * now
 
 
@@ -386,12 +386,12 @@ def _update_rival(
         assert track is not None
         whole = before.whole_frames + int(sight.has_both_markers)
         return replace(before, track=track, frames=before.frames + 1, whole_frames=whole)
-    turned_rad, farther_m = abs(float(fit.off[0])), float(fit.off[3])
-    range_differs = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(fit.S[3, 3])
+    turned_rad, farther_m = abs(float(fit.residual[0])), float(fit.residual[3])
+    has_different_range = farther_m**2 > _MAX_SAME_RANGE_SIGMAS**2 * float(fit.S[3, 3])
     where = f"{fit.distance_m:.2f} m away from it"
     if turned_rad > _MIN_REPORTED_ROTATION_RAD:
         where += f" and turned by {math.degrees(turned_rad):.0f} deg"
-    if range_differs:
+    if has_different_range:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or of another size"
     return RivalTrack(
@@ -400,7 +400,7 @@ def _update_rival(
         since_s=sight.t_s,
         frames=1,
         whole_frames=int(sight.has_both_markers),
-        range_differs=range_differs,
+        has_different_range=has_different_range,
         text=where,
     )
 
@@ -418,7 +418,7 @@ def _is_rival_accepted(lock: Lock, rival: RivalTrack, sight: FramePose) -> bool:
     # A position outside the picture is not known to be empty.
     return (
         (sight.is_lock_in_view or unseen_s >= 2.0 * REACQUIRE_S)
-        and not rival.range_differs
+        and not rival.has_different_range
         and rival.whole_frames >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
     )
@@ -484,13 +484,13 @@ def update_last_pose(
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)
     # Across the line of sight, because the distance of a far target is uncertain along it.
-    off = [
+    residual = [
         R.T.dot(way_m - seen_m)[:2] / pose.tvec_m[2]
         for way_m in _camera_displacements_m(then, attitude, setup)
     ]
     by_place, by_speed = (
         old + _ERROR_UPDATE_FRACTION * (float(new.dot(new)) - old)
-        for old, new in zip(before.error_rad2, off, strict=True)
+        for old, new in zip(before.error_rad2, residual, strict=True)
     )
     return LastPose(pose, attitude, (by_place, by_speed))
 

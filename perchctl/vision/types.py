@@ -164,7 +164,7 @@ class EdgeShift:
 
     shift_px: float
     sigma_px: float
-    age: int = 0
+    age_frames: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ class Detections:
     large: Detection | None = None
     small: Detection | None = None
     mirrored: bool = False  # a marker decoded as its mirror image
-    targets: int = 0  # complete targets, with both markers, found by a search
+    target_count: int = 0  # complete targets, with both markers, found by a search
     flow_px_s: dict[MarkerName, Array] = field(
         default_factory=dict
     )  # (4, 2), or (2,) for all corners
@@ -357,7 +357,7 @@ class RivalTrack:
     since_s: float
     frames: int
     whole_frames: int
-    range_differs: bool
+    has_different_range: bool
     text: str
 
 
@@ -382,15 +382,16 @@ class MeasuredMarkers:
 @dataclass(frozen=True, eq=False)
 class FieldState:
     """State of the detection of interlacing in a stream: `kind` of the last examined frame,
-    `skipped` frames ago; whether the top field is first, None until the `votes` decide; the last
-    periods of the frames; the time `last_s` and the picture of the `previous` woven frame."""
+    `skipped` frames ago; whether the top field is first, None until the `order_votes` decide; the
+    last periods of the frames; the time `last_woven_s` and the picture of the `previous` woven
+    frame."""
 
     kind: PictureKind | None = None
     skipped: int = 0
-    votes: float = 0.0
-    top_first: bool | None = None
+    order_votes: float = 0.0
+    is_top_first: bool | None = None
     periods_s: tuple[float, ...] = ()
-    last_s: float | None = None
+    last_woven_s: float | None = None
     previous: NDArray[np.uint8] | None = None
 
 
@@ -402,7 +403,7 @@ class PipelineState:
     in_world: bool = False  # frame of the tracks: world of the state estimate, or level
     measured: MeasuredMarkers = MeasuredMarkers()  # poses of the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
-    last: Detections | None = None
+    last_detections: Detections | None = None
     last_pose: LastPose | None = None  # the last pose
     disagreeing_frames: int = 0
     empty_frames: int = 0  # number of successive frames without a marker
@@ -430,12 +431,12 @@ class CameraErrors:
     """Errors of the profile's camera latency and mounting estimated in flight, each with one
     standard deviation.
 
-    `delay_s` is the latency beyond the profile's. `turn_rad` is the rotation of the mounting about
-    body x, y and z. `turn_sigma_rad` includes the constant error of the attitude, which moves the
-    target just as an error in roll and pitch of the mounting does.
+    `delay_s` is the latency beyond the profile's. `rotation_rad` is the rotation of the mounting
+    about body x, y and z. `rotation_sigma_rad` includes the constant error of the attitude, which
+    moves the target just as an error in roll and pitch of the mounting does.
     """
 
     delay_s: float
     delay_sigma_s: float
-    turn_rad: tuple[float, float, float]
-    turn_sigma_rad: tuple[float, float, float]
+    rotation_rad: tuple[float, float, float]
+    rotation_sigma_rad: tuple[float, float, float]

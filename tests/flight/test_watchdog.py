@@ -67,7 +67,9 @@ class Rig:
 
     def turn(self, t_s: float, command: Command = HOVER, state: PlannerState = IN_AIR) -> None:
         obs = Observation(t_s, telemetry(t_s, self.z_m))
-        self.dog.tick(t_s + PERIOD_S, remembering(state, last=obs.telemetry), command, obs)
+        self.dog.tick(
+            t_s + PERIOD_S, remembering(state, last_telemetry=obs.telemetry), command, obs
+        )
 
     def after(self, silent_s: float, **changes: object) -> Command | None:
         """What is sent so long after the turn; telemetry 20 ms old, altered."""
@@ -383,7 +385,7 @@ def test_without_positions_a_silent_loop_is_followed_by_a_level_descent(
     profile = Profile.model_validate({"positioning": by})
     dog = Watchdog(profile, lambda: Operator.NONE, lambda now_s: now_s - T_S + age_s)
     obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=age_s)
-    dog.tick(T_S + PERIOD_S, remembering(IN_AIR, last=obs.telemetry), HOVER, obs)
+    dog.tick(T_S + PERIOD_S, remembering(IN_AIR, last_telemetry=obs.telemetry), HOVER, obs)
     for i in range(60):
         now_s = T_S + LAND_S + 0.1 + 0.05 * i
         command = dog.poll(now_s, telemetry(now_s - 0.02, 1.0, supervisor=AIRBORNE))
@@ -397,7 +399,7 @@ def test_what_has_waited_for_the_loop_is_felt_too() -> None:
     for waits in (True, False):
         dog = Watchdog(profile, lambda: Operator.NONE)
         obs = Observation(T_S, telemetry(T_S, 0.1), position_age_s=0.05)
-        low = remembering(IN_AIR, phase=Phase.LANDING, last=obs.telemetry)
+        low = remembering(IN_AIR, phase=Phase.LANDING, last_telemetry=obs.telemetry)
         dog.tick(T_S + PERIOD_S, low, RawThrust(HOVER_THRUST), obs)
         samples: list[Telemetry] = []
         for i in range(1, 121):

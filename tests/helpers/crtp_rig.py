@@ -196,12 +196,12 @@ class Pilot(Client):
 
     def advance(self, dt_s: float) -> None:
         """Let time pass, and wait until the log data up to then have arrived."""
-        remaining_s = dt_s
-        while remaining_s > 1e-9:
-            part_s = min(CHUNK_S, remaining_s)
+        left_s = dt_s
+        while left_s > 1e-9:
+            part_s = min(CHUNK_S, left_s)
             self.sim.advance(part_s)
             self.t_s = round(self.t_s + part_s, 6)
-            remaining_s -= part_s
+            left_s -= part_s
             self._sync()
 
     def stream(self, dt_s: float, send: Callable[[], None], period_s: float = 0.02) -> None:

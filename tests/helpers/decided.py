@@ -11,7 +11,7 @@ import json
 from dataclasses import replace
 from functools import cache
 
-from perchctl.mission import step_mission, table_of
+from perchctl.mission import load_table, step_mission
 from perchctl.record import json_line, read_log, to_exact_json
 from perchctl.record.header import computer_record
 from perchctl.record.read import parse_turn
@@ -33,7 +33,7 @@ def decided_here(name: str) -> tuple[bytes, ...]:
     profile, records = log.flown_profile, iter(log.turn_records)
     if not log.has_position_variance:  # as the replay does
         profile = profile.with_({"link.unreported": ["variance", *profile.link.unreported]})
-    table = table_of(profile.planner.rows)
+    table = load_table(profile.planner.rows)
     names = _DECIDED + (_SINCE_4 if changed["version"] >= 4 else ())
     for line in lines:
         record = json.loads(line)

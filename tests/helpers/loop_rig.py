@@ -22,7 +22,7 @@ from perchctl.mission import (
     Operator,
     Phase,
     PlannerState,
-    Rest,
+    RestReport,
     SentCommand,
     Tick,
 )
@@ -302,10 +302,10 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rest:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> RestReport:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
-        told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state
+        told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last_telemetry": known} | state
         before = PlannerState.on_ground(Observation(known.t_s, ground), self.profile)
         before = remembering(before, **told)
         began_s = self.link.now_s

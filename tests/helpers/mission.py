@@ -16,7 +16,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Severity
 from perchctl.mission.state import LevelDescent
-from perchctl.mission.table import CONDITIONS, PHASES
+from perchctl.mission.table import PHASE_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
 from perchctl.vision import TargetEstimate
@@ -170,8 +170,8 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
     field's name. Conditions, as `since`, go where they are counted."""
     since = changes.pop("since", None)
     if since is not None:
-        changes["since"] = {each: s for each, s in since.items() if each in CONDITIONS}
-        held = {each: s for each, s in since.items() if each not in CONDITIONS}
+        changes["since"] = {each: s for each, s in since.items() if each in PHASE_CONDITIONS}
+        held = {each: s for each, s in since.items() if each not in PHASE_CONDITIONS}
         state = replace(state, belief=replace(state.belief, since=held))
     if "hover_thrust" in changes:
         thrust = changes.pop("hover_thrust")
@@ -224,6 +224,6 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         entry_m=(0.0, 0.0, z_m),
         last_target_world_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
-        energy=FINE_BATTERY,
+        battery_fit=FINE_BATTERY,
         contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
     )

@@ -120,10 +120,10 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
-        state = remembering(state_in(Phase.ALIGN), energy=moment.energy, hover_thrust=0.0)
-        remaining_s = compute_battery_outlook(context_at(state, obs, profile)).remaining_s
-        assert remaining_s is not None
-        assert remaining_s <= 1.1 * (end_s - moment.t_s) + 10.0
+        state = remembering(state_in(Phase.ALIGN), battery_fit=moment.energy, hover_thrust=0.0)
+        left_s = compute_battery_outlook(context_at(state, obs, profile)).left_s
+        assert left_s is not None
+        assert left_s <= 1.1 * (end_s - moment.t_s) + 10.0
 
 
 def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
@@ -165,7 +165,7 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
 def flown(
     phase: Phase, energy: BatteryFit, seconds: float, profile: Profile = PROFILE, **tel: Any
 ) -> PlannerState:
-    begin = remembering(state_in(phase), energy=energy)
+    begin = remembering(state_in(phase), battery_fit=energy)
     return fly(begin, at(**tel), seconds, profile, one_phase=True).state
 
 
@@ -210,7 +210,7 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
     assert gated or phase is not Phase.ALIGN or state.row == "aligned"
     if gated and energy.rest_v is None:
         assert "not known" in state.reason
-        assert state.battery.remaining_s is None
+        assert state.battery.left_s is None
 
 
 def test_a_reading_that_stands_still_is_none() -> None:
@@ -218,7 +218,7 @@ def test_a_reading_that_stands_still_is_none() -> None:
     for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
         later = observation(state.t_s + 4.0, battery_age_s=age_s)
         state = replace(observing(state, later), t_s=later.t_s)
-        assert (compute_battery_outlook(Context(state)).remaining_s is not None) is known
+        assert (compute_battery_outlook(Context(state)).left_s is not None) is known
 
 
 @pytest.mark.parametrize(

@@ -47,12 +47,12 @@ CAMERA = CameraConfig(latency_s=0.06)
 def test_only_what_is_surely_beyond_its_gate_is_an_advice(
     seen: CameraErrors, camera: CameraConfig, words: str
 ) -> None:
-    found = Findings.of(seen, camera)
+    found = Findings.from_camera_errors(seen, camera)
     assert found.latency_s == pytest.approx(camera.start_latency_s + seen.delay_s)
     assert bool(found.advice) is bool(words)
     assert words in "".join(found.advice)
     # The scenario's camera is nobody's: it says nothing of the profile.
-    dreamt = Findings.of(seen, camera, simulated=True)
+    dreamt = Findings.from_camera_errors(seen, camera, simulated=True)
     assert dreamt == replace(found, advice=())
 
 
@@ -76,7 +76,7 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
         imu=ImuMotion(t_s=BEGIN_S), lateral_offset_m=(0.03, 0.04), lateral_sigma_m=0.01
     )
     state = remembering(state_in(phase), reckoning=reckoning, contact=None)
-    report = FlightReport.of(state, observation(BEGIN_S), BY_TARGET, (), None)
+    report = FlightReport.from_state(state, observation(BEGIN_S), BY_TARGET, (), None)
     if phase is Phase.LANDED:
         assert report.contact is None
         return

@@ -112,7 +112,7 @@ def context(
     sample = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
     state = remembering(
         state_in(Phase.LANDING, NOW_S - since_s, z_m),
-        t_s=NOW_S - TICK_S, last=sample, reckoned_height_m=z_m,
+        t_s=NOW_S - TICK_S, last_telemetry=sample, reckoned_height_m=z_m,
         contact_z_m=z_m if held else None, in_reach_since_s=NOW_S - 2.0 if held else None,
         reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
@@ -403,7 +403,7 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     profile, stale = PROFILES[positioning], hung > 1.0
     state = remembering(
         state_in(Phase.LANDING, z_m=MIN_HANGING_HEIGHT_M),
-        last=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_above_m=1.0,
+        last_telemetry=telemetry(NOW_S, MIN_HANGING_HEIGHT_M), catch_above_m=1.0,
         since={MOTORS_STOPPED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s

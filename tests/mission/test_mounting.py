@@ -55,7 +55,7 @@ def test_a_turned_mounting_is_seen_and_measured(deg: float) -> None:
     watch, moved_m = flown(turned(deg))
     assert watch.is_wrong
     assert moved_m < 0.17
-    assert abs(math.remainder(math.degrees(watch.turn_rad) - deg, 360.0)) < 15.0
+    assert abs(math.remainder(math.degrees(watch.rotation_rad) - deg, 360.0)) < 15.0
 
 
 @given(st.floats(-30, 30))
@@ -79,7 +79,7 @@ def test_a_turned_mounting_shows_in_the_vehicles_own_tilts(deg: int) -> None:
     with each tilt, while the vehicle flies on."""
     watch = _tilting(deg)
     assert watch.is_wrong
-    assert abs(math.remainder(math.degrees(watch.turn_rad) - deg, 360.0)) < 5.0
+    assert abs(math.remainder(math.degrees(watch.rotation_rad) - deg, 360.0)) < 5.0
 
 
 def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
@@ -96,7 +96,7 @@ def test_a_lean_is_where_the_upward_axis_meets_the_target() -> None:
 def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
-    watch = MountingMonitor(contradictions=9, turn_rad=math.pi / 2)
+    watch = MountingMonitor(contradictions=9, rotation_rad=math.pi / 2)
     flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
     assert flight.state.row == "mounting"
     assert isinstance(flight.command, PositionSetpoint)

@@ -360,7 +360,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
 ) -> None:
     """A world with its y up: the vehicle rises, its position slides, its height and its vertical
     speed stand. It is let down by what its accelerometer feels, one with an offset too."""
-    begin = remembering(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
+    begin = remembering(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last_telemetry=None)
     it = Falls(hover, felt_too_much_g)
     state = fly(begin, it, 5.0, MOCAP, feels=True).state
     assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
@@ -446,7 +446,9 @@ def gains_beside(
     """Flown by positions that gain so much speed aside which the accelerometer does not feel."""
     felt = Felt()
     begun = felt(at()(BEGIN_S))
-    state = remembering(state, last=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu))
+    state = remembering(
+        state, last_telemetry=begun.telemetry, reckoning=DeadReckoning(imu=begun.imu)
+    )
     for t_s in times(lasts_s):
         if not state.belief.diverged:
             beside = replace(state.belief.reckoning, estimate_only_mps=(0.0, estimate_only_mps))

@@ -31,7 +31,7 @@ from perchctl.mission.table import (
     Transition,
     add_rows,
     first_transition,
-    table_of,
+    load_table,
 )
 from perchctl.vehicle import (
     CRASHED,
@@ -238,7 +238,7 @@ CASES: dict[str, Case] = {
     "align-timeout": Case(P.ALIGN, P.RECOVER, aside(0.2), state={"entered_s": -20.0}),
     "too-little-left": Case(
         P.ALIGN, P.LANDING, at(battery_v=3.24), 1.0, O.SAFETY,
-        state={"energy": replace(FINE_BATTERY, rest_v=3.77)},
+        state={"battery_fit": replace(FINE_BATTERY, rest_v=3.77)},
     ),
     "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
     "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen()),
@@ -461,10 +461,10 @@ def test_a_profile_names_rows_or_a_function_that_makes_them_anew(
     module.other = partial(called.append, 1)  # as a log's profile might name anything
     monkeypatch.setitem(sys.modules, "my_rows", module)
     for name in ("ROWS", "make"):
-        assert [row.name for row in table_of(f"my_rows:{name}") if row.name == "mine"] == ["mine"]
+        assert [row.name for row in load_table(f"my_rows:{name}") if row.name == "mine"] == ["mine"]
     for name, words in (("fails", "ZeroDivisionError"), ("other", "must be"), ("none", "no none")):
         with pytest.raises(PerchError, match=words):
-            table_of(f"my_rows:{name}")
+            load_table(f"my_rows:{name}")
     assert called == []
 
 

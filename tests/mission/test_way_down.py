@@ -485,7 +485,7 @@ def test_nothing_is_caught_on_an_old_speed() -> None:
 def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves: bool) -> None:
     """It was at rest before the silence and is at rest after it: on the floor. Else what is
     remembered moves with the estimate."""
-    state = landing(1.0, last=telemetry(10.0, 1.0))
+    state = landing(1.0, last_telemetry=telemetry(10.0, 1.0))
     new, _ = step_mission(state, at(0.02, obs={"jumped": True})(10.0 + gap_s), PROFILE)
     assert state.belief.takeoff_position_m is not None
     assert new.belief.takeoff_position_m is not None
@@ -501,7 +501,7 @@ def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None
     """By the line in the world that was it would dive by the step."""
     lands = AIRBORNE | HL_ACTIVE
     state = landing(
-        0.4, order_count=3, last_order_s=9.0, last=telemetry(9.98, 0.4, supervisor=lands)
+        0.4, order_count=3, last_order_s=9.0, last_telemetry=telemetry(9.98, 0.4, supervisor=lands)
     )
     up = at(0.9, obs={"jumped": True}, velocity_mps=(0.0, 0.0, -0.3), supervisor=lands)
     state, command = step_mission(state, up(10.0), PROFILE)

@@ -144,7 +144,7 @@ def test_each_turn_is_found_about_its_own_axis(axis: int) -> None:
     turn = [0.0, 0.0, 0.0]
     turn[axis] = math.radians(5.0)
     found = _seen(Truth(turn_rad=(turn[0], turn[1], turn[2])))
-    for truth, seen, sigma in zip(turn, found.turn_rad, found.turn_sigma_rad, strict=True):
+    for truth, seen, sigma in zip(turn, found.rotation_rad, found.rotation_sigma_rad, strict=True):
         assert abs(seen - truth) < 3.0 * sigma
         assert sigma < math.radians(1.5)
 
@@ -164,8 +164,8 @@ def test_what_is_claimed_is_what_is_so() -> None:
             drift_mps=tuple(rng.normal(0.0, 0.01, 2)),
         )
         found = _seen(truth, seed, told_s=delay_s + rng.uniform(-0.01, 0.01))
-        off = np.array([found.delay_s - delay_s, *(np.array(found.turn_rad) - turn)])
-        ratios.append((off / [found.delay_sigma_s, *found.turn_sigma_rad]) ** 2)
+        off = np.array([found.delay_s - delay_s, *(np.array(found.rotation_rad) - turn)])
+        ratios.append((off / [found.delay_sigma_s, *found.rotation_sigma_rad]) ** 2)
     mean = np.mean(ratios, axis=0)
     assert ((mean > 0.5) & (mean < 2.0)).all(), mean
 
@@ -173,10 +173,10 @@ def test_what_is_claimed_is_what_is_so() -> None:
 def test_a_vehicle_at_rest_tells_nothing() -> None:
     found = _seen(Truth(delay_s=0.05, turn_rad=(0.1, 0.1, 0.5), rests=True))
     assert found.delay_sigma_s > 0.05
-    assert min(found.turn_sigma_rad) > math.radians(3.0)
+    assert min(found.rotation_sigma_rad) > math.radians(3.0)
 
 
 def test_a_world_that_jumps_spoils_nothing() -> None:
     found = _seen(Truth(delay_s=0.02, jump_m=0.3))
     assert found.delay_s == pytest.approx(0.02, abs=0.006)
-    assert abs(found.turn_rad[2]) < 3.0 * found.turn_sigma_rad[2]
+    assert abs(found.rotation_rad[2]) < 3.0 * found.rotation_sigma_rad[2]

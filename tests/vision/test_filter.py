@@ -267,7 +267,7 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
 ) -> None:
     """A pose that is solved with roll and pitch off by a little is off by `tilt` times it."""
     setup = build(gear_body_m=(0.01, -0.02, 0.03), kalman=KalmanConfig(attitude_sigma_deg=0.3))
-    constants = setup.tracks.constants(in_world)
+    constants = setup.tracks.select_filter(in_world)
     true = Attitude(0.0, *rpy, (0.3, -0.2, 1.0))
     wrong = Attitude(0.0, rpy[0] + bias_rad[0], rpy[1] + bias_rad[1], rpy[2], true.position_m)
     in_body = rotation_from_rpy(rpy[0], rpy[1], 0.0).T @ e_m

@@ -342,5 +342,5 @@ def test_of_two_targets_in_view_one_is_told(build: Build) -> None:
     watch.show(LOCKED)
     T = make_T(rot_z(0.0), TARGET_M - [0.0, 0.0, RANGE_M])
     seen = seen_from(T, TARGET_M, watch.k / HZ, watch.rng)
-    _, output = step_detections(watch.state, replace(seen, targets=2), None, watch.setup)
+    _, output = step_detections(watch.state, replace(seen, target_count=2), None, watch.setup)
     assert "more than one target in view" in output.lock_note

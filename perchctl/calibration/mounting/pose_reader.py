@@ -17,7 +17,7 @@ from perchctl.vision import (
     MarkerPose,
     PipelineOutput,
     camera_covariance,
-    camera_profile,
+    make_camera_only_profile,
     make_pipeline,
 )
 
@@ -31,7 +31,7 @@ class PoseReader:
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
         # A pipeline that knows nothing of how the camera is mounted.
-        bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
+        bare = make_camera_only_profile(profile).model_copy(update={"pose": profile.pose})
         self._perception = Perception(make_pipeline(bare, camera), bare)
         self._live = live
         self.mirrored = 0

@@ -75,7 +75,7 @@ class Belief:
     profile: Profile
     sent: SentOrders = field(default_factory=lambda: SentOrders(maneuver=Maneuver()))
     t_s: float = 0.0  #: time of the last update
-    last: Telemetry | None = None  #: newest sample that an update has used
+    last_telemetry: Telemetry | None = None  #: newest sample that an update has used
 
     # --- world frame of the state estimate, and how far to trust it ---
     takeoff_position_m: Vector | None = None  #: position where the flight started
@@ -111,7 +111,7 @@ class Belief:
     thrust_mismatch_since_s: float | None = None
     #: last tick in which that difference was older than `THRUST_REPORT_DELAY_S`
     last_thrust_mismatch_s: float = -math.inf
-    energy: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
+    battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
     @classmethod
     def on_ground(cls, obs: Observation, profile: Profile) -> Belief:
@@ -160,7 +160,7 @@ class Belief:
         return self.obs.t_s - tel.t_s + oldest_s
 
     @cached_property
-    def proves(self) -> bool:
+    def is_telemetry_fresh(self) -> bool:
         """True if all parts of the telemetry are recent enough to count as evidence."""
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
 
@@ -231,7 +231,7 @@ class Belief:
     def is_position_valid(self) -> bool:
         """True if the position is trusted and the telemetry is recent enough to count as
         evidence."""
-        return self.is_position_trusted and self.proves
+        return self.is_position_trusted and self.is_telemetry_fresh
 
     @cached_property
     def latency_s(self) -> float:
@@ -369,7 +369,9 @@ class Belief:
     @cached_property
     def target(self) -> TargetBelief:
         """The belief about the target, from the pipeline's newest estimate."""
-        return TargetBelief.of(self.obs.target, self.obs.t_s, self.latency_s, self.profile)
+        return TargetBelief.from_estimate(
+            self.obs.target, self.obs.t_s, self.latency_s, self.profile
+        )
 
     @cached_property
     def mismatch(self) -> Mismatch:

@@ -177,7 +177,7 @@ def is_hover_thrust(b: Belief) -> bool:
         and vz < MAX_MOTIONLESS_CLIMB_MPS
     )
     return (
-        b.proves
+        b.is_telemetry_fresh
         and b.is_position_valid
         and MIN_HOVER_THRUST <= tel.thrust < PRESS_SATURATION_FRACTION * FULL_THRUST
         and b.speed_mps < MAX_HOVER_SPEED_MPS

@@ -87,7 +87,7 @@ class MountingMonitor:
     is_confirmed: bool = False
     is_target_stationary: bool = False  # the target has stood still so far
     contradictions: int = 0  # successive sightings that contradict the mounting
-    turn_rad: float = 0.0  # rotation of the mounting with which the target would stand still
+    rotation_rad: float = 0.0  # rotation of the mounting with which the target would stand still
 
     @property
     def is_wrong(self) -> bool:
@@ -162,5 +162,5 @@ def _judge_mounting(watch: MountingMonitor, against: int) -> MountingMonitor:
         and spread_m >= MIN_TARGET_SPREAD_M
         and unexplained_m <= MAX_UNEXPLAINED_FRACTION * spread_m
     ):
-        return replace(watch, contradictions=against + 1, turn_rad=-cmath.phase(turn))
+        return replace(watch, contradictions=against + 1, rotation_rad=-cmath.phase(turn))
     return watch

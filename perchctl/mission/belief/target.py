@@ -63,7 +63,7 @@ class TargetBelief:
         return self.world_m is not None and self.error_z_m > MIN_FAR_ABOVE_M
 
     @classmethod
-    def of(
+    def from_estimate(
         cls, target: TargetEstimate | None, t_s: float, latency_s: float, profile: Profile
     ) -> TargetBelief:
         """Return the belief at `t_s` from the pipeline's estimate; `latency_s` is the age of a

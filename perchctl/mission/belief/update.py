@@ -55,7 +55,7 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawThrust
 
-CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
+BELIEF_CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions of the belief."""
 MAX_TARGET_SUPPORT_DISTANCE_M = 0.3
 """Distance below the target within which any support is the target, m."""
@@ -98,7 +98,7 @@ def update_belief(belief: Belief, obs: Observation, sent: SentOrders, profile: P
 
 def has_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
     """True if the planner has not run for longer than a position may be missing."""
-    return belief.last is not None and obs.t_s - belief.t_s > profile.positioning.hold_s
+    return belief.last_telemetry is not None and obs.t_s - belief.t_s > profile.positioning.hold_s
 
 
 def start_dead_reckoning(b: Belief) -> Belief:
@@ -163,7 +163,7 @@ def _shift_belief_frame(b: Belief) -> Belief:
     vehicle. Ground, contact and all other remembered positions move with the frame. They stay if
     samples are missing before the jump, since the vehicle may have moved, or if external positions
     have just returned and the jump ends a drift."""
-    obs, last = b.obs, b.last
+    obs, last = b.obs, b.last_telemetry
     first_jump_s = obs.t_s if b.first_jump_s is None else b.first_jump_s
     if last is None:
         return replace(b, first_jump_s=first_jump_s)
@@ -233,7 +233,10 @@ def _integrate_reckoning(b: Belief) -> DeadReckoning:
     """Integrate accelerometer and estimate, and learn biases from positions in the open."""
     obs, source = b.obs, b.profile.positioning.source
     believed = (
-        b.is_position_valid and b.proves and b.dead_reckoned_s is None and b.first_jump_s is None
+        b.is_position_valid
+        and b.is_telemetry_fresh
+        and b.dead_reckoned_s is None
+        and b.first_jump_s is None
     )
     new = advance_reckoning(
         b.reckoning,
@@ -246,12 +249,12 @@ def _integrate_reckoning(b: Belief) -> DeadReckoning:
         pushed=source.is_target and not b.is_velocity_corrected,
     )
     in_free_air = b.sent.maneuver.in_free_air and b.height_m > MAX_STANDING_HEIGHT_M
-    if believed and b.is_velocity_corrected and in_free_air and b.last:
-        new = learn_velocity_bias(new, b.last, obs.telemetry)
+    if believed and b.is_velocity_corrected and in_free_air and b.last_telemetry:
+        new = learn_velocity_bias(new, b.last_telemetry, obs.telemetry)
     else:
         new = reset_means(new)
-    if b.is_position_trusted and not source.is_target and b.last is not None:
-        new = add_position_step(new, b.last, obs.telemetry)
+    if b.is_position_trusted and not source.is_target and b.last_telemetry is not None:
+        new = add_position_step(new, b.last_telemetry, obs.telemetry)
     return new
 
 
@@ -356,12 +359,12 @@ def _find_in_reach_since_s(b: Belief, new: DeadReckoning) -> float | None:
 def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     """Return the climb since the previous tick of a vehicle without a position, m; 0 with a
     position."""
-    obs, before, last = b.obs, b.reckoning.imu, b.last
+    obs, before, last = b.obs, b.reckoning.imu, b.last_telemetry
     if b.dead_reckoned_s is None or before is None:
         return 0.0
     dt_s = max(0.0, min(MAX_HEIGHT_STEP_S, obs.imu.t_s - before.t_s))
     tel = obs.telemetry
-    heard_again = obs.imu.silent_s > before.t_s and b.proves and not obs.jumped
+    heard_again = obs.imu.silent_s > before.t_s and b.is_telemetry_fresh and not obs.jumped
     if heard_again and last is not None and tel.start == last.start:
         return tel.position_m[2] - last.position_m[2]
     return new.velocity_mps[2] * dt_s
@@ -374,12 +377,12 @@ def _update_estimators(b: Belief) -> Belief:
     """Return the belief with its conditions, hover thrust, battery and mounting after the tick."""
     obs, maneuver = b.obs, b.sent.maneuver
     held = bool(hold_reason(b, maneuver))
-    fresh = [each for each in CONDITIONS if is_evidence_fresh(b, each)]
+    fresh = [each for each in BELIEF_CONDITIONS if is_evidence_fresh(b, each)]
     since: dict[Condition[Any], float] = update_since(b.since, fresh, b, obs.t_s)
     if held:
         since = keep_independent(since)  # a hold interrupts the evidence
     dt_s = max(0.0, obs.t_s - b.t_s)
-    last_s = obs.telemetry.t_s - dt_s if b.last is None else b.last.t_s
+    last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
     sample_s = max(0.0, min(MAX_SAMPLE_WEIGHT_S, obs.telemetry.t_s - last_s))  # 0: no new sample
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.climbs_to_target or b.target.error_z_m > near_m
@@ -395,10 +398,12 @@ def _update_estimators(b: Belief) -> Belief:
     return replace(
         b,
         t_s=obs.t_s,
-        last=obs.telemetry,
+        last_telemetry=obs.telemetry,
         since=since,
         hover=found,
-        energy=update_from_telemetry(b.energy, obs.telemetry, obs.battery_age_s, dt_s, mah),
+        battery_fit=update_from_telemetry(
+            b.battery_fit, obs.telemetry, obs.battery_age_s, dt_s, mah
+        ),
         mounting=b.mounting if held else _update_mounting(b),
     )
 
@@ -406,7 +411,7 @@ def _update_estimators(b: Belief) -> Belief:
 def _update_mounting(b: Belief) -> MountingMonitor:
     obs, target = b.obs, b.obs.target
     measured = target is not None and target.measured and target.world_m is not None
-    if not (obs.new_frame and measured and b.proves and b.sent.maneuver.in_free_air):
+    if not (obs.new_frame and measured and b.is_telemetry_fresh and b.sent.maneuver.in_free_air):
         return b.mounting
     assert b.last_target_world_m is not None
     return update_monitor(

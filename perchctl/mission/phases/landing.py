@@ -6,7 +6,7 @@ from perchctl.mission.belief.contact import MOTORS_STOPPED
 from perchctl.mission.belief.reckoning import correct_bias_for_wrong_positions
 from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
-from perchctl.mission.descent import MANEUVER, act, enter_descent
+from perchctl.mission.descent import DESCENT_MANEUVER, act, enter_descent
 from perchctl.mission.phase import Claim, Outcome, Phase
 from perchctl.mission.rest import RestState, find_rest_state
 from perchctl.mission.state import PlannerState
@@ -63,7 +63,7 @@ def _outcome_after_hanging(before: Outcome | None) -> Outcome | None:
 
 LANDING = PhaseDefinition(
     phase=Phase.LANDING,
-    maneuver=MANEUVER,
+    maneuver=DESCENT_MANEUVER,
     enter=enter,
     act=act,
     exits=(

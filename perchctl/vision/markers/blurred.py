@@ -40,26 +40,30 @@ from perchctl.vision.markers.photometric_fit import Alignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
 _BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # initial guesses of the blur
-_SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # largest error of an expected position
+# largest error of an expected position
+_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
 _MIN_START_CORRELATION = 0.5
 # minimum at an expected position; textures seldom reach it, and each costs a fit
 _MIN_EXPECTED_CORRELATION = 0.45
 _MAX_CANDIDATES = 3
-_CENTRE_GREY, _BEYOND_GREY = 0.3, 0.6  # grey of areas with unknown content
+_CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # grey of areas with unknown content
 _MAX_DUPLICATE_DISTANCE = 0.15  # distance, as a share of a side, of candidates that count as one
 _PAPER_HALF_SIDES = 1.3  # half sides of a marker that are certainly paper
 
 
 def find_expected_blurred(
-    picture: Picture, expected: Mapping[MarkerName, Array], turn: int | None = None
+    picture: Picture, expected: Mapping[MarkerName, Array], blur_guess_index: int | None = None
 ) -> dict[MarkerName, RefinedCorners]:
     """Return the first marker found near its `expected` corners (4, 2) px; empty if none is found.
 
-    An even or odd `turn` selects fits that start with little or with much blur; None tries both.
+    An even or odd `blur_guess_index` selects fits that start with little or with much blur; None
+    tries both.
     """
     image, patterns = picture.image, picture.setup.patterns
-    blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
+    blurs_px = (
+        _BLURS_PX if blur_guess_index is None else (_BLURS_PX[blur_guess_index % len(_BLURS_PX)],)
+    )
     for name in MARKERS:
         corners = expected.get(name)
         if corners is None or not is_inside_picture(corners, image.shape):
@@ -101,8 +105,14 @@ def _rank_quads(
     for name in MARKERS:
         like = np.array([correlate_pattern(image, quad, patterns[name]) for quad in quads])
         for i in np.flatnonzero(like.max(axis=1) > _MIN_START_CORRELATION):
-            turn = int(like[i].argmax())
-            found.append((float(like[i, turn]), name, np.roll(quads[i], turn, axis=0)))
+            blur_guess_index = int(like[i].argmax())
+            found.append(
+                (
+                    float(like[i, blur_guess_index]),
+                    name,
+                    np.roll(quads[i], blur_guess_index, axis=0),
+                )
+            )
     chosen: list[tuple[MarkerName, Array]] = []
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
         middle, room_px = (
@@ -121,7 +131,7 @@ def _align_by_correlation(image: NDArray[np.uint8], corners_px: Array, pattern: 
     """Return the corners moved to the best correlation of the drawing with the picture."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
-    reach = max(_SEARCH_PX, _SEARCH_SIDES * side_px)
+    reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
     centre = corners_px.mean(axis=0)
     half = float(np.abs(corners_px - centre).max()) * _PAPER_HALF_SIDES
     h, w = image.shape
@@ -155,7 +165,7 @@ def _render_template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np
     white = np.where(inside, pattern.drawing.cells[cell[..., 1], cell[..., 0]], 1.0)
     if pattern.drawing.centre is not None:
         white[np.abs(own).max(axis=2) < pattern.drawing.ratio] = _CENTRE_GREY
-    white[np.abs(own).max(axis=2) > _PAPER_HALF_SIDES] = _BEYOND_GREY
+    white[np.abs(own).max(axis=2) > _PAPER_HALF_SIDES] = _OUTSIDE_GREY
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
 
@@ -165,13 +175,13 @@ def _render_template(pattern: Pattern, own: Array, side_px: float) -> NDArray[np
 
 _MIN_SIGMA_PX = 0.015
 _BLUR_SIGMA = 0.012  # share of the blur: no picture equals its drawing with uniform blur
-_MIN_PATTERN, _MIN_CORRELATION = 0.9, 0.9
-_MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
+_MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
+_MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
 _MAX_CELL_DEVIATION = 0.3
-_MAX_FLIP, _MAX_FLIP_SIGMA = 0.4, 0.35
+_MAX_WRONG_BIT_DEGREE, _MAX_WRONG_BIT_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_SIGMA = 0.06  # share of the side
 _MIN_REACH_PX = 3.0
-_MIN_GROWTH, _MAX_GROWTH = 0.6, 1.6  # ratio of the mean sides
+_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6  # ratio of the mean sides
 _MIN_SIDE_RATIO = 0.6  # ratio of the shortest side to the longest
 
 
@@ -206,7 +216,7 @@ def align_marker(
     sides_px, areas = side_lengths_px(found.corners_px), [found.corners_px, start_px]
     if (
         sides_px.min() < _MIN_SIDE_RATIO * sides_px.max()
-        or not _MIN_GROWTH < float(sides_px.mean()) / side_px < _MAX_GROWTH
+        or not _MIN_SIZE_RATIO < float(sides_px.mean()) / side_px < _MAX_SIZE_RATIO
         or np.prod(signed_double_area(np.stack(areas))) <= 0.0
     ):
         return None
@@ -226,9 +236,9 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool
     the marker, it is above 0.95.
     """
     return (
-        found.pattern > _MIN_PATTERN
+        found.pattern > _MIN_INNER_CORRELATION
         and found.fit_correlation > _MIN_CORRELATION
-        and _MIN_STRENGTH < found.strength < _MAX_STRENGTH
+        and _MIN_PATTERN_CONTRAST < found.pattern_contrast < _MAX_PATTERN_CONTRAST
         and found.cell_deviation < _MAX_CELL_DEVIATION
         and found.sigma_px < max_sigma * mean_side_px(found.corners_px)
     )
@@ -237,4 +247,7 @@ def is_verified(found: Alignment, max_sigma: float = _MAX_ALIGNED_SIGMA) -> bool
 def is_distinctive(found: Alignment) -> bool:
     """True if any other codeword would look different. All of 36 other markers that `is_verified`
     accepted had a flip above 0.5."""
-    return found.wrong_bit_degree < _MAX_FLIP and found.wrong_bit_sigma < _MAX_FLIP_SIGMA
+    return (
+        found.wrong_bit_degree < _MAX_WRONG_BIT_DEGREE
+        and found.wrong_bit_sigma < _MAX_WRONG_BIT_SIGMA
+    )

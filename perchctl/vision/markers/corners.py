@@ -21,7 +21,8 @@ from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 UNIT_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners of the unit square in the marker's own coordinates, (4, 2)."""
-NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # indices of corner i's neighbours
+# indices of corner i's neighbours
+NEXT_CORNER, PREVIOUS_CORNER = (np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2]))
 OUTWARD_NORMALS: Array = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
 """Outward normal of each side in the marker's own coordinates."""
 _UNIT_SQUARE_F32 = UNIT_SQUARE.astype(np.float32)
@@ -71,7 +72,7 @@ def increment_homography(H: Array, p: Array) -> Array:
 
 def side_lengths_px(corners_px: Array) -> Array:
     """Return the side lengths (..., 4) of squares with corners (..., 4, 2)."""
-    d = corners_px.take(NEXT, axis=-2) - corners_px
+    d = corners_px.take(NEXT_CORNER, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
 

@@ -175,7 +175,7 @@ def _search_near_pose(start: RigidPose, texture: Texture, view: Overview) -> Rig
     for growth in _SCALE_CANDIDATES:
         t = start.t * (1.0, 1.0, 1.0 / growth)
         wide = render_drawing(RigidPose(start.R, t).H, texture, lattice, _SEARCH_RANGE_NODES)
-        mask = view.seen.astype(np.float32)
+        mask = view.is_visible.astype(np.float32)
         score = cv2.matchTemplate(wide, view.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
@@ -258,7 +258,7 @@ class Overview:
 
     lattice: Lattice
     grey: Grey
-    seen: NDArray[np.bool_]
+    is_visible: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=8)
@@ -352,7 +352,7 @@ def correlate_drawing(H: Array, texture: Texture, view: Overview) -> tuple[float
     """Return the view's correlation with the drawing projected by H (3, 3), and the contrast in
     grey levels."""
     lattice = view.lattice
-    rows, columns = np.nonzero(view.seen)
+    rows, columns = np.nonzero(view.is_visible)
     at = lattice.first + lattice.step * np.stack([columns, rows], axis=1).astype(np.float64)
     on = (
         np.abs(apply_homography(np.asarray(np.linalg.inv(H), np.float64), at)).max(axis=1)
@@ -372,7 +372,7 @@ def correlate_drawing(H: Array, texture: Texture, view: Overview) -> tuple[float
 
 
 LARGE_PAPER_HALF_SIDES = 1.25  # half sides of the large marker that are certainly paper
-_LARGE_PLACES, _SMALL_CELL_PLACES = 24, 6  # points along a cell's side
+_POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # points along a cell's side
 # share of a cell's side near its ends, where the next cell's corner blurs the edge
 _END_MARGIN_CELLS = 0.15
 _CENTRAL_MARKER_HALF_SIDES = 1.2  # half sides of the central marker, which hides the large one
@@ -381,11 +381,11 @@ _TEXTURE_SIZE = 320
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Points along the drawing's edges: `at` (n, 2) and `normal` (n, 2) from black to white. Per
-    point (n,): number of its `line`, standard deviation of that line's print error, width of the
-    adjacent `cell`, and whether the edge belongs to the `small` marker."""
+    """Points along the drawing's edges: `points` (n, 2) and `normal` (n, 2) from black to white.
+    Per point (n,): number of its `line`, standard deviation of that line's print error, width of
+    the adjacent `cell`, and whether the edge belongs to the `small` marker."""
 
-    at: Array
+    points: Array
     normal: Array
     line: NDArray[np.intp]
     print_sigma: Array
@@ -405,19 +405,19 @@ def make_outline(drawing: Drawing, large_tolerance: float, small_tolerance: floa
     hidden = _CENTRAL_MARKER_HALF_SIDES * drawing.ratio
     edges = [
         edge
-        for edge in _iterate_edges(drawing.cells, 1.0, _LARGE_PLACES)
+        for edge in _iterate_edges(drawing.cells, 1.0, _POINTS_PER_LARGE_CELL)
         if np.abs(edge[0]).max(axis=1).min() > hidden
     ]
     large = len(edges)
     if drawing.centre is not None:
-        edges += _iterate_edges(drawing.centre, drawing.ratio, _SMALL_CELL_PLACES)
+        edges += _iterate_edges(drawing.centre, drawing.ratio, _POINTS_PER_SMALL_CELL)
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
     places = np.array([len(each) for each in at])
     cell = np.repeat(cells, places)
     small = np.repeat(np.arange(len(edges)) >= large, places)
     return Outline(
-        at=np.concatenate(at),
+        points=np.concatenate(at),
         normal=np.repeat(normals, places, axis=0),
         line=np.repeat([numbers[name] for name in names], places),
         print_sigma=np.where(small, small_tolerance, large_tolerance) * cell,
@@ -468,12 +468,12 @@ def _iterate_edges(
 # Half lengths of the profiles per round. An ascent blurs edges near the picture's border by several
 # pixels.
 _PROFILE_HALF_LENGTHS_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
-_PROFILE_REACH_CELLS, _LEAST_REACH_PX = 0.4, 3.0
+_PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
 # below the first, no further round; above the second, the fit has failed
-_CUT_STILL_PX, _CUT_SETTLED_PX = 0.02, 0.5
-_LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE = 8.0, 0.35  # grey levels; share of the median
+_CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
+_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35  # grey levels; share of the median
 _MIN_EDGE_POINTS = 24
-_TUKEY_SCALE, _LEAST_SCALE_PX = 3.5, 0.15
+_TUKEY_SCALE, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 _ROBUST_VARIANCE_FACTOR = 1.3  # compensates the reduction of squared residuals by robust weights
 _LINE_SIGMA_PX = 0.02  # error of a whole line, due to lens and light
 # standard deviations of a prediction
@@ -527,12 +527,12 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _EdgePoints:
-    """Edge points of an outline in the picture: `at` (n, 2) px and unit normal (n, 2) from black to
-    white. `J` (n, 7) is their motion along the normal with rotation, translation and the shift of
-    all edges (white over black), `px_per_unit` (n,) the scale across the edge, and `index` (n,)
-    their index in the outline."""
+    """Edge points of an outline in the picture: `points` (n, 2) px and unit normal (n, 2) from
+    black to white. `J` (n, 7) is their motion along the normal with rotation, translation and the
+    shift of all edges (white over black), `px_per_unit` (n,) the scale across the edge, and `index`
+    (n,) their index in the outline."""
 
-    at: Array
+    points: Array
     normal: Array
     J: Array
     px_per_unit: Array
@@ -570,9 +570,11 @@ def fit_pose(
         pose = RigidPose(turn @ pose.R, pose.t + step[3:])
         total[:6] += step
         moved_px = float(np.abs(places.J[:, :6] @ step).max())
-        if moved_px < _CUT_STILL_PX:
+        if moved_px < _CONVERGED_FIT_PX:
             break
-    if found is None or not (moved_px <= _CUT_SETTLED_PX and pose.t[2] > 0.0):  # also for NaN
+    if found is None or not (
+        moved_px <= _MAX_CONVERGENCE_ERROR_PX and pose.t[2] > 0.0
+    ):  # also for NaN
         return None
     return _make_pose_fit(pose, found, places, outline)
 
@@ -599,7 +601,7 @@ def _edge_points_in_view(
     mask: NDArray[np.uint8] | None,
 ) -> _EdgePoints:
     h, w = shape[:2]
-    X = np.column_stack([outline.at, np.zeros(len(outline.at))]) @ pose.R.T + pose.t
+    X = np.column_stack([outline.points, np.zeros(len(outline.points))]) @ pose.R.T + pose.t
     ahead = X[:, 2] > 0.05
     x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
     near = np.flatnonzero(ahead & (np.hypot(*x.T) < make_lattice(camera).reach))
@@ -647,14 +649,14 @@ def _measure_offsets(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the offset of each point's edge along its normal, (n,) px, and whether an edge was
     found."""
-    half_px = np.maximum(half_px, _LEAST_REACH_PX)
-    grey = sample_profiles(image, places.at[:, None], places.normal[:, None], half_px)[:, 0]
+    half_px = np.maximum(half_px, _MIN_PROFILE_REACH_PX)
+    grey = sample_profiles(image, places.points[:, None], places.normal[:, None], half_px)[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
     u = half_px[:, None] * GRADIENT_POSITIONS.astype(np.float64)
     mass = gradient * np.exp(-0.5 * (u / (0.5 * half_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
-    least = max(_LEAST_EDGE_CONTRAST, _LEAST_CONTRAST_SHARE * float(np.median(contrast)))
+    least = max(_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION * float(np.median(contrast)))
     shows = (contrast > least) & (total > 0.25 * least)
     offset_px = (mass * u).sum(axis=1) / np.where(shows, total, 1.0)
     return np.clip(offset_px, -half_px, half_px), shows
@@ -669,7 +671,7 @@ def _solve_step(
     for _ in range(4):
         error = offset_px - J @ step
         size = np.abs(error)
-        scale = max(1.4826 * float(np.median(size[shows])), _LEAST_SCALE_PX)
+        scale = max(1.4826 * float(np.median(size[shows])), _MIN_TUKEY_SCALE_PX)
         weight = np.maximum(1.0 - (size / (_TUKEY_SCALE * scale)) ** 2, 0.0) ** 2 * shows
         mass = float(weight.sum())
         if mass < 0.5 * _MIN_EDGE_POINTS:

@@ -61,7 +61,7 @@ from perchctl.vision.markers.pattern import (
     is_correlated_with_pattern,
 )
 from perchctl.vision.markers.search import FoundMarkers, SearchMode, search, search_half_size
-from perchctl.vision.target_selection import OwnOffset
+from perchctl.vision.target_selection import OwnTargetOffset
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -88,9 +88,9 @@ class Prior:
 
     Attributes:
         expected: the markers' predicted corners, each (4, 2) px; empty if no target is expected.
-        both: `expected`, with a missing marker derived from the other one.
+        expected_both: `expected`, with a missing marker derived from the other one.
         search_mode: the kinds of search for this frame.
-        turn: its parity selects the first guess of the blur; None tries all.
+        blur_guess_index: its parity selects the first guess of the blur; None tries all.
         was_recent: a marker was found at most `MAX_CUT_FIT_AGE_S` before this frame; False without
             edge fits.
         was_cut: `was_recent`, and no marker can have been completely in that picture.
@@ -99,13 +99,13 @@ class Prior:
     """
 
     expected: Mapping[MarkerName, Array]
-    both: Mapping[MarkerName, Array]
+    expected_both: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    turn: int | None
+    blur_guess_index: int | None
     was_recent: bool
     was_cut: bool
     edge_shift: EdgeShift | None
-    own: OwnOffset | None
+    own: OwnTargetOffset | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +140,13 @@ class CornerMethod:
 
 
 def _is_target_expected(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
-    return prior.search_mode != "fits" and bool(prior.both) and picture.setup.fits_lines
+    return prior.search_mode != "fits" and bool(prior.expected_both) and picture.setup.fits_lines
 
 
 def _fit_edges(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    return replace(found, corners=refine_expected_markers(picture, prior.both, prior.edge_shift))
+    return replace(
+        found, corners=refine_expected_markers(picture, prior.expected_both, prior.edge_shift)
+    )
 
 
 def _is_edge_fit_empty(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
@@ -153,7 +155,7 @@ def _is_edge_fit_empty(picture: Picture, prior: Prior, found: CornerFindings) ->
 
 def _search_half_size(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     # If no side was found, a close target has usually moved further than a profile reaches.
-    searched = search_half_size(picture, prior.both)
+    searched = search_half_size(picture, prior.expected_both)
     if searched is None:
         return found
     corners = _refine_found(picture, searched)
@@ -165,7 +167,7 @@ def _is_half_size_search_empty(picture: Picture, prior: Prior, found: CornerFind
 
 
 def _fit_visible_part(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
-    corners = add_partly_visible(picture, prior.both, found.corners, prior.edge_shift)
+    corners = add_partly_visible(picture, prior.expected_both, found.corners, prior.edge_shift)
     return replace(found, corners=corners)
 
 
@@ -183,7 +185,7 @@ def _fit_drawing(picture: Picture, prior: Prior, found: CornerFindings) -> Corne
 def _can_be_cut(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     if found.corners or not prior.was_recent:
         return False
-    return is_target_cut(prior.both, picture.image.shape, picture.hidden)
+    return is_target_cut(prior.expected_both, picture.image.shape, picture.hidden)
 
 
 def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
@@ -193,7 +195,9 @@ def _fit_cut_target(picture: Picture, prior: Prior, found: CornerFindings) -> Co
 def _should_search(picture: Picture, prior: Prior, found: CornerFindings) -> bool:
     if prior.search_mode in ("blurred", "fits"):
         return False
-    if not found.corners and (not prior.was_cut or can_be_whole(prior.both, picture.image.shape)):
+    if not found.corners and (
+        not prior.was_cut or can_be_whole(prior.expected_both, picture.image.shape)
+    ):
         return True
     return _is_marker_missing(picture, found.corners, prior.expected)
 
@@ -213,7 +217,7 @@ def _can_be_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> bo
 def _search_blurred(picture: Picture, prior: Prior, found: CornerFindings) -> CornerFindings:
     bare = replace(picture, hidden=None)
     if prior.expected:
-        seen = find_expected_blurred(bare, prior.expected, prior.turn)
+        seen = find_expected_blurred(bare, prior.expected, prior.blur_guess_index)
     else:
         seen = find_blurred(bare)
     return replace(found, corners=improve_corners(bare, seen))
@@ -300,7 +304,7 @@ def detect_markers(
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: OwnOffset | None = None,
+    own: OwnTargetOffset | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
@@ -323,27 +327,27 @@ def make_prior(
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: OwnOffset | None = None,
+    own: OwnTargetOffset | None = None,
 ) -> Prior:
     """Return the knowledge before the frame; arguments as in `detect_markers`."""
     expected = dict(expected) if expected else extrapolate_corners(previous, frame.t_s)
     search_mode = _choose_search_mode(empty_frames, bool(expected), setup.fits_lines)
-    turn = None
+    blur_guess_index = None
     if empty_frames is not None and search_mode in ("near", "fits"):
-        turn = (empty_frames + 2) // 4
+        blur_guess_index = (empty_frames + 2) // 4
     # A part of the target is recognized only at a position measured a short time ago.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = previous is not None and 0.0 < frame.t_s - previous.t_s <= MAX_CUT_FIT_AGE_S
     was_recent = was_recent and setup.fits_lines and bool(last)
     shift = None if previous is None else previous.edge_shift
     if shift is not None:
-        age = shift.age + 1
-        shift = replace(shift, age=age) if age < _MAX_EDGE_SHIFT_AGE else None
+        age = shift.age_frames + 1
+        shift = replace(shift, age_frames=age) if age < _MAX_EDGE_SHIFT_AGE else None
     return Prior(
         expected=expected,
-        both=add_missing_marker(expected, setup.ratio, camera),
+        expected_both=add_missing_marker(expected, setup.ratio, camera),
         search_mode=search_mode,
-        turn=turn,
+        blur_guess_index=blur_guess_index,
         was_recent=was_recent,
         was_cut=was_recent and not can_be_whole(last, frame.image.shape),
         edge_shift=shift,
@@ -363,7 +367,7 @@ def _detect(frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: Prio
         large=_make_detection("large", seen, frame.fields),
         small=_make_detection("small", seen, frame.fields),
         mirrored=found.search.mirrored and not seen,
-        targets=found.search.targets,
+        target_count=found.search.target_count,
         edge_shift=next((each for each in shifts if each is not None), None),
     )
 
@@ -490,7 +494,7 @@ _MIN_ACCURATE_CELL_PX = 6.0  # from this size on, lines are as accurate as the d
 _MIN_ACCURATE_CELL_BLURS = 6.0
 _ALIGN_RANGE = 0.3  # share of the side
 # A marker whose position follows from the other one may have a larger standard deviation.
-_MOST_SIGMA_ALONE, _MOST_TRACKED_SIGMA = 0.06, 0.12  # share of the side
+_MAX_UNTRACKED_SIGMA, _MAX_TRACKED_SIGMA = 0.06, 0.12  # share of the side
 _DEFAULT_BLUR_PX = 1.5  # initial guess if the blur is unknown
 _SIDE_BLUR_SIGMA_PX = 0.37
 """Standard deviation that pixels and interpolation add to the blur of sides but not to that of a
@@ -525,7 +529,7 @@ def improve_corners(picture: Picture, seen: _FoundCorners, searched: bool = Fals
         ):
             continue
         alone = _OTHER_MARKER[name] not in better
-        max_sigma = _MOST_SIGMA_ALONE if alone else _MOST_TRACKED_SIGMA
+        max_sigma = _MAX_UNTRACKED_SIGMA if alone else _MAX_TRACKED_SIGMA
         blur_px = _blur_px(better.get(name))
         exact = align_marker(picture, name, start, _ALIGN_RANGE, blur_px, max_sigma, alone)
         if exact is not None:
@@ -668,18 +672,20 @@ _MAX_FIELD_MOTION_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
 def average_fields(first: Detections, second: Detections) -> Detections:
     """Return the mean of both fields' corners, valid for either order of the fields. If one marker
     is in both fields, a marker in only one field is omitted."""
-    both: dict[MarkerName, Detection] = {}
+    expected_both: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)
         if one is None or other is None:
             continue
         way_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
         if float(np.linalg.norm(way_px)) < _MAX_FIELD_MOTION_SIDES * mean_side_px(one.corners_px):
-            both[name] = _average_detections(one, other)
-    if not both:
+            expected_both[name] = _average_detections(one, other)
+    if not expected_both:
         alone = first if first.markers else second
         return replace(alone, mirrored=alone.mirrored or second.mirrored)
-    return replace(first, large=both.get("large"), small=both.get("small"), mirrored=False)
+    return replace(
+        first, large=expected_both.get("large"), small=expected_both.get("small"), mirrored=False
+    )
 
 
 def _average_detections(a: Detection, b: Detection) -> Detection:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision.markers.corners import scale_square
-from perchctl.vision.markers.pattern import Pattern, make_drawing, make_pattern, make_rim
+from perchctl.vision.markers.pattern import Pattern, make_border_cells, make_drawing, make_pattern
 from perchctl.vision.types import CameraModel, Frame, MarkerName
 
 MIRROR_INDEX = 1
@@ -68,13 +68,13 @@ def make_detector_setup(
         ),
         patterns={
             "large": make_pattern(
-                make_rim(
+                make_border_cells(
                     large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
                 ),
                 make_drawing(large_bits, small_bits, ratio),
             ),
             "small": make_pattern(
-                make_rim(
+                make_border_cells(
                     small_bits, _PRINT_EDGE_SIGMA_M * (len(small_bits) + 2) / target.small.side_m
                 ),
                 make_drawing(small_bits),
@@ -140,7 +140,7 @@ WHITE_BORDER_HALF_SIDES = 1.25
 sides."""
 _MASK_SPREAD_ROWS = 7  # rows of a field's picture to which a covered row contributes
 # reduction factor, and standard deviation of the fill in the reduced picture
-_REDUCED, _SPREAD = 8, 2.0
+_FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
 _MIN_FILL_WEIGHT = 1e-4
 
 
@@ -156,11 +156,11 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden: HiddenMask) -> NDArray[
     """Return the picture with its hidden pixels filled smoothly from their surroundings."""
     h, w = image.shape
     free = (~hidden).astype(np.float32)
-    size = (max(w // _REDUCED, 1), max(h // _REDUCED, 1))
+    size = (max(w // _FILL_REDUCTION, 1), max(h // _FILL_REDUCTION, 1))
 
     def around(values: NDArray[np.float32]) -> NDArray[np.float32]:
         reduced = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _SPREAD), np.float32)
+        return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA), np.float32)
 
     mean = cv2.mean(image, (~hidden).astype(np.uint8))[0]
     grey = (around(image * free) + _MIN_FILL_WEIGHT * mean) / (around(free) + _MIN_FILL_WEIGHT)

@@ -40,9 +40,9 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array, is_finite
 from perchctl.vision.lens import distort, undistort
 from perchctl.vision.markers.corners import (
-    BEFORE,
-    NEXT,
+    NEXT_CORNER,
     OUTWARD_NORMALS,
+    PREVIOUS_CORNER,
     UNIT_SQUARE,
     RefinedCorners,
     apply_homography,
@@ -51,7 +51,7 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
     signed_double_area,
 )
-from perchctl.vision.markers.pattern import Rim
+from perchctl.vision.markers.pattern import BorderCells
 from perchctl.vision.types import CameraModel, EdgeShift
 
 # --- Grey profiles across the sides of markers ---
@@ -147,11 +147,13 @@ _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIER_FRACTION = 0.5
 # compensates the reduction of squared residuals and samples by the weights
 _LINE_VARIANCE_FACTOR = 1.7
-_BEND, _BEND_BLURS = 0.6, 2.0  # bend of an edge by the next one, a cell away, in units of blur
+# bend of an edge by the next one, a cell away, in units of blur
+_NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
 _BLUR_ERROR_PER_PX2 = 0.0022  # px per cubed pixel of blur: profiles are too short for wide edges
 CLIPPED_SIGMA_PX = 0.1  # if white is clipped, edges move by different amounts
 CLIPPED_FRACTION = 0.05  # share of the profiles
-_WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off a wide edge that is not central
+# profiles cut off a wide edge that is not central
+_MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
 # of 7: an edge 6 px off the centre was cut off and displaced by up to 0.3 px
 _MAX_EDGE_OFFSET_PX = 4.0
 _MIN_ROW_JITTER_RATIO = 2.0  # ratio of variances of the sides that shows jittering rows
@@ -175,7 +177,7 @@ _MIN_BOW_SIGMAS = 3.0  # standard deviations
 def refine_lines(
     image: NDArray[np.uint8],
     raw_px: Array,
-    rims: Sequence[Rim],
+    rims: Sequence[BorderCells],
     camera: CameraModel,
     known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
@@ -190,7 +192,9 @@ def refine_lines(
         if each is None:
             continue
         off_px = float(np.abs(each.corners_px - raw_px[i]).max())
-        if off_px > (_CENTRED_PX if each.blur_px > _WIDE_BLUR_PX else _MAX_EDGE_OFFSET_PX):
+        if off_px > (
+            _MAX_WIDE_EDGE_OFFSET_PX if each.blur_px > _MIN_WIDE_BLUR_PX else _MAX_EDGE_OFFSET_PX
+        ):
             centred[i] = each.corners_px
     if (centred == raw_px).all():
         return found
@@ -201,7 +205,7 @@ def refine_lines(
 def _refine_lines_once(
     image: NDArray[np.uint8],
     raw_px: Array,
-    rims: Sequence[Rim],
+    rims: Sequence[BorderCells],
     camera: CameraModel,
     known: EdgeShift | None,
 ) -> list[RefinedCorners | None]:
@@ -276,7 +280,7 @@ def _fit_lines(markers: MarkerSides, sides: EdgeData) -> tuple[Array, Array]:
 def _intersect(lines: Array) -> Array:
     """Return the intersections of side i - 1 and side i of each marker: (m, 4, 2)."""
     sides = lines.reshape(-1, 4, 3)
-    before = sides.take(BEFORE, axis=1)
+    before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
     bx, by, bc = sides[..., 0], sides[..., 1], sides[..., 2]
     det = ax * by - ay * bx
@@ -369,7 +373,9 @@ def _is_accepted(
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
     contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
     lines = (residual_px < _MAX_RESIDUAL_PX) & (inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE)
-    lines &= (contrast > _MIN_CONTRAST * PROFILES_PER_SIDE) & (sides.blur_px < 0.9 * sides.near_px)
+    lines &= (contrast > _MIN_CONTRAST * PROFILES_PER_SIDE) & (
+        sides.blur_px < 0.9 * sides.window_half_px
+    )
     way = corners_px - markers.raw_px
     moved_px = np.hypot(way[..., 0], way[..., 1]).max(axis=1)
     good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_px > _MIN_CELL_PX)
@@ -381,7 +387,9 @@ def _corner_sigma_px(
 ) -> float:
     blur_px = max(blur_px, 1e-3)
     # With cells of few pixels, the blur of the inner pattern reaches the border's edge.
-    bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
+    bend_px = (
+        _NEIGHBOUR_BEND * blur_px * math.exp(-cell_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_px))
+    )
     reach_px = _BLUR_ERROR_PER_PX2 * blur_px**3
     clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
     # Printed edges deviate from their nominal positions.
@@ -421,7 +429,7 @@ class MarkerSides:
     each side `px_per_unit` (4m,)."""
 
     raw_px: Array
-    rims: Sequence[Rim]
+    rims: Sequence[BorderCells]
     corners: Array
     sides_px: Array
     depth_px: Array
@@ -433,18 +441,19 @@ class MarkerSides:
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """Edges on profiles: `grey` values (rows, n, steps + 1), half lengths `near_px` of the windows
-    in them (rows,), edge `points` (rows, n, 2), normalised, `weight` (rows, n) and blur (rows,)."""
+    """Edges on profiles: `grey` values (rows, n, steps + 1), half lengths `window_half_px` of the
+    windows in them (rows,), edge `points` (rows, n, 2), normalised, `weight` (rows, n) and blur
+    (rows,)."""
 
     grey: Floats
-    near_px: Array
+    window_half_px: Array
     points: Array
     weight: Array
     blur_px: Array
 
 
 def prepare_marker_sides(
-    raw_px: Array, rims: Sequence[Rim], camera: CameraModel
+    raw_px: Array, rims: Sequence[BorderCells], camera: CameraModel
 ) -> MarkerSides | None:
     """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
     quadrilateral."""
@@ -455,8 +464,8 @@ def prepare_marker_sides(
     is_square = turn.all() and sides_px.min() > 1e-6
     if not (is_square and is_finite(corners)):
         return None
-    along = corners.take(NEXT, axis=1) - corners
-    across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
+    along = corners.take(NEXT_CORNER, axis=1) - corners
+    across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
     cell_px = sides_px @ _MEAN_OF_FOUR / cells
     return MarkerSides(
         raw_px=raw_px,
@@ -496,19 +505,19 @@ def measure_edges(
     if with_inner:
         sign[-4:] *= -1.0
     s = profile_positions(lengths_px.ravel())
-    ends = starts.take(NEXT, axis=1).reshape(-1, 2)
+    ends = starts.take(NEXT_CORNER, axis=1).reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
-    near_px, half_px = (each[of] for each in profile_half_lengths_px(markers.cell_px))
+    window_half_px, half_px = (each[of] for each in profile_half_lengths_px(markers.cell_px))
     grey = sample_profiles(image, origin, normal, half_px)
     around = find_neighbour_edges(s, markers.rims, rim, depth_px.ravel())
-    offset_px, weight, blur_px = locate_edges(grey, half_px, near_px, around)
+    offset_px, weight, blur_px = locate_edges(grey, half_px, window_half_px, around)
     points = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES_PER_SIDE, 2)
     points = points if is_finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_px)
     sides, inner_edges = (
-        EdgeData(grey[part], near_px[part], points[part], weight[part], blur_px[part])
+        EdgeData(grey[part], window_half_px[part], points[part], weight[part], blur_px[part])
         for part in (slice(0, n), slice(n, None))
     )
     return sides, inner_edges if with_inner else None
@@ -517,12 +526,12 @@ def measure_edges(
 def profile_half_lengths_px(cell_px: Array) -> tuple[Array, Array]:
     """Return the half lengths, px, of the windows around edges and of the profiles, for a cell
     size."""
-    near_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
-    return near_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
+    window_half_px = np.minimum(np.maximum(0.85 * cell_px, 1.5), 7.0)
+    return window_half_px, np.minimum(np.maximum(1.5 * cell_px, 1.75), 7.0)
 
 
 def find_neighbour_edges(
-    shares: Array, rims: Sequence[Rim], inner_rim: Rim, cell_depth_px: Array
+    shares: Array, rims: Sequence[BorderCells], inner_rim: BorderCells, cell_depth_px: Array
 ) -> NeighbourEdges:
     """Return the neighbours of the edges at `shares` (rows, n) of sides: four rows per rim, then,
     if given, four rows for the inner edges of `inner_rim`'s border. `cell_depth_px` (rows,) is the
@@ -549,8 +558,8 @@ def find_neighbour_edges(
 
 _SIDE_POSITIONS_F32 = SIDE_POSITIONS.astype(np.float32)
 # squares of the window's standard deviation: in units of the blur's, and px^2
-_WINDOW2, _LEAST_WINDOW2 = 2.25, 0.81
-_MOST_SHARE, _LEAST_MOMENT2, _MOST_MOMENT = 0.9, 0.01, 0.8
+_WINDOW_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
+_MAX_VARIANCE_FRACTION, _MIN_SECOND_MOMENT, _MAX_FIRST_MOMENT = 0.9, 0.01, 0.8
 # inverse standard deviation of the wide window, times its half length
 _WINDOW_LENGTH_SIGMAS = 1.0 / 0.6
 _TUKEY_SCALE = 3.5 * 1.4826
@@ -590,7 +599,7 @@ class NeighbourEdges:
 
 
 def locate_edges(
-    grey: Floats, half_px: Array, near_px: Array, neighbours: NeighbourEdges
+    grey: Floats, half_px: Array, window_half_px: Array, neighbours: NeighbourEdges
 ) -> tuple[Array, Array, Array]:
     """Locate the dark-to-bright edge on each profile. Return its offset from the middle of the
     profile, px (rows, n), its weight, 0 for outliers (rows, n), and the blur of each row, standard
@@ -598,11 +607,11 @@ def locate_edges(
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
-        half_px, near_px: half length of the profiles and of the windows, (rows,).
+        half_px, window_half_px: half length of the profiles and of the windows, (rows,).
     """
-    profiles = _Profiles(grey, half_px, near_px, neighbours)
+    profiles = _Profiles(grey, half_px, window_half_px, neighbours)
     edge, usable = profiles.wide()
-    blur2 = np.ones(len(near_px), dtype=np.float32)
+    blur2 = np.ones(len(window_half_px), dtype=np.float32)
     line = weight = _fit_line_to_halves(edge, usable)
     moved_px = np.inf
     for k in range(_LINE_FIT_ITERATIONS):
@@ -620,11 +629,14 @@ class _Profiles:
     """The gradients along all profiles, and the values that every window over them needs."""
 
     def __init__(
-        self, grey: Floats, half_px: Array, near_px: Array, around: NeighbourEdges
+        self, grey: Floats, half_px: Array, window_half_px: Array, around: NeighbourEdges
     ) -> None:
         self.gradient = grey[:, :, 1:] - grey[:, :, :-1]
         self.u = half_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS  # position, (rows, steps)
-        self.near, self.depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
+        self.near, self.depth = (
+            window_half_px.astype(np.float32),
+            around.depth_px.astype(np.float32),
+        )
         self.most2 = 0.25 * self.near * self.near  # square of a window's largest standard deviation
         # Neighbouring edges on the flanks: number on both, and outside minus inside.
         self.both, self.side = around.inside + around.outside, around.outside - around.inside
@@ -648,7 +660,9 @@ class _Profiles:
         """Return the edges from a window around the row's line, which ones count, and blur^2."""
         relative = self.u[:, None, :] - line[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
-        w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), self.most2)
+        w2 = np.minimum(
+            np.maximum(_WINDOW_VARIANCE_RATIO * blur2, _MIN_WINDOW_VARIANCE_PX2), self.most2
+        )
         squared = relative * relative
         mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
@@ -659,7 +673,7 @@ class _Profiles:
         wide2 = w2 + blur2
         place = self.depth * w2 / wide2
         lost = np.exp(-0.5 * self.depth * self.depth / wide2)
-        share = np.minimum(self.both * lost[:, None], _MOST_SHARE)
+        share = np.minimum(self.both * lost[:, None], _MAX_VARIANCE_FRACTION)
         total = np.where(usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
@@ -667,7 +681,7 @@ class _Profiles:
         second = mass @ _SAMPLE_ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
         moment = (second * usable).dot(_ONES32)
         moment /= np.maximum((total * usable).dot(_ONES32), 1e-9)
-        moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
+        moment = np.minimum(np.maximum(moment, _MIN_SECOND_MOMENT), _MAX_FIRST_MOMENT * w2)
         found2 = moment * w2 / (w2 - moment)
         # Undo the pull of the window on the centroid.
         centroid = first / total * (1.0 + found2 / w2)[:, None]

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.lens import distort, pinhole_px, undistort, undistort_px
 from perchctl.vision.markers.corners import (
-    BEFORE,
-    NEXT,
+    NEXT_CORNER,
     OUTWARD_NORMALS,
+    PREVIOUS_CORNER,
     UNIT_SQUARE,
     RefinedCorners,
     apply_homography,
@@ -67,7 +67,7 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 MIN_PARTIAL_CELL_PX = 4.0  # with smaller cells, a part of a side contains no information
-_PART_ROUNDS, _PART_STILL_PX = 5, 0.05
+_PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
 _MAX_RESIDUAL_PX = 0.6
 _MAX_BLUR_FRACTION = 0.9  # share of the window
 _MAX_CORNER_SIGMA = 0.02  # share of the side: less certain corners are no measurement
@@ -103,7 +103,7 @@ def fit_partly_visible(
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H = homography_from_unit_square(start)
-    for k in range(_PART_ROUNDS):
+    for k in range(_PARTIAL_FIT_ITERATIONS):
         seen = find_visible_edges(picture, H, pattern)
         if seen is None:
             return None
@@ -113,7 +113,7 @@ def fit_partly_visible(
         if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_STEP):
             return None
         H = increment_homography(H, p)
-        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _PART_STILL_PX:
+        if k > 0 and float(np.abs(p[:6]).max() * seen.scale_px.mean()) < _CONVERGED_PARTIAL_PX:
             break
     assert seen is not None
     left_px = seen.offset_px - (step @ A).reshape(seen.offset_px.shape)
@@ -297,7 +297,7 @@ def _has_enough_known_cells(
 PICTURE_MARGIN_PX = 2.0
 """Distance to the picture's edge, px, within which blur would need pixels outside the picture."""
 _MIN_INNER_EDGE_CELL_PX = 6.0  # cell of a border whose inner and outer edges are separate
-_TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # shares of the contrast: black inside, white outside
+_BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5  # shares of the contrast: black inside, white outside
 _MIN_PARTIAL_CONTRAST = 10.0
 _MIN_SIDE_WEIGHT = 3.0  # of a side's profiles
 _MIN_VISIBLE_EDGES = 4  # a square has eight unknowns, and an edge determines two
@@ -338,32 +338,32 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
     side = np.arange(len(at)) % 4
     to_rays: Array = np.linalg.inv(camera.K) @ H
     starts = np.stack([apply_homography(to_rays, r * UNIT_SQUARE) for r in rings])
-    scale_px = (0.25 * (sides_px[BEFORE] + sides_px[NEXT]))[side]
+    scale_px = (0.25 * (sides_px[PREVIOUS_CORNER] + sides_px[NEXT_CORNER]))[side]
     s = profile_positions(sides_px[side] * at)
-    ends = starts[:, NEXT].reshape(-1, 2)
+    ends = starts[:, NEXT_CORNER].reshape(-1, 2)
     origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
     if not (np.abs(origin) < _OUT_OF_RANGE_PX).all():
         return None  # far outside, a lens model may yield any position, even NaN
     # White is outside the marker, and inside its border.
     turn = float(np.sign(signed_double_area(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
-    near_px, half_px = profile_half_lengths_px(np.full(len(at), cell_px))
+    window_half_px, half_px = profile_half_lengths_px(np.full(len(at), cell_px))
     depth_px = 2.0 * scale_px / cells
     around = find_neighbour_edges(s, [pattern.rim], pattern.rim, depth_px)
-    free = around.possible & _is_profile_in_view(picture, origin, normal, near_px)
+    free = around.possible & _is_profile_in_view(picture, origin, normal, window_half_px)
     kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_SIDE_WEIGHT)
     if len(kept) < _MIN_VISIBLE_EDGES:
         return None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
     origin, normal, free = origin[kept], normal[kept], free[kept]
-    near_px, half_px = near_px[kept], half_px[kept]
+    window_half_px, half_px = window_half_px[kept], half_px[kept]
     grey = sample_profiles(picture.image, origin, normal, half_px)
-    lit = _find_clean_profiles(grey, free, near_px, half_px)
+    lit = _find_clean_profiles(grey, free, window_half_px, half_px)
     if lit is None:
         return None
     good, white = lit
     around = NeighbourEdges(depth_px[kept], around.inside[kept], around.outside[kept], good)
-    offset_px, weight, blur_px = locate_edges(grey, half_px, near_px, around)
+    offset_px, weight, blur_px = locate_edges(grey, half_px, window_half_px, around)
     weight = np.where(good, weight, 0.0)
     weight[weight.sum(axis=1) < _MIN_SIDE_WEIGHT] = 0.0
     found = undistort((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
@@ -380,25 +380,26 @@ def find_visible_edges(picture: Picture, H: Array, pattern: Pattern) -> VisibleE
         side=side,
         side_distance=at,
         scale_px=scale_px,
-        blur=blur_px / near_px,
+        blur=blur_px / window_half_px,
         white_grey=white,
     )
 
 
 def _is_profile_in_view(
-    picture: Picture, origin: Array, normal: Array, near_px: Array
+    picture: Picture, origin: Array, normal: Array, window_half_px: Array
 ) -> NDArray[np.bool_]:
     hidden, (h, w) = picture.hidden, picture.image.shape
     # A profile is in the picture if both of its ends are.
     reach, last = (
-        near_px[:, None, None] * np.abs(normal),
+        window_half_px[:, None, None] * np.abs(normal),
         (w - 1 - PICTURE_MARGIN_PX, h - 1 - PICTURE_MARGIN_PX),
     )
     x_and_y = (origin - reach >= PICTURE_MARGIN_PX) & (origin + reach <= last)
     seen = x_and_y[..., 0] & x_and_y[..., 1]
     if hidden is not None and seen.any():
         at = (
-            origin[:, :, None] + near_px[:, None, None, None] * _SEARCH_OFFSETS * normal[:, :, None]
+            origin[:, :, None]
+            + window_half_px[:, None, None, None] * _SEARCH_OFFSETS * normal[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
         seen &= ~hidden[pixel[..., 1], pixel[..., 0]].any(axis=2)
@@ -406,12 +407,12 @@ def _is_profile_in_view(
 
 
 def _find_clean_profiles(
-    grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array
+    grey: Floats, free: NDArray[np.bool_], window_half_px: Array, half_px: Array
 ) -> tuple[NDArray[np.bool_], float] | None:
     """Return which profiles (rows, n) change from black to white, and the grey level of white
     paper."""
     # At half the window from the edge, blur has ended and no neighbour begins.
-    off = max(1, round(0.5 * SAMPLES_PER_PROFILE * float((0.6 * near_px / half_px)[0])))
+    off = max(1, round(0.5 * SAMPLES_PER_PROFILE * float((0.6 * window_half_px / half_px)[0])))
     dark, bright = (
         grey[:, :, SAMPLES_PER_PROFILE // 2 - off],
         grey[:, :, SAMPLES_PER_PROFILE // 2 + off],
@@ -420,5 +421,5 @@ def _find_clean_profiles(
     contrast = white - black
     if contrast < _MIN_PARTIAL_CONTRAST:
         return None
-    good = (dark < black + _TOO_BRIGHT * contrast) & (bright > white - _TOO_DARK * contrast)
+    good = (dark < black + _BLACK_MARGIN * contrast) & (bright > white - _WHITE_MARGIN * contrast)
     return free & good, white

@@ -29,7 +29,7 @@ _SPOT_OFFSETS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-
 
 
 @dataclass(frozen=True, eq=False)
-class Rim:
+class BorderCells:
     """The cells next to a marker's border, along its four sides in the order of the corners.
 
     white: (4, n), 1 for a white cell; the first and last ones belong to the border. white_behind:
@@ -57,7 +57,7 @@ class Pattern:
     is_inner (cells,): True for a white cell, for a cell within the border.
     """
 
-    rim: Rim
+    rim: BorderCells
     drawing: Drawing
     spots: Array
     spot_cells: NDArray[np.intp]
@@ -67,7 +67,7 @@ class Pattern:
     is_inner: NDArray[np.bool_]
 
 
-def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
+def make_border_cells(bits: NDArray[np.uint8], tolerance: float = 0.0) -> BorderCells:
     """Return the rim of a marker with inner bits (n, n), 1 = white: the cells whose blur may reach
     the border's edges."""
     n = len(bits)
@@ -82,10 +82,10 @@ def make_rim(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
 
     white = np.pad(ring(0), ((0, 0), (1, 1)))
     second = np.pad(ring(1), ((0, 0), (1, 1)))
-    return Rim(white, white * second, tolerance)
+    return BorderCells(white, white * second, tolerance)
 
 
-def make_pattern(rim: Rim, drawing: Drawing) -> Pattern:
+def make_pattern(rim: BorderCells, drawing: Drawing) -> Pattern:
     """Return the pattern of a marker, with spots in all cells that no central marker hides."""
     n = len(drawing.cells)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0

@@ -49,18 +49,18 @@ from perchctl.vision.markers.pattern import (
 )
 from perchctl.vision.types import CameraModel
 
-_MAX_GRID, _MIN_GRID = 44, 18
+_MAX_GRID_NODES, _MIN_GRID_NODES = 44, 18
 _NODE_SPACING_PX = 0.8  # picture pixels between nodes
 _MAX_ITERATIONS = 12
-_HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
-"""Number of rounds after which the fit fails unless its likeness reaches `_LEAST_HOPE`. The
-likeness of a marker is above 0.9 after two rounds."""
+_EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
+"""Number of rounds after which the fit fails unless its likeness reaches `_MIN_EARLY_CORRELATION`.
+The likeness of a marker is above 0.9 after two rounds."""
 _CONVERGED_STEP_PX = 0.05  # after such a step, the next round usually moves by a tenth of it
 _MAX_LENS_REUSE_MOTION_PX = 0.3  # motion after which the lens distortion is computed again
 _MAX_INCREMENT = 0.5  # per round; beyond it, the fit has diverged
 # Standard deviations of the shape from its start, in half sides: rotations and scales; the
 # perspective.
-_SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
+_SHAPE_SIGMA, _PERSPECTIVE_SIGMA = 0.2, 0.03
 _TONE_CURVE_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
 _MAX_BLUR_STEP = 0.5  # per round, as a share of the blur's square; a node's square at least
@@ -69,10 +69,20 @@ _BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
 cells."""
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
-_SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # indices of the unknowns: increment, blur, light
+# indices of the unknowns: increment, blur, light
+_SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
 _PRIOR_INFORMATION: Array = (
     np.array(
-        [_SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _VIEW_SIGMA, _VIEW_SIGMA]
+        [
+            _SHAPE_SIGMA,
+            _SHAPE_SIGMA,
+            1e3,
+            _SHAPE_SIGMA,
+            _SHAPE_SIGMA,
+            1e3,
+            _PERSPECTIVE_SIGMA,
+            _PERSPECTIVE_SIGMA,
+        ]
     )
     ** -2.0
 )  # terms of the increment; the position is free
@@ -85,8 +95,8 @@ class Alignment:
     Attributes:
         corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
         fit_correlation: correlation of the picture with the drawing.
-        pattern, strength: correlation and contrast of the inner bits, beyond a black square of the
-            same size; the contrast is relative to the border's.
+        pattern, pattern_contrast: correlation and contrast of the inner bits, beyond a black square
+            of the same size; the contrast is relative to the border's.
         cell_deviation: largest mean deviation of a cell, in units of the gain.
         wrong_bit_degree, wrong_bit_sigma: how far the worst-fitting cell has the opposite colour, 0
             (as drawn) to 1 (wrong bit), and the standard deviation of the least certain cell.
@@ -98,7 +108,7 @@ class Alignment:
     sigma_px: float
     fit_correlation: float
     pattern: float
-    strength: float
+    pattern_contrast: float
     cell_deviation: float
     wrong_bit_degree: float
     wrong_bit_sigma: float
@@ -138,7 +148,9 @@ def align_drawing(
     side_px, reach = float(sides.mean()), drawing.reach
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
-    n = int(np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID, _MAX_GRID))
+    n = int(
+        np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
+    )
     node_px, cell_px = reach * side_px / n, side_px / len(drawing.cells)
     grid, H = make_grid(n, reach), homography_from_unit_square(start)
     lens_px = lens_shift_px(grid, H, camera)
@@ -162,10 +174,13 @@ def align_drawing(
         equations = _linearize_greys(grey, seen, total)
         if equations is None:
             return None
-        if k == _HOPE_ROUNDS and fit_correlation(grey, equations.error) < _LEAST_HOPE:
+        if (
+            k == _EARLY_CHECK_ITERATIONS
+            and fit_correlation(grey, equations.error) < _MIN_EARLY_CORRELATION
+        ):
             return None
         step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
-        p = step[_SHAPE]
+        p = step[_SHAPE_SLICE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT):
             return None
         H, total = increment_homography(H, p), total + p
@@ -173,7 +188,7 @@ def align_drawing(
         since_lens_px += motion_px
         sigma2 = seen.sigma**2
         most = max(1.0, _MAX_BLUR_STEP * sigma2)
-        squared = sigma2 + float(np.clip(step[_BLUR], -most, most))
+        squared = sigma2 + float(np.clip(step[_BLUR_INDEX], -most, most))
         wanted_px = max_motion_px(math.sqrt(max(squared, 1e-3)) * node_px)
         drawn_px = seen.sigma * node_px
         if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_px):
@@ -184,18 +199,18 @@ def align_drawing(
     # Residuals of the last round, whose step was negligible.
     gain, error = equations.gain, equations.error
     corners_px = distort_px(apply_homography(H, UNIT_SQUARE).T, camera).T
-    pattern, strength = _measure_inner_pattern(seen, grey, gain)
+    pattern, pattern_contrast = _measure_inner_pattern(seen, grey, gain)
     many = _count_redundant_nodes(error.reshape(n, n))
     inverse = np.asarray(np.linalg.inv(equations.N))
     wrong_bit_degree, wrong_bit_sigma = _measure_wrong_bits(seen, equations, inverse, many)
     J = homography_jacobian(H)
-    variance = float(np.trace(J @ (inverse[_SHAPE, _SHAPE] * many) @ J.T)) / 8.0
+    variance = float(np.trace(J @ (inverse[_SHAPE_SLICE, _SHAPE_SLICE] * many) @ J.T)) / 8.0
     return Alignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
         fit_correlation=fit_correlation(grey, error),
         pattern=pattern,
-        strength=strength,
+        pattern_contrast=pattern_contrast,
         cell_deviation=_cell_deviation(error / gain, grid, len(drawing.cells)),
         wrong_bit_degree=wrong_bit_degree,
         wrong_bit_sigma=wrong_bit_sigma,
@@ -219,13 +234,13 @@ def _linearize_greys(grey: Array, seen: RenderedDrawing, total: Array) -> _Equat
     noise = max(float((error**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
-    bend = _LIGHT + BEND
-    N[_BLUR, _BLUR] += 1.0  # about a node's width per round
+    bend = _LIGHT_INDEX + BEND
+    N[_BLUR_INDEX, _BLUR_INDEX] += 1.0  # about a node's width per round
     N[bend, bend] += (_TONE_CURVE_SIGMA * gain) ** -2.0
     g[bend] -= light[BEND] * (_TONE_CURVE_SIGMA * gain) ** -2.0
-    N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
+    N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _PRIOR_INFORMATION
-    g[_SHAPE] -= _PRIOR_INFORMATION * total
+    g[_SHAPE_SLICE] -= _PRIOR_INFORMATION * total
     return _Equations(gain, error, J, noise, N, g)
 
 

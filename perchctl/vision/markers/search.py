@@ -29,7 +29,7 @@ from perchctl.vision.markers.detector import (
     Thresholds,
     make_aruco_detector,
 )
-from perchctl.vision.target_selection import OwnOffset
+from perchctl.vision.target_selection import OwnTargetOffset
 from perchctl.vision.types import MARKERS, MarkerName
 
 SearchMode = Literal["near", "window", "fits", "sharp", "blurred", "all"]
@@ -57,14 +57,14 @@ class FoundMarkers:
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     mirrored: bool = False
-    targets: int = 0
+    target_count: int = 0
 
 
 def search(
     picture: Picture,
     expected: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
-    own: OwnOffset | None = None,
+    own: OwnTargetOffset | None = None,
 ) -> FoundMarkers:
     """Search the window around the expected markers, then the whole picture if the window shows too
     little.
@@ -92,7 +92,7 @@ def search(
 
 
 def search_half_size(
-    picture: Picture, expected: Mapping[MarkerName, Array], own: OwnOffset | None = None
+    picture: Picture, expected: Mapping[MarkerName, Array], own: OwnTargetOffset | None = None
 ) -> FoundMarkers | None:
     """Search the window at half size, in 1 ms; None if it misses an expected complete marker."""
     shape = picture.image.shape
@@ -134,7 +134,7 @@ def _search_once(
     window: Window,
     expected: Mapping[MarkerName, Array],
     thresholds: Thresholds,
-    own: OwnOffset | None,
+    own: OwnTargetOffset | None,
     halved: bool = False,
 ) -> FoundMarkers:
     setup, part = picture.setup, picture.image[window]
@@ -165,7 +165,7 @@ def choose_markers(
     candidates: Mapping[MarkerName, list[Array]],
     expected: Mapping[MarkerName, Array],
     ratio: float,
-    own: OwnOffset | None = None,
+    own: OwnTargetOffset | None = None,
 ) -> dict[MarkerName, Array]:
     """Return at most one large and one small marker, corners (4, 2) px.
 
@@ -205,7 +205,7 @@ def choose_markers(
 
 
 def _sort_by_distance(
-    candidates: Mapping[MarkerName, list[Array]], own: OwnOffset
+    candidates: Mapping[MarkerName, list[Array]], own: OwnTargetOffset
 ) -> Mapping[MarkerName, list[Array]]:
     """Return the candidates sorted by their distance, without those that are too far away.
 

@@ -16,7 +16,7 @@ from perchctl.vision.markers.corners import (
     refine_subpix,
 )
 from perchctl.vision.markers.edge_fit import refine_lines
-from perchctl.vision.markers.pattern import has_matching_cells, make_rim
+from perchctl.vision.markers.pattern import has_matching_cells, make_border_cells
 from tests.helpers.markers import POSE, SETUP, corners, waved
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
@@ -24,7 +24,7 @@ from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 
 RIMS = {6: bits_of("DICT_4X4_1000", 997), 7: bits_of("DICT_ARUCO_ORIGINAL", 5)}
-RIMS = {cells: make_rim(bits) for cells, bits in RIMS.items()}
+RIMS = {cells: make_border_cells(bits) for cells, bits in RIMS.items()}
 POSES = [
     (0.0, 0.0, 0.24, 0.0, 0.0, 0.0),
     (0.02, -0.01, 0.24, 0.5, 0.05, -0.08),
