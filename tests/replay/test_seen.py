@@ -71,8 +71,8 @@ def test_they_show_all_that_matters() -> None:
     [
         (edge_fit, "_SHIFT_PRIOR_PX"),  # the fit of edges
         pytest.param(edge_fit, "MIN_LINE_SIGMA_PX", marks=pytest.mark.long),
-        pytest.param(pose, "_TRUST", marks=pytest.mark.long),  # the pose
-        (the_filter, "_PUSH_S"),
+        pytest.param(pose, "_CLAIMED_SPREAD_DOF", marks=pytest.mark.long),  # the pose
+        (the_filter, "_ACCELERATION_DURATION_S"),
     ],
 )
 def test_a_changed_constant_of_the_pipeline_is_noticed(

@@ -124,13 +124,13 @@ def test_with_another_latency_the_pictures_are_of_another_time(
 ) -> None:
     """They are still found, by the recorded time."""
     log, given_s = begun(flight[0]), []
-    inside = perception.pictures
+    inside = perception.deinterlace
 
     def looked_at(state: PipelineState, frame: Frame, pipeline: Pipeline) -> Any:
         given_s.append(frame.t_s)
         return inside(state, frame, pipeline)
 
-    monkeypatch.setattr(perception, "pictures", looked_at)
+    monkeypatch.setattr(perception, "deinterlace", looked_at)
     seen_again(log, flight[1])
     as_flown_s = given_s.copy()
     given_s.clear()
