@@ -12,7 +12,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def data_folder(kind: str) -> Path:
-    """The folder of shipped files of a `kind` (`profiles`, `calib`), in the wheel or checkout."""
+    """The folder of shipped files of a `kind` (`profiles`, `fleets`, `calib`), in the wheel or in
+    the checkout."""
     shipped = _PACKAGE / "_data" / kind
     return shipped if shipped.is_dir() else _PACKAGE.parent / kind
 

@@ -1,3 +1,5 @@
+from .base import Section as Section
+from .base import key as key
 from .edit import apply_settings as apply_settings
 from .edit import profile_value as profile_value
 from .edit import writable_profile as writable_profile
@@ -9,14 +11,18 @@ from .limits import DOUBTFUL as DOUBTFUL
 from .load import find_calibration as find_calibration
 from .load import find_mask as find_mask
 from .load import find_profile as find_profile
+from .load import layered_profile as layered_profile
 from .load import load_profile as load_profile
 from .load import read_mask as read_mask
+from .load import read_yaml as read_yaml
+from .load import target_keys as target_keys
 from .mission import PlannerConfig as PlannerConfig
 from .mission import SafetyConfig as SafetyConfig
 from .positioning import PositioningConfig as PositioningConfig
 from .schema import LinkConfig as LinkConfig
 from .schema import Profile as Profile
 from .schema import key_and_reason as key_and_reason
+from .schema import nearest_names as nearest_names
 from .simulation import SimulationConfig as SimulationConfig
 from .vision import USED_LATENCY_S as USED_LATENCY_S
 from .vision import CameraConfig as CameraConfig

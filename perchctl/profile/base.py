@@ -36,6 +36,8 @@ Range = Ordered[float]
 
 
 class Section(BaseModel):
+    """Keys and values of a YAML file: frozen, and without a key that nobody knows."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")

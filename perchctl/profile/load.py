@@ -62,12 +62,45 @@ def load_profile(name: str | Path | Profile, *, with_weights: bool = True) -> Pr
         return name
     require_type("profile", name, str, Path, Profile)
     path = find_profile(str(name))
-    profile = _checked(path, _read_yaml(path))
-    if profile.merge.weights_file is None or not with_weights:
+    profile = _checked(path, read_yaml(path))
+    return _with_weights(profile) if with_weights else profile
+
+
+def _with_weights(profile: Profile) -> Profile:
+    if profile.merge.weights_file is None:
         return profile
     weights = _read_weights(profile.merge.weights_file)
     merge = profile.merge.model_copy(update={"weights": weights})
     return profile.model_copy(update={"merge": merge})
+
+
+def layered_profile(path: Path, base: str, *layers: dict[str, Any]) -> Profile:
+    """The profile that a file at `path` would be if it extended `base` with the keys of all
+    `layers`, of which later ones count more. Names of files in them are relative to its folder.
+
+    Errors: NotFound, InvalidValue, both beginning with `path`.
+    """
+    values: dict[str, Any] = {"extends": base}
+    for layer in layers:
+        values = _merged(values, _by_in_full(layer))
+    return _with_weights(_checked(path, values))
+
+
+def _by_in_full(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with `positioning: mocap` written as the section that other layers add to."""
+    by = values.get("positioning")
+    return {**values, "positioning": {"by": by}} if isinstance(by, str) else values
+
+
+def target_keys(path: Path) -> dict[str, Any]:
+    """The keys of the section `target` in the profile at `path`, which need not be complete.
+
+    Errors: NotFound, InvalidValue.
+    """
+    target = _resolved(path, read_yaml(path), seen=()).get("target")
+    if not isinstance(target, dict):
+        raise InvalidValue(f"{path}: has no section target, which says where the target is")
+    return target
 
 
 def check_profile(path: Path, text: str) -> None:
@@ -103,7 +136,7 @@ def _read_weights(name: str) -> WeightsConfig:
             f"merge.weights_file: {name} does not exist; perchctl fit-weights makes it, or remove "
             f"the key"
         )
-    weights = _read_yaml(path).get("weights")
+    weights = read_yaml(path).get("weights")
     held = weights if isinstance(weights, dict) else {}
     missing = [axis for axis in WeightsConfig.model_fields if axis not in held]
     if missing:
@@ -206,7 +239,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
         base = find_profile(str(beside.absolute()) if by_path else base_name)
     except NotFound as error:
         raise NotFound(f"{path}: extends: {error}") from None
-    return _merged(_resolved(base, _read_yaml(base), (*seen, path)), values)
+    return _merged(_resolved(base, read_yaml(base), (*seen, path)), values)
 
 
 def _without_constants(values: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -232,7 +265,8 @@ def _place_beside(
         values[section] = {**part, key: str(beside)}  # type: ignore[dict-item]
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The keys and values of a YAML file, unchecked. Errors: NotFound, InvalidValue."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:

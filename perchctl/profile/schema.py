@@ -120,7 +120,9 @@ class Profile(Section):
             inner: Any = values
             for name in sections:
                 if not isinstance(inner.get(name), dict):
-                    what = "no section" if name in inner else f"unknown; {_meant(name, inner)}"
+                    what = (
+                        "no section" if name in inner else f"unknown; {nearest_names(name, inner)}"
+                    )
                     raise InvalidValue(f"{dotted}: {name} is {what}")
                 inner = inner[name]
             if isinstance(inner.get(key), dict) and dotted != "link.parameters":
@@ -167,14 +169,17 @@ _MOST_OF_A_FAULT = 1000
 _BOUNDS = ("less_than_equal", "greater_than_equal")
 
 
-def key_and_reason(error: ValidationError) -> tuple[str, str]:
-    """The key of the first error, empty if it concerns several keys, and its reason."""
+def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, str]:
+    """The key of the first error, empty if it concerns several keys, and its reason. `model`: what
+    was validated."""
     first = error.errors(include_url=False)[0]
     key = clip_text(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":
         above = first["loc"][:-1]
-        keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
-        text = f"this key is unknown; {_meant(str(first['loc'][-1]), keys)}"
+        keys = _keys_at(model, above)
+        if model is Profile and not above:
+            keys = ["extends", *keys]
+        text = f"this key is unknown; {nearest_names(str(first['loc'][-1]), keys)}"
     elif first["type"] == "value_error":
         text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
     elif first["type"] == "model_type":
@@ -189,13 +194,13 @@ def key_and_reason(error: ValidationError) -> tuple[str, str]:
     return key, text
 
 
-def _meant(name: str, allowed: Collection[str]) -> str:
+def nearest_names(name: str, allowed: Collection[str]) -> str:
+    """The end of a message about an unknown name: the nearest one of `allowed`, and all of them."""
     close = difflib.get_close_matches(name, allowed, 1)
     return f"{f'did you mean {close[0]}? ' if close else ''}allowed here are {', '.join(allowed)}"
 
 
-def _keys_at(loc: tuple[int | str, ...]) -> list[str]:
-    model: Any = Profile
+def _keys_at(model: Any, loc: tuple[int | str, ...]) -> list[str]:
     for part in loc:
         model = model.model_fields[part].annotation
     return list(model.model_fields)

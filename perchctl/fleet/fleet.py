@@ -1,0 +1,144 @@
+"""Several vehicles in one room, as frozen values: who flies from where to which target."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from perchctl.link import vehicle_uri
+from perchctl.profile import Profile, TargetConfig
+
+Point = tuple[float, float]
+"""A place on the floor or the ceiling: x and y, m."""
+Frame = Literal["room", "home"]
+OnFailure = Literal["continue", "land-all"]
+Assign = Literal["fixed", "nearest"]
+
+ONE_AT_A_TIME = "one-at-a-time"
+TOGETHER = "together"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetVehicle:
+    """One vehicle of a fleet, with the ordinary `Profile` of its flight.
+
+    The profile already holds the URI, the camera source and, in the axes of this vehicle's state
+    estimate, the place of its target (`target.expected_xy_m`, `planner.approach_xy_m`).
+
+    Attributes:
+        name: unique in the fleet; letters, digits, ``-``, ``_`` and ``.``, fit for a file's name.
+        home_m: where it stands before take-off, in the room's axes.
+        target_m: where its target hangs, in the room's axes.
+        heading_deg: where its nose points at home, counter-clockwise from the room's x axis.
+        frame: the origin and axes of its state estimate. ``room``: those of the room, as with
+            motion capture, Lighthouse or Loco. ``home``: it starts at zero wherever it stands,
+            as with a Flow deck or the target alone.
+    """
+
+    name: str
+    profile: Profile
+    home_m: Point
+    target_m: Point
+    heading_deg: float = 0.0
+    frame: Frame = "home"
+
+    @property
+    def uri(self) -> str:
+        """The vehicle's URI; one without a dongle (``radio:///80``) has been given one."""
+        return self.profile.link.uri
+
+    @property
+    def source(self) -> str:
+        """The camera source."""
+        return self.profile.camera.source
+
+    @property
+    def address(self) -> str:
+        """The same text for all URIs of a vehicle, without dongle, letter case and options."""
+        return vehicle_uri(self.uri)
+
+    @property
+    def simulated(self) -> bool:
+        """True for a vehicle of perchctl's own simulator."""
+        return self.uri.startswith("sim://")
+
+    def to_room(self, estimate_m: Point) -> Point:
+        """A place in the axes of the vehicle's state estimate, in those of the room."""
+        if self.frame == "room":
+            return estimate_m
+        x, y = _rotated(estimate_m, math.radians(self.heading_deg))
+        return self.home_m[0] + x, self.home_m[1] + y
+
+    def to_estimate(self, room_m: Point) -> Point:
+        """A place in the room's axes, in those of the vehicle's state estimate."""
+        if self.frame == "room":
+            return room_m
+        away = room_m[0] - self.home_m[0], room_m[1] - self.home_m[1]
+        return _rotated(away, -math.radians(self.heading_deg))
+
+    def with_target(self, target_m: Point, target: TargetConfig | None = None) -> FleetVehicle:
+        """The vehicle with a target at this place of the room; `target`: its markers, by default
+        those of the vehicle's profile.
+
+        By the target alone the vehicle gets no point to approach: it stands below its target,
+        and turned by a few degrees it would begin by flying away from it.
+        """
+        expected_m = self.to_estimate(target_m)
+        planner = self.profile.planner
+        alone = self.profile.positioning.source.is_target
+        profile = self.profile.model_copy(
+            update={
+                "target": (target or self.profile.target).model_copy(
+                    update={"expected_xy_m": expected_m}
+                ),
+                "planner": planner.model_copy(
+                    update={"approach_xy_m": None if alone else expected_m}
+                ),
+            }
+        )
+        return replace(self, target_m=target_m, profile=profile)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fleet:
+    """A fleet file as loaded and checked: no two vehicles share an address, a name, a camera or a
+    motion-capture body, and with ``assign: nearest`` each already has its target.
+
+    Attributes:
+        order: ``one-at-a-time``, ``together`` or ``N at a time``; `most_at_once` has the number.
+        on_failure: whether the others fly on or land after one has failed.
+        separation_m: least distance between two corridors that are flown at a time; None: the
+            default (`perchctl.fleet.schedule`).
+        path: the file that it was read from.
+    """
+
+    name: str
+    vehicles: tuple[FleetVehicle, ...]
+    order: str = ONE_AT_A_TIME
+    on_failure: OnFailure = "continue"
+    assign: Assign = "fixed"
+    separation_m: float | None = None
+    path: Path | None = None
+
+    @property
+    def most_at_once(self) -> int:
+        """How many vehicles may be in the air at a time."""
+        if self.order == ONE_AT_A_TIME:
+            return 1
+        if self.order == TOGETHER:
+            return len(self.vehicles)
+        return int(self.order.split()[0])
+
+    def vehicle(self, name: str) -> FleetVehicle:
+        """The vehicle of this name. Raises KeyError."""
+        for vehicle in self.vehicles:
+            if vehicle.name == name:
+                return vehicle
+        raise KeyError(name)
+
+
+def _rotated(point: Point, angle_rad: float) -> Point:
+    (x, y), c, s = point, math.cos(angle_rad), math.sin(angle_rad)
+    return c * x - s * y, s * x + c * y

@@ -1,0 +1,302 @@
+"""From a fleet file to a checked, frozen `Fleet`.
+
+Every fault is one sentence of the form ``file: vehicle NAME: key: what is wrong``. Nothing is
+connected or opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from perchctl.camera import parse_source
+from perchctl.errors import InvalidValue, NotFound, PerchError
+from perchctl.fleet.assignment import assign_nearest
+from perchctl.fleet.dongles import choose_dongles
+from perchctl.fleet.fleet import Fleet, FleetVehicle, Frame, Point
+from perchctl.link import check_uri, is_own_uri
+from perchctl.places import data_file, file_names
+from perchctl.plain_yaml import clip_text
+from perchctl.profile import (
+    Profile,
+    Section,
+    key,
+    key_and_reason,
+    layered_profile,
+    nearest_names,
+    read_yaml,
+    target_keys,
+)
+
+EXAMPLE = "four"
+"""The shipped fleet that is used where none is named."""
+MOST_VEHICLES = 32
+"""In one fleet; with more of them a plan would take longer to work out than anyone waits."""
+FARTHEST_M = 50.0
+"""Of a home or target from the room's origin: farther off, millimetres were meant."""
+_Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+_ORDER = r"^(one-at-a-time|together|[1-9][0-9]? at a time)$"
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
+_PROFILE_KEYS = tuple(name for name in Profile.model_fields if name not in ("name", "description"))
+
+
+class _Common(Section):
+    """Keys that a vehicle may have from `defaults`, beside those of the profile."""
+
+    profile: str | None = key(None, "profile, by name or path")
+    uri: str | None = key(None, "URI of the vehicle")
+    source: str | None = key(None, "camera source")
+    heading_deg: float | None = key(None, "where the nose points at home, from the room's x axis")
+    frame: Frame | None = key(None, "axes of the state estimate: `room` or `home`")
+
+
+class _Vehicle(_Common):
+    name: str = key(..., "name of the vehicle", pattern=_NAME)
+    home_m: tuple[_Length, _Length] = key(..., "where it stands before take-off: x, y")
+    target_m: tuple[_Length, _Length] | None = key(None, "where its target hangs: x, y")
+    body: str | None = key(None, "its rigid body in the motion capture", min_length=1)
+
+
+class _File(Section):
+    name: str | None = key(None, "name of the fleet")
+    defaults: dict[str, Any] = Field(default_factory=dict)
+    order: str = key("one-at-a-time", "how many fly at a time", pattern=_ORDER)
+    on_failure: Literal["continue", "land-all"] = key("continue", "what the others do")
+    assign: Literal["fixed", "nearest"] = key("fixed", "whether the targets are interchangeable")
+    separation_m: float | None = key(
+        None, "least distance between two corridors flown at a time", ge=0.2, le=10
+    )
+    vehicles: list[dict[str, Any]] = key(
+        ..., "the vehicles", min_length=1, max_length=MOST_VEHICLES
+    )
+
+
+def find_fleet(name: str) -> Path:
+    """The file of a fleet given by path or name. NotFound names the choices."""
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path
+    found = data_file("fleets", name) if "/" not in name else None
+    if found is None:
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise NotFound(
+            f"fleet file {name} {what}; give a path, or one of {', '.join(file_names('fleets'))}"
+        )
+    return found
+
+
+def load_fleet(name: str | Path = EXAMPLE) -> Fleet:
+    """The fleet with path or name `name`, checked, each vehicle with its profile and target.
+
+    Errors: NotFound, InvalidValue.
+    """
+    path = find_fleet(str(name))
+    values = read_yaml(path)
+    if "vehicles" not in values:
+        raise InvalidValue(
+            f"{path}: has no vehicles, so it is no fleet file: list them under vehicles, each with "
+            f"name, uri, home_m and target_m"
+        )
+    keys: _File = _validated(path, _File, values)
+    defaults = _split(f"{path}: defaults", _Common, keys.defaults)
+    common: _Common = _validated(f"{path}: defaults", _Common, defaults[0])
+    vehicles = [
+        _vehicle(path, number, entry, common, defaults[1])
+        for number, entry in enumerate(keys.vehicles, start=1)
+    ]
+    _refuse_shared(path, vehicles)
+    fleet = Fleet(
+        name=keys.name or path.stem,
+        vehicles=tuple(choose_dongles(vehicles)),
+        order=keys.order,
+        on_failure=keys.on_failure,
+        assign=keys.assign,
+        separation_m=keys.separation_m,
+        path=path,
+    )
+    return assign_nearest(fleet) if fleet.assign == "nearest" else fleet
+
+
+# --- One vehicle ---
+
+
+def _vehicle(
+    path: Path, number: int, entry: dict[str, Any], common: _Common, shared: dict[str, Any]
+) -> FleetVehicle:
+    name = entry.get("name")
+    where = f"{path}: vehicle {clip_text(str(name)) if name is not None else number}"
+    own_values, sections = _split(where, _Vehicle, entry)
+    own: _Vehicle = _validated(where, _Vehicle, own_values)
+    layers = [*_layers(path, where, common, shared), *_layers(path, where, own, sections)]
+    if own.body is not None:
+        layers.append({"positioning": {"body": own.body}})
+    if own.target_m is not None:
+        layers.append({"target": {"expected_xy_m": list(own.target_m)}})
+    layers.append({"name": own.name})
+    profile_name = own.profile or common.profile or "sim"
+    try:
+        profile = layered_profile(path, profile_name, *layers)
+    except PerchError as error:
+        raise type(error)(f"{where}: {str(error).removeprefix(f'{path}: ')}") from None
+    profile = _with_own_body(profile, own.name)
+    vehicle = FleetVehicle(
+        name=own.name,
+        profile=profile,
+        home_m=own.home_m,
+        target_m=own.target_m or own.home_m,
+        heading_deg=next((h for h in (own.heading_deg, common.heading_deg) if h is not None), 0.0),
+        frame=own.frame or common.frame or default_frame(profile),
+    )
+    _check(where, vehicle)
+    return vehicle.with_target(_target_place(where, vehicle, own.target_m))
+
+
+def default_frame(profile: Profile) -> Frame:
+    """The frame of a vehicle whose fleet file names none: motion capture measures in the room's
+    axes. A deck may be a Lighthouse, but as a profile does not say so, it counts as a Flow deck,
+    whose drift needs more room."""
+    return "room" if profile.positioning.source.is_mocap else "home"
+
+
+def _layers(
+    path: Path, where: str, keys: _Common, sections: dict[str, Any]
+) -> Iterable[dict[str, Any]]:
+    """The profile's keys that `defaults` or a vehicle give, the stronger ones last."""
+    sections = dict(sections)
+    if isinstance(file := sections.get("target"), str):
+        target_path = path.parent / Path(file).expanduser()
+        try:
+            sections["target"] = target_keys(target_path)
+        except PerchError as error:
+            raise type(error)(f"{where}: target: {error}") from None
+    yield sections
+    if keys.uri is not None:
+        yield {"link": {"uri": keys.uri}}
+    if keys.source is not None:
+        yield {"camera": {"source": keys.source}}
+
+
+def _with_own_body(profile: Profile, name: str) -> Profile:
+    """By motion capture a body that nobody has named is called as the vehicle is."""
+    positioning = profile.positioning
+    if not positioning.source.is_mocap or "body" in positioning.model_fields_set:
+        return profile
+    return profile.model_copy(update={"positioning": positioning.model_copy(update={"body": name})})
+
+
+def _check(where: str, vehicle: FleetVehicle) -> None:
+    """Refuse a URI or a camera source that could not be flown."""
+    uri = vehicle.uri
+    try:
+        if not is_own_uri(uri):
+            # Any dongle, as cfcli writes it, gets a number later.
+            check_uri(uri.replace("radio:///", "radio://0/", 1))
+        source = parse_source(vehicle.source)
+    except PerchError as error:
+        raise type(error)(f"{where}: {error}") from None
+    if not vehicle.simulated and (source.scheme == "sim" or not source.live):
+        raise InvalidValue(
+            f"{where}: camera source {source} is no live camera, but {uri} is a real vehicle: "
+            f"name its camera, as in source: camera:0"
+        )
+
+
+def _target_place(where: str, vehicle: FleetVehicle, target_m: Point | None) -> Point:
+    """Where the vehicle's target is in the room. Raises InvalidValue if nothing says it."""
+    if target_m is not None:
+        return target_m
+    expected_m = vehicle.profile.target.expected_xy_m
+    if expected_m is None:
+        raise InvalidValue(
+            f"{where}: nothing says where its target is: give target_m, or target: FILE with "
+            f"target.expected_xy_m in it"
+        )
+    return vehicle.to_room(expected_m)
+
+
+# --- Two vehicles that share what they must not ---
+
+
+def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
+    kinds: tuple[tuple[Callable[[FleetVehicle], str | None], str], ...] = (
+        (lambda v: v.name.lower(), "have one name, {0}: give each its own"),
+        (_address, "have one address, {0}: give each its own in Bitcraze's client, and its uri"),
+        (_camera, "have one camera, {0}: give each its own source"),
+        (_body, "have one motion-capture body, {0}: give each its own body"),
+    )
+    for read, words in kinds:
+        seen: dict[str, tuple[int, FleetVehicle]] = {}
+        for number, vehicle in enumerate(vehicles, start=1):
+            value = read(vehicle)
+            if value is None:
+                continue
+            if value in seen:
+                first, other = seen[value]
+                same = other.name.lower() == vehicle.name.lower()
+                who = f"{first} and {number}" if same else f"{other.name} and {vehicle.name}"
+                raise InvalidValue(f"{path}: vehicles {who} {words.format(value)}")
+            seen[value] = number, vehicle
+
+
+def _address(vehicle: FleetVehicle) -> str | None:
+    """None for a simulated vehicle: each flight starts a simulator of its own."""
+    return None if vehicle.simulated else vehicle.address
+
+
+def _camera(vehicle: FleetVehicle) -> str | None:
+    """None for what is no device: the simulated camera, and recordings."""
+    source = parse_source(vehicle.source)
+    return str(source) if source.live and source.scheme != "sim" else None
+
+
+def _body(vehicle: FleetVehicle) -> str | None:
+    positioning = vehicle.profile.positioning
+    return positioning.body if positioning.source.is_mocap else None
+
+
+# --- Keys ---
+
+
+def _split(
+    where: str, model: type[Section], values: dict[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The keys of `model`, and those of the profile. Raises InvalidValue for any other."""
+    own = {name: value for name, value in values.items() if name in model.model_fields}
+    sections = {name: value for name, value in values.items() if name in _PROFILE_KEYS}
+    for name in values:
+        if name not in own and name not in sections:
+            allowed = (*model.model_fields, *_PROFILE_KEYS)
+            raise InvalidValue(
+                f"{where}: {clip_text(str(name))}: this key is unknown; "
+                f"{nearest_names(str(name), allowed)}"
+            )
+    return own, sections
+
+
+def _validated(where: object, model: type[Section], values: dict[str, Any]) -> Any:
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        key, reason = key_and_reason(error, model)
+        raise InvalidValue(f"{where}: {key or 'fleet'}: {_in_words(key, reason)}") from None
+
+
+def _in_words(key: str, reason: str) -> str:
+    """The reason with what is allowed, where pydantic shows a regular expression."""
+    found = reason.rpartition(", found ")[2]
+    if reason.startswith("string should match") and key == "order":
+        return f"found {found}; allowed are one-at-a-time, together, or as in 2 at a time"
+    if reason.startswith("string should match"):
+        return f"found {found}; allowed are letters, digits, -, _ and ., at most 32"
+    if reason.startswith("field required"):
+        return f"is missing; {_NEEDED.get(key, 'give it')}"
+    return reason
+
+
+_NEEDED = {
+    "name": "give each vehicle a name",
+    "home_m": "measure where it stands before take-off, x and y in metres",
+}

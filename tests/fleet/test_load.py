@@ -1,0 +1,168 @@
+"""The fleet file: each vehicle gets its profile and target, and each fault is one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.fleet import Fleet, load_fleet
+from perchctl.profile import load_profile
+
+ATRIUM = """\
+name: atrium
+defaults: {profile: crazyflie, planner: {takeoff_height_m: 0.6}}
+order: 2 at a time
+on_failure: land-all
+vehicles:
+  - {name: north, uri: radio:///80/2M/E7E7E7E701, source: camera:FPV-1, home_m: [0, 0],
+     target_m: [0.2, 0.1], safety: {fence_radius_m: 1.2}}
+  - {name: east, uri: radio:///80/2M/E7E7E7E702, source: camera:FPV-2, home_m: [3, 0],
+     heading_deg: 90, target: east.yaml}
+"""
+EAST = """\
+target:
+  expected_xy_m: [0.3, -0.1]
+  large: {dictionary: DICT_4X4_1000, id: 145, side_m: 0.15}
+"""
+
+
+def load(tmp_path: Path, text: str) -> Fleet:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_fleet(path)
+
+
+def refusal(tmp_path: Path, text: str) -> str:
+    """The sentence with which the file is refused, without its path."""
+    with pytest.raises((InvalidValue, NotFound)) as caught:
+        load(tmp_path, text)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'fleet.yaml'}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{tmp_path / 'fleet.yaml'}: ")
+
+
+def two(first: str = "", second: str = "", top: str = "", defaults: str = "") -> str:
+    """A fleet file of two simulated vehicles with other keys added."""
+    return (
+        f"defaults: {{profile: sim{defaults}}}\n{top}\nvehicles:\n"
+        f"  - {{name: north, home_m: [0, 0], target_m: [0.2, 0]{first}}}\n"
+        f"  - {{name: east, home_m: [3, 0], target_m: [3.2, 0]{second}}}\n"
+    )
+
+
+def test_the_shipped_fleet_is_four_simulated_vehicles_with_ordinary_profiles() -> None:
+    fleet = load_fleet()
+    assert (fleet.name, len(fleet.vehicles)) == ("four", 4)
+    assert all(vehicle.simulated for vehicle in fleet.vehicles)
+    north = fleet.vehicle("north").profile
+    changed = {"name", "target", "planner"}
+    same = {name: value for name, value in load_profile("sim") if name not in changed}
+    assert {name: value for name, value in north if name not in changed} == same
+
+
+def test_each_vehicle_resolves_to_a_profile(tmp_path: Path) -> None:
+    (tmp_path / "east.yaml").write_text(EAST, encoding="utf-8")
+    fleet = load(tmp_path, ATRIUM)
+    north, east = fleet.vehicles
+    assert (fleet.name, fleet.most_at_once, fleet.on_failure) == ("atrium", 2, "land-all")
+    assert (north.profile.name, north.source) == ("north", "camera:FPV-1")
+    assert north.profile.safety.fence_radius_m == 1.2
+    assert east.profile.safety.fence_radius_m == 1.5
+    assert north.profile.planner.takeoff_height_m == east.profile.planner.takeoff_height_m == 0.6
+    assert north.profile.target.expected_xy_m == (0.2, 0.1)
+    assert east.profile.target.large.id == 145
+
+
+def test_a_place_of_a_file_is_in_the_axes_of_its_own_vehicle(tmp_path: Path) -> None:
+    (tmp_path / "east.yaml").write_text(EAST, encoding="utf-8")
+    east = load(tmp_path, ATRIUM).vehicle("east")
+    assert east.target_m == pytest.approx((3.1, 0.3))
+    assert east.profile.planner.approach_xy_m == pytest.approx((0.3, -0.1))
+    assert east.to_estimate(east.to_room((0.5, -0.7))) == pytest.approx((0.5, -0.7))
+
+
+def test_by_motion_capture_the_room_s_axes_are_the_vehicle_s(tmp_path: Path) -> None:
+    fleet = load(tmp_path, two(second=", body: cf7", defaults=", positioning: mocap"))
+    north, east = fleet.vehicles
+    assert (north.frame, north.profile.positioning.body) == ("room", "north")
+    assert east.profile.positioning.body == "cf7"
+    assert east.profile.target.expected_xy_m == (3.2, 0.0)
+
+
+def test_by_the_target_alone_no_point_is_approached(tmp_path: Path) -> None:
+    north = load(tmp_path, two(defaults=", positioning: target")).vehicles[0]
+    assert north.profile.planner.approach_xy_m is None
+    assert north.profile.target.expected_xy_m == (0.2, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("order", "most"), [("one-at-a-time", 1), ("together", 2), ("7 at a time", 7)]
+)
+def test_order_says_how_many_fly_at_a_time(tmp_path: Path, order: str, most: int) -> None:
+    assert load(tmp_path, two(top=f"order: {order}")).most_at_once == most
+
+
+def test_any_dongle_is_one_for_each_channel_that_nobody_has_named(tmp_path: Path) -> None:
+    uris = (
+        "radio:///80/2M/E7E7E7E701",
+        "radio:///80/2M/E7E7E7E702",
+        "radio:///90/2M/E7E7E7E703",
+        "radio://0/70/2M/E7E7E7E704",
+    )
+    rows = "".join(
+        f"  - {{name: v{n}, uri: {uri}, source: 'camera:{n}', home_m: [{3 * n}, 0], "
+        f"target_m: [{3 * n}, 0]}}\n"
+        for n, uri in enumerate(uris)
+    )
+    fleet = load(tmp_path, f"defaults: {{profile: crazyflie}}\nvehicles:\n{rows}")
+    assert [vehicle.uri[8] for vehicle in fleet.vehicles] == ["1", "1", "2", "0"]
+
+
+RADIO = ", uri: radio://0/80/2M/E7E7E7E7{0}, source: 'camera:{1}'"
+BAD_URI = "URI 'radio://0/80/3M/E7' is not one of a vehicle; examples: sim://"
+REFUSED = [
+    (two(top="odrer: together"), "odrer: this key is unknown; did you mean order?"),
+    (two(top="order: two"), "order: found 'two'; allowed are one-at-a-time, together, or"),
+    (two(top="separation_m: 0.1"), "separation_m: input should be greater than or equal to 0.2"),
+    (two(first=", hme_m: [0, 0]"), "vehicle north: hme_m: this key is unknown; did you mean home"),
+    (two(first=", safety: {fence_m: 1}"), "vehicle north: safety.fence_m: this key is unknown"),
+    (two(defaults=", home_m: [0, 0]"), "defaults: home_m: this key is unknown"),
+    (two(second=", profile: smi"), "vehicle east: extends: profile 'smi' not found"),
+    (two(second=", uri: radio://0/80/3M/E7"), f"vehicle east: {BAD_URI}"),
+    (two(second=", source: 'camra:0'"), "vehicle east: "),
+    (two(second=", uri: radio://0/80/2M/E7E7E7E701"), "vehicle east: camera source sim: is no"),
+    (two().replace("east", "north"), "vehicles 1 and 2 have one name, north: give each its own"),
+    (
+        two(RADIO.format("01", 0), RADIO.format("01", 1).replace("//0", "//1")),
+        "vehicles north and east have one address, radio/80/2M/E7E7E7E701: give each its own",
+    ),
+    (
+        two(RADIO.format("01", 0), RADIO.format("02", 0)),
+        "vehicles north and east have one camera, camera:0: give each its own source",
+    ),
+    (
+        two(", body: cf", ", body: cf", defaults=", positioning: mocap"),
+        "vehicles north and east have one motion-capture body, cf: give each its own body",
+    ),
+    (two().replace(", target_m: [3.2, 0]", ""), "vehicle east: nothing says where its target is"),
+    (two().replace("home_m: [3, 0], ", ""), "vehicle east: home_m: is missing; measure where it"),
+    (two(second=", target: none.yaml"), "vehicle east: target: "),
+    (two().replace("[3, 0]", "[3000, 0]"), "vehicle east: home_m.0: input should be less than"),
+    ("extends: sim\n", "has no vehicles, so it is no fleet file: list them under vehicles"),
+    (two(first=", name: west"), "line 4: key name is there twice, first in line 4: keep one"),
+]
+
+
+@pytest.mark.parametrize(("text", "sentence"), REFUSED, ids=[s for _, s in REFUSED])
+def test_a_fault_is_one_sentence_that_names_the_vehicle(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
+    assert refusal(tmp_path, text).startswith(sentence)
+
+
+def test_a_fleet_that_is_missing_names_the_choices() -> None:
+    with pytest.raises(NotFound, match=r"fleet file none.yaml does not exist; .* one of four"):
+        load_fleet("none.yaml")
