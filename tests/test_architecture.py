@@ -47,6 +47,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.errors", "perchctl.startup"),
     (
         "perchctl.geometry",
+        "perchctl.corridor",
         "perchctl.files",
         "perchctl.places",
         "perchctl.plain_yaml",
@@ -89,7 +90,7 @@ MOST_NAMES = {
     "faults": 6,
     "fleet": 20,
     "flight": 19,
-    "link": 14,
+    "link": 16,
     "record": 12,
     "mission": 34,
     "perception": 5,

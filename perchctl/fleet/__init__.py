@@ -2,12 +2,23 @@
 flight.
 
 Everything here is a pure function of the fleet file and the profiles that it names: nothing is
-connected, opened or armed.
+connected, opened or armed. For those who fly, simulate or show a fleet:
 
-    fleet = load_fleet("atrium.yaml")     # Fleet of FleetVehicle, each with an ordinary Profile
+    fleet = load_fleet("atrium.yaml")   # Fleet; raises NotFound, InvalidValue, one sentence each
+    fleet.vehicles                      # FleetVehicle: name, home_m, target_m, and an ordinary
+                                        # Profile, with which a single flight is flown as it is
+    plan = make_plan(fleet)             # FleetPlan; raises InvalidValue if it cannot be flown
+    plan.fleet                          # the fleet with telemetry periods that its dongles carry
+    plan.schedule.groups                # who flies together: (("north", "east"), ("south",))
+    plan.schedule.may_fly_together(a, b)
+    plan.corridors["north"]             # perchctl.corridor.Corridor, in the room's axes
+    estimate_corridor(vehicle)          # the same in the axes of its own estimate: its fence,
+                                        # estimate_corridor(vehicle).contains(x_m, y_m, z_m)
+    plan.dongles                        # DongleLoad: which vehicles share a Crazyradio
 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
-assignment: interchangeable targets. dongles: which Crazyradio carries whom.
+assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, and
+who flies when. plan: all of it in one call.
 """
 
 import lazy_loader

@@ -3,3 +3,13 @@ from .fleet import FleetVehicle as FleetVehicle
 from .load import EXAMPLE as EXAMPLE
 from .load import find_fleet as find_fleet
 from .load import load_fleet as load_fleet
+from .plan import FleetPlan as FleetPlan
+from .plan import make_plan as make_plan
+from .radio import DongleLoad as DongleLoad
+from .radio import RadioPlace as RadioPlace
+from .radio import budget_radio as budget_radio
+from .radio import radio_place as radio_place
+from .schedule import Schedule as Schedule
+from .schedule import estimate_corridor as estimate_corridor
+from .schedule import make_schedule as make_schedule
+from .schedule import vehicle_corridor as vehicle_corridor

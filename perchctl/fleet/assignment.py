@@ -12,8 +12,8 @@ def assign_nearest(fleet: Fleet) -> Fleet:
     target is least.
 
     By squared distances, straight ways between starts and goals do not meet when starts and goals
-    lie 2.83 radii apart (CAPT, Turpin and others, 2014; ../shared/facts/swarm.md, fact 26). Of
-    equal sums, scipy's choice counts, which is the same each time. A target's markers go with it.
+    lie 2.83 radii apart (CAPT: Turpin, Michael and Kumar, 2014). Of equal sums, scipy's choice
+    counts, which is the same each time. A target's markers go with it.
     """
     from scipy.optimize import linear_sum_assignment
 

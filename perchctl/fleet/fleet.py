@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from perchctl.corridor import Point
 from perchctl.link import vehicle_uri
 from perchctl.profile import Profile, TargetConfig
 
-Point = tuple[float, float]
-"""A place on the floor or the ceiling: x and y, m."""
 Frame = Literal["room", "home"]
 OnFailure = Literal["continue", "land-all"]
 Assign = Literal["fixed", "nearest"]

@@ -13,10 +13,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 
 from perchctl.camera import parse_source
+from perchctl.corridor import Point
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.fleet.assignment import assign_nearest
-from perchctl.fleet.dongles import choose_dongles
-from perchctl.fleet.fleet import Fleet, FleetVehicle, Frame, Point
+from perchctl.fleet.fleet import Fleet, FleetVehicle, Frame
+from perchctl.fleet.radio import choose_dongles
 from perchctl.link import check_uri, is_own_uri
 from perchctl.places import data_file, file_names
 from perchctl.plain_yaml import clip_text
@@ -140,7 +141,8 @@ def _vehicle(
     try:
         profile = layered_profile(path, profile_name, *layers)
     except PerchError as error:
-        raise type(error)(f"{where}: {str(error).removeprefix(f'{path}: ')}") from None
+        reason = str(error).removeprefix(f"{path}: ").replace("extends: ", "profile: ", 1)
+        raise type(error)(f"{where}: {reason}") from None
     profile = _with_own_body(profile, own.name)
     vehicle = FleetVehicle(
         name=own.name,
@@ -188,8 +190,15 @@ def _with_own_body(profile: Profile, name: str) -> Profile:
 
 
 def _check(where: str, vehicle: FleetVehicle) -> None:
-    """Refuse a URI or a camera source that could not be flown."""
-    uri = vehicle.uri
+    """Refuse a frame, a URI or a camera source that could not be flown."""
+    positioning, uri = vehicle.profile.positioning, vehicle.uri
+    only = default_frame(vehicle.profile)
+    if vehicle.frame != only and not positioning.source.is_deck:
+        axes = "the room's axes" if only == "room" else "axes that begin where it stands"
+        raise InvalidValue(
+            f"{where}: frame: is {vehicle.frame}, but with positioning by {positioning.label} its "
+            f"estimate has {axes}: write {only}, or leave it out"
+        )
     try:
         if not is_own_uri(uri):
             # Any dongle, as cfcli writes it, gets a number later.

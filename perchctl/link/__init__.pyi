@@ -12,3 +12,5 @@ from .protocol import VehicleLink as VehicleLink
 from .protocol import check_uri as check_uri
 from .protocol import is_own_uri as is_own_uri
 from .protocol import vehicle_uri as vehicle_uri
+from .telemetry import LOG_STEP_S as LOG_STEP_S
+from .telemetry import telemetry_packets_per_s as telemetry_packets_per_s

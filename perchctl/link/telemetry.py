@@ -156,8 +156,25 @@ FAST_BLOCKS = ("state", "attitude")
 """A sample requires these blocks; the others arrive ten times a second if the firmware has them."""
 SLOW_PERIOD_S = 0.1
 """Period of the slow blocks, s."""
+LOG_STEP_S = 0.01
+"""The firmware counts the period of a log block in such steps, s."""
 MOST_CARRIED_S = 0.05
 """Longest time for which a position is extrapolated, s."""
+
+
+def telemetry_packets_per_s(period_s: float) -> float:
+    """Packets a second that a vehicle sends for its telemetry, if its firmware has all blocks:
+    `period_s` is that of the fast blocks (`link.telemetry_period_s`), rounded as in `start_block`.
+
+    220 at 0.01 s, 120 at 0.02 s, 70 at 0.04 s.
+    """
+    slow = len(BLOCKS) - len(FAST_BLOCKS)
+    return len(FAST_BLOCKS) / _rounded_ms(period_s) * 1000.0 + slow / SLOW_PERIOD_S
+
+
+def _rounded_ms(period_s: float) -> int:
+    step_ms = round(LOG_STEP_S * 1000)
+    return max(step_ms, step_ms * round(period_s / LOG_STEP_S))
 
 
 class SampleAssembler:
@@ -328,8 +345,7 @@ def start_block(
     """
     from cflib.crazyflie.log import LogConfig
 
-    period_ms = max(10, 10 * round(period_s * 100))
-    block = LogConfig(name=_PREFIX + name, period_in_ms=period_ms)
+    block = LogConfig(name=_PREFIX + name, period_in_ms=_rounded_ms(period_s))
     for variable, ctype in variables.items():
         block.add_variable(variable, ctype)
     try:

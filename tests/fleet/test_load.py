@@ -121,6 +121,27 @@ def test_any_dongle_is_one_for_each_channel_that_nobody_has_named(tmp_path: Path
     assert [vehicle.uri[8] for vehicle in fleet.vehicles] == ["1", "1", "2", "0"]
 
 
+def test_files_are_named_from_the_fleet_file_s_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine.yaml").write_text("extends: sim\nsafety: {max_height_m: 2.5}\n")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    fleet = load(tmp_path, two(first=", profile: mine.yaml"))
+    assert [v.profile.safety.max_height_m for v in fleet.vehicles] == [2.5, 3.0]
+
+
+def test_interchangeable_targets_go_to_the_nearest_with_their_markers(tmp_path: Path) -> None:
+    crossed = two().replace("[0.2, 0]", "TEMP").replace("[3.2, 0]", "[0.2, 0]")
+    marked = crossed.replace("TEMP", "[3.2, 0], target: east.yaml")
+    (tmp_path / "east.yaml").write_text(EAST, encoding="utf-8")
+    north, east = load(tmp_path, f"assign: nearest\n{marked}").vehicles
+    assert (north.target_m, east.target_m) == ((0.2, 0.0), (3.2, 0.0))
+    assert (north.profile.target.large.id, east.profile.target.large.id) == (997, 145)
+    assert east.profile.target.expected_xy_m == pytest.approx((0.2, 0.0))
+
+
 RADIO = ", uri: radio://0/80/2M/E7E7E7E7{0}, source: 'camera:{1}'"
 BAD_URI = "URI 'radio://0/80/3M/E7' is not one of a vehicle; examples: sim://"
 REFUSED = [
@@ -130,7 +151,7 @@ REFUSED = [
     (two(first=", hme_m: [0, 0]"), "vehicle north: hme_m: this key is unknown; did you mean home"),
     (two(first=", safety: {fence_m: 1}"), "vehicle north: safety.fence_m: this key is unknown"),
     (two(defaults=", home_m: [0, 0]"), "defaults: home_m: this key is unknown"),
-    (two(second=", profile: smi"), "vehicle east: extends: profile 'smi' not found"),
+    (two(second=", profile: smi"), "vehicle east: profile: profile 'smi' not found"),
     (two(second=", uri: radio://0/80/3M/E7"), f"vehicle east: {BAD_URI}"),
     (two(second=", source: 'camra:0'"), "vehicle east: "),
     (two(second=", uri: radio://0/80/2M/E7E7E7E701"), "vehicle east: camera source sim: is no"),
@@ -150,6 +171,14 @@ REFUSED = [
     (two().replace(", target_m: [3.2, 0]", ""), "vehicle east: nothing says where its target is"),
     (two().replace("home_m: [3, 0], ", ""), "vehicle east: home_m: is missing; measure where it"),
     (two(second=", target: none.yaml"), "vehicle east: target: "),
+    (
+        two(", frame: room", defaults=", positioning: target"),
+        "vehicle north: frame: is room, but with positioning by the sight of the target its",
+    ),
+    (
+        two(", frame: home", defaults=", positioning: mocap"),
+        "vehicle north: frame: is home, but with positioning by motion capture at vicon its",
+    ),
     (two().replace("[3, 0]", "[3000, 0]"), "vehicle east: home_m.0: input should be less than"),
     ("extends: sim\n", "has no vehicles, so it is no fleet file: list them under vehicles"),
     (two(first=", name: west"), "line 4: key name is there twice, first in line 4: keep one"),

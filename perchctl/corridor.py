@@ -1,0 +1,94 @@
+"""The corridor of one vehicle, and exact distances between corridors.
+
+A vehicle flies in three parts: a column over the place where it takes off, a column under its
+target, and the way between them. Seen from above they are one shape, all points within a radius of
+the straight line from home to target:
+
+           .-----------------------------.
+          /                               \\
+         |   home x ------------- x target |     radius_m around the line
+          \\                               /
+           '-----------------------------'
+
+Two vehicles must not share a place in this view, whatever their heights: the air below a hovering
+vehicle pushes another one down from 2 m above. So all distances here are level.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+Point = tuple[float, float]
+"""x and y, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corridor:
+    """The space that one flight may use.
+
+    Attributes:
+        home_m: the place of take-off.
+        target_m: the place under the target.
+        radius_m: level distance from the line between them. Larger, and fewer vehicles fit into a
+            room; smaller, and a draught carries the vehicle out of it.
+        way_top_m: height above the ground up to which all of it may be used.
+        target_top_m: height up to which the column under the target may be used.
+    """
+
+    home_m: Point
+    target_m: Point
+    radius_m: float
+    way_top_m: float
+    target_top_m: float
+
+    def contains(self, x_m: float, y_m: float, z_m: float) -> bool:
+        """True for a place in the corridor, its surface included; `z_m`: above the ground. False if
+        one of the numbers is not a number. It has no floor, since a landing aims below it."""
+        place = x_m, y_m
+        if not point_distance_m(place, self.home_m, self.target_m) <= self.radius_m:
+            return False
+        under_target = math.dist(place, self.target_m) <= self.radius_m
+        return z_m <= (self.target_top_m if under_target else self.way_top_m)
+
+    def distance_m(self, other: Corridor) -> float:
+        """Level distance between the edges of two corridors; negative where they overlap."""
+        axes_m = segment_distance_m(self.home_m, self.target_m, other.home_m, other.target_m)
+        return axes_m - (self.radius_m + other.radius_m)
+
+    def distance_to_m(self, place_m: Point) -> float:
+        """Level distance of a place from the corridor's edge; negative inside."""
+        return point_distance_m(place_m, self.home_m, self.target_m) - self.radius_m
+
+
+def point_distance_m(point: Point, start: Point, end: Point) -> float:
+    """Distance of a point from the segment between `start` and `end`, which may be one point."""
+    (px, py), (ax, ay), (bx, by) = point, start, end
+    dx, dy = bx - ax, by - ay
+    length2 = dx * dx + dy * dy
+    share = ((px - ax) * dx + (py - ay) * dy) / length2 if length2 > 0.0 else 0.0
+    # The ends by themselves, as a + (b - a) is not always b.
+    inside = math.hypot(px - ax - share * dx, py - ay - share * dy) if 0.0 < share < 1.0 else None
+    ends = min(math.dist(point, start), math.dist(point, end))
+    return ends if inside is None else min(inside, ends)
+
+
+def segment_distance_m(a: Point, b: Point, c: Point, d: Point) -> float:
+    """Distance between the segments a to b and c to d; 0 where they cross."""
+    if _are_apart(a, b, c, d) and _are_apart(c, d, a, b):
+        return 0.0
+    return min(
+        point_distance_m(a, c, d),
+        point_distance_m(b, c, d),
+        point_distance_m(c, a, b),
+        point_distance_m(d, a, b),
+    )
+
+
+def _are_apart(a: Point, b: Point, c: Point, d: Point) -> bool:
+    """True if c and d are on different sides of the line through a and b."""
+    return _side(a, b, c) * _side(a, b, d) < 0.0
+
+
+def _side(a: Point, b: Point, p: Point) -> float:
+    return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])

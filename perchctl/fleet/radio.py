@@ -1,0 +1,262 @@
+"""The radio budget: what each Crazyradio can carry, and what the flights on it need.
+
+A Crazyradio sends one packet at a time and gets one in its answer, so that a vehicle can send only
+as often as it is asked. cflib asks the vehicles of a dongle one after the other, whether they have
+anything to say or not, and sets the dongle's address before each packet, and its channel if that
+differs. So each of n vehicles gets an equal share, and a share is enough if it is larger than both
+what the vehicle sends (telemetry) and what it is sent (setpoints and positions).
+
+The figures are measured, with cflib's threads over a simulated dongle (0.7 ms a packet, 1.25 ms a
+setting); with a real dongle they are not proven.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from perchctl.errors import InvalidValue
+from perchctl.fleet.fleet import Fleet, FleetVehicle
+from perchctl.link import LOG_STEP_S, telemetry_packets_per_s
+from perchctl.profile import Profile, SafetyConfig
+
+ANY = "radio:///"
+"""Beginning of a URI on whichever dongle is there, as Bitcraze's cfcli and Swarmkeeper write it
+(bitcraze/cfcli, docs/swarm.md)."""
+RADIO = "radio://"
+
+ALONE_PER_S = 1000.0
+"""Packets a second to a vehicle alone on its dongle, whose address and channel stay set."""
+SAME_CHANNEL_PER_S = {2: 245.0, 3: 162.0, 4: 123.0}
+"""Packets a second to each of so many vehicles on one channel of one dongle, measured. Too
+large, and telemetry comes late in flight; too small, and fleets that could fly are refused."""
+OTHER_CHANNELS_PER_S = {2: 151.0, 4: 73.0}
+"""The same, on different channels of one dongle, measured: why that is refused."""
+PACKET_S = 0.00206
+"""Time that a packet of a shared dongle takes, the longest of `SAME_CHANNEL_PER_S` (3 vehicles):
+0.7 ms on the air, 1.25 ms for the address, the rest Python's threads. For more vehicles than were
+measured."""
+USABLE_SHARE = 0.9
+"""Of a share; the rest is for lost packets and for a neighbour that does not answer, which costs
+2 ms a turn (measured). Larger, and a few lost packets make all telemetry late; smaller, and
+telemetry is slower than it needs to be."""
+MOST_ON_A_DONGLE = 5
+"""Vehicles on one dongle: users of cflib report three to five."""
+LEAST_APART = 2
+"""Channels between two dongles: at 2M a channel is 2 MHz wide, two channels (bitcraze/cfcli)."""
+SLOWEST_PERIOD_S = SafetyConfig.proof_age_s / 2
+"""Of telemetry that is chosen: with one slower, a single lost packet proves nothing."""
+LEAST_RATE_HZ = 10
+"""Of positions that are sent, the least that `positioning.rate_hz` allows."""
+MEASURED_RATE = "2M"
+"""Data rate of all figures above; at 1M and 250K nobody has measured what a dongle carries."""
+
+
+@dataclass(frozen=True)
+class RadioPlace:
+    """Where a vehicle is on the air. `dongle`: number or serial number of the Crazyradio; empty:
+    any. `rate`: ``250K``, ``1M`` or ``2M``."""
+
+    dongle: str
+    channel: int
+    rate: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class DongleLoad:
+    """One dongle with its vehicles: packets a second that it carries for each of them, and the most
+    that one of them needs."""
+
+    dongle: str
+    channel: int
+    vehicles: tuple[str, ...]
+    carries_per_s: float
+    needs_per_s: float
+
+
+def radio_place(vehicle: FleetVehicle) -> RadioPlace | None:
+    """The vehicle's dongle, channel and rate; None without a radio (sim, USB, UDP, own link)."""
+    if not vehicle.uri.startswith(RADIO):
+        return None
+    _, channel, rate, _ = vehicle.address.split("/")
+    dongle = vehicle.uri.removeprefix(RADIO).partition("?")[0].partition("/")[0]
+    is_number = dongle.isdecimal() and len(dongle) < 10  # ten digits are a serial number
+    return RadioPlace(str(int(dongle)) if is_number else dongle.upper(), int(channel), rate)
+
+
+def choose_dongles(vehicles: Sequence[FleetVehicle]) -> Iterable[FleetVehicle]:
+    """The vehicles, each ``radio:///`` with a dongle.
+
+    Vehicles on one channel share a dongle, since two dongles on a channel disturb each other. A
+    channel on which no other vehicle names a dongle gets the next number that nobody has named.
+    """
+    places = [radio_place(vehicle) for vehicle in vehicles]
+    named = {p.channel: p.dongle for p in reversed(places) if p is not None and p.dongle}
+    used = set(named.values())
+    free = (str(number) for number in itertools.count() if str(number) not in used)
+    for vehicle, place in zip(vehicles, places, strict=True):
+        if place is None or place.dongle:
+            yield vehicle
+            continue
+        if place.channel not in named:
+            named[place.channel] = next(free)
+        uri = vehicle.uri.replace(ANY, f"{RADIO}{named[place.channel]}/", 1)
+        yield _with_link(vehicle, uri=uri)
+
+
+# --- The budget ---
+
+
+def carried_per_s(vehicles: int) -> float:
+    """Packets a second that a dongle carries for each of so many vehicles on one channel."""
+    if vehicles <= 1:
+        return ALONE_PER_S
+    return SAME_CHANNEL_PER_S.get(vehicles, 1.0 / (vehicles * PACKET_S))
+
+
+def uplink_per_s(profile: Profile) -> float:
+    """Packets a second that perchctl sends to a vehicle: a setpoint each turn of the loop, and the
+    positions of a motion capture or of the target."""
+    positioning = profile.positioning
+    sent_hz = 0.0 if positioning.source.is_deck else positioning.rate_hz
+    return profile.link.loop_hz + sent_hz
+
+
+def needed_per_s(profile: Profile, period_s: float | None = None) -> float:
+    """Packets a second that a flight needs, at `period_s` or at the profile's own telemetry period.
+
+    Each packet goes there and back, so it is the larger of both ways."""
+    period_s = profile.link.telemetry_period_s if period_s is None else period_s
+    return max(telemetry_packets_per_s(period_s), uplink_per_s(profile))
+
+
+def budget_radio(fleet: Fleet) -> tuple[Fleet, tuple[DongleLoad, ...]]:
+    """The fleet with telemetry periods that its dongles can carry, and each dongle's load.
+
+    A `link.telemetry_period_s` that a profile or the fleet file names is kept; where none is named,
+    the shortest one that fits is chosen. Raises InvalidValue, naming the dongle and what to do, if
+    vehicles on one dongle use different channels or rates, if two dongles are too near on the air,
+    or if a flight needs more than its dongle carries.
+    """
+    on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]] = {}
+    for vehicle in fleet.vehicles:
+        if (place := radio_place(vehicle)) is not None:
+            on_air.setdefault(place.dongle, []).append((vehicle, place))
+    _refuse_mixed(on_air)
+    _refuse_near(on_air)
+    chosen: dict[str, FleetVehicle] = {}
+    loads = []
+    for dongle, members in on_air.items():
+        channel, names = members[0][1].channel, tuple(vehicle.name for vehicle, _ in members)
+        for vehicle, _ in members:
+            chosen[vehicle.name] = _fitted(vehicle, dongle, channel, len(members))
+        loads.append(
+            DongleLoad(
+                dongle=dongle,
+                channel=channel,
+                vehicles=names,
+                carries_per_s=carried_per_s(len(members)),
+                needs_per_s=max(needed_per_s(chosen[name].profile) for name in names),
+            )
+        )
+    vehicles = tuple(chosen.get(vehicle.name, vehicle) for vehicle in fleet.vehicles)
+    return replace(fleet, vehicles=vehicles), tuple(loads)
+
+
+def _refuse_mixed(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> None:
+    for dongle, members in on_air.items():
+        (first, there), others = members[0], members[1:]
+        for other, place in others:
+            if place.channel != there.channel:
+                raise InvalidValue(
+                    f"dongle {dongle} has {first.name} on channel {there.channel} and {other.name} "
+                    f"on channel {place.channel}, and would carry {OTHER_CHANNELS_PER_S[2]:g} "
+                    f"packets/s for each of two vehicles instead of {SAME_CHANNEL_PER_S[2]:g}: set "
+                    f"both to one channel, or give {other.name} another dongle"
+                )
+            if MEASURED_RATE not in (there.rate, place.rate) or place.rate != there.rate:
+                slow, rate = (
+                    (other, place.rate) if there.rate == MEASURED_RATE else (first, there.rate)
+                )
+                raise InvalidValue(
+                    f"dongle {dongle} is shared, but {slow.name} is at {rate}, where nobody knows "
+                    f"what a shared dongle carries: set it to {MEASURED_RATE}"
+                )
+
+
+def _refuse_near(on_air: dict[str, list[tuple[FleetVehicle, RadioPlace]]]) -> None:
+    channels = [(dongle, members[0][1].channel) for dongle, members in on_air.items()]
+    for (one, low), (other, high) in itertools.combinations(sorted(channels, key=_channel), 2):
+        if high - low < LEAST_APART:
+            where = f"channel {low}" if low == high else f"channels {low} and {high}"
+            raise InvalidValue(
+                f"dongles {one} and {other} disturb each other on {where}: put vehicles of one "
+                f"channel on one dongle, or set channels that are at least {LEAST_APART} apart"
+            )
+
+
+def _channel(item: tuple[str, int]) -> int:
+    return item[1]
+
+
+def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) -> FleetVehicle:
+    """The vehicle with a telemetry period that fits. Raises InvalidValue if none does."""
+    profile, usable = vehicle.profile, USABLE_SHARE * carried_per_s(shared_by)
+    periods_s = _periods_s(profile)
+    fits = [period_s for period_s in periods_s if needed_per_s(profile, period_s) <= usable]
+    is_named = "telemetry_period_s" in profile.link.model_fields_set
+    need = needed_per_s(profile, None if is_named else periods_s[-1])
+    most = _most_that_fit(need)
+    fewer = (
+        f"leave at most {most} on it, and give the others another dongle, on a channel at least "
+        f"{LEAST_APART} away"
+    )
+    if shared_by > MOST_ON_A_DONGLE:
+        raise InvalidValue(
+            f"dongle {dongle} has {shared_by} vehicles on channel {channel}, of at most "
+            f"{MOST_ON_A_DONGLE}: {fewer}"
+        )
+    if need > usable:
+        raise InvalidValue(
+            f"dongle {dongle} carries {carried_per_s(shared_by):.0f} packets/s for each of its "
+            f"{shared_by} vehicles on channel {channel}, of which {usable:.0f} can be relied on, "
+            f"but {vehicle.name} needs {need:.0f}: {_slower(profile, usable, fits)}{fewer}"
+        )
+    return vehicle if is_named else _with_link(vehicle, telemetry_period_s=fits[0])
+
+
+def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
+    """What to slow down so that the flight fits, if that is enough; ends in ``, or``."""
+    if fits:
+        need = needed_per_s(profile, fits[0])
+        return (
+            f"set link.telemetry_period_s to {fits[0]:g} (for {need:.0f} packets/s) instead of "
+            f"{profile.link.telemetry_period_s:g}, or "
+        )
+    rate_hz = math.floor((usable - profile.link.loop_hz) / 10.0) * 10
+    if not profile.positioning.source.is_deck and rate_hz >= LEAST_RATE_HZ:
+        return (
+            f"set positioning.rate_hz to {rate_hz} instead of {profile.positioning.rate_hz:g}, or "
+        )
+    return ""
+
+
+def _periods_s(profile: Profile) -> list[float]:
+    """The periods that may be chosen, from the profile's own one on, shortest first."""
+    first = round(profile.link.telemetry_period_s / LOG_STEP_S)
+    last = round(SLOWEST_PERIOD_S / LOG_STEP_S)
+    return [round(step * LOG_STEP_S, 3) for step in range(first, max(first, last) + 1)]
+
+
+def _most_that_fit(need_per_s: float) -> int:
+    """How many vehicles with this need one dongle carries, at least one."""
+    counts = range(1, MOST_ON_A_DONGLE + 1)
+    fit = [count for count in counts if need_per_s <= USABLE_SHARE * carried_per_s(count)]
+    return max(fit, default=1)
+
+
+def _with_link(vehicle: FleetVehicle, **changes: object) -> FleetVehicle:
+    link = vehicle.profile.link.model_copy(update=changes)
+    return replace(vehicle, profile=vehicle.profile.model_copy(update={"link": link}))

@@ -1,0 +1,312 @@
+"""Vehicles that cannot meet: each one's corridor, and who flies when.
+
+The corridor's radius follows from what measures the position:
+
+    room axes (motion capture, Lighthouse, Loco)   WANDER_M + ROOM_ERROR_M
+    Flow deck                                      WANDER_M + FLOW_DRIFT_MPS * time without target
+    target alone                                   TARGET_ALONE_M
+
+Two vehicles are in the air together only if their corridors keep the separation and neither stands
+near the other's. A vehicle that waits on the floor, or that hangs, is an obstacle for the others:
+
+    i waits in j's corridor  ->  i flies before j
+    i hangs in j's corridor  ->  j flies before i
+
+An order that keeps all of these is found by sorting; where there is none, two vehicles are named.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+
+from perchctl.corridor import Corridor
+from perchctl.errors import InvalidValue
+from perchctl.fleet.fleet import Fleet, FleetVehicle
+from perchctl.profile import MarkerConfig, Profile
+
+WANDER_M = 0.3
+"""How far a draught carries a healthy vehicle from its setpoint, level; the profile's own limit for
+the least fence (`0.3 <= safety.fence_radius_m`). Smaller, and gusts end flights; larger, and fewer
+vehicles fit into a room."""
+ROOM_ERROR_M = 0.05
+"""Error of a position in the room's axes: perchctl takes off only if estimate and motion capture
+agree within it (docs/positioning.md), and the Lighthouse geometries of two vehicles can differ by
+centimetres (bitcraze/cfcli). Smaller, and two estimates that differ let vehicles meet."""
+FLOW_DRIFT_MPS = 0.01
+"""Drift of a Flow deck's estimate, as in the simulation (`simulation.drift_mps`). Smaller, and a
+long search ends outside the corridor; larger, and Flow decks need more room."""
+TARGET_ALONE_M = 1.0
+"""Radius for the target alone: a vehicle that loses sight may drift 1 m in all until it is down
+(seen in simulated flights). Smaller, and a blind vehicle leaves it; larger, and targets must hang
+farther apart."""
+HEIGHT_MARGIN_M = 0.3
+"""Above the highest search: a climb overshoots by 0.1 m (docs/firmware.md, "Position take-off"),
+and a height drifts. Smaller, and an overshoot ends a flight."""
+
+SEPARATION_M = 0.4
+"""Between the edges of two corridors that are flown at a time. A jet 2 m below its vehicle still
+blows 0.24 m/s at 0.4 m aside (jet of Bauersfeld and others, 2024), less than the draughts in which
+perchctl perches. Distances in use between axes: 0.2 m in Bitcraze's demos, 0.24 m by Crazyswarm,
+0.6 m in the firmware's avoidance. Smaller, and neighbours blow each other about; larger, and fewer
+fit into a room."""
+START_SEPARATION_M = 0.5
+"""Of a vehicle that takes off from the corridor of one that flies, as in Bitcraze's demos.
+Smaller, and a vehicle starts in another's jet; larger, and homes must be farther apart."""
+OBSTACLE_M = 0.24
+"""Of a flown corridor from a vehicle that waits or hangs: twice the radius of 0.12 m that
+Crazyswarm takes for a vehicle. Smaller, and propellers touch; larger, and fewer targets fit."""
+
+
+# --- Corridors ---
+
+
+def corridor_radius_m(vehicle: FleetVehicle) -> float:
+    """Radius of the vehicle's corridor, from what measures its position."""
+    profile = vehicle.profile
+    if profile.positioning.source.is_target:
+        return TARGET_ALONE_M
+    if vehicle.frame == "room":
+        return WANDER_M + ROOM_ERROR_M
+    drift_mps = FLOW_DRIFT_MPS
+    if vehicle.simulated:
+        drift_mps = max(drift_mps, profile.simulation.drift_mps)
+    return WANDER_M + drift_mps * _unseen_s(profile)
+
+
+def _unseen_s(profile: Profile) -> float:
+    """Longest time in which nothing but the estimate says where the vehicle is: take-off and way,
+    the whole search, and the descent from the height limit. Under its target it flies by sight."""
+    planner = profile.planner
+    search_s = planner.search.attempts * planner.search.wait_s
+    descent_s = profile.safety.max_height_m / planner.landing.speed_mps
+    return planner.approach_timeout_s + search_s + descent_s
+
+
+def vehicle_corridor(vehicle: FleetVehicle) -> Corridor:
+    """The vehicle's corridor in the room's axes."""
+    profile = vehicle.profile
+    return Corridor(
+        home_m=vehicle.home_m,
+        target_m=vehicle.target_m,
+        radius_m=corridor_radius_m(vehicle),
+        way_top_m=profile.planner.search.max_height_m + HEIGHT_MARGIN_M,
+        target_top_m=profile.safety.max_height_m,
+    )
+
+
+def estimate_corridor(vehicle: FleetVehicle) -> Corridor:
+    """The same corridor in the axes of the vehicle's own state estimate: its fence.
+
+    Its radius is the same. A vehicle that flies by its setpoints keeps its estimate on the way
+    while its true place drifts; one under its target keeps its true place, while its estimate
+    drifts.
+    """
+    corridor = vehicle_corridor(vehicle)
+    return Corridor(
+        home_m=vehicle.to_estimate(corridor.home_m),
+        target_m=vehicle.to_estimate(corridor.target_m),
+        radius_m=corridor.radius_m,
+        way_top_m=corridor.way_top_m,
+        target_top_m=corridor.target_top_m,
+    )
+
+
+# --- Who may fly with whom ---
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Two vehicles that must not be in the air together, and `why`, with the distance."""
+
+    first: str
+    second: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Precedence:
+    """`first` must have flown before `then` takes off, and `why`, with the distance."""
+
+    first: str
+    then: str
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """Groups of vehicles that fly together, in their order, and what it follows from."""
+
+    groups: tuple[tuple[str, ...], ...]
+    conflicts: tuple[Conflict, ...]
+    precedences: tuple[Precedence, ...]
+
+    def may_fly_together(self, first: str, second: str) -> bool:
+        """True if the corridors of the two keep all separations.
+
+        Two that may not are also in each other's way on the floor: while one of them lies landed
+        away from its home, the other one must not take off.
+        """
+        return {first, second} not in ({c.first, c.second} for c in self.conflicts)
+
+
+def make_schedule(fleet: Fleet) -> Schedule:
+    """Who flies with whom, and in which order: as many at a time as `fleet.order` allows, in the
+    order of the file as far as nobody is in another's way.
+
+    Raises InvalidValue, naming two vehicles and the distance, if no order exists, or if a target
+    cannot be reached.
+    """
+    vehicles = fleet.vehicles
+    corridors = {vehicle.name: vehicle_corridor(vehicle) for vehicle in vehicles}
+    for vehicle in vehicles:
+        _check_fence(vehicle)
+    for pair in itertools.combinations(vehicles, 2):
+        _check_targets(*pair)
+    separation_m = SEPARATION_M if fleet.separation_m is None else fleet.separation_m
+    conflicts = find_conflicts(corridors, separation_m)
+    precedences = find_precedences(corridors)
+    _refuse_circles(precedences, corridors)
+    groups = _groups(list(corridors), fleet.most_at_once, conflicts, precedences)
+    return Schedule(groups=groups, conflicts=conflicts, precedences=precedences)
+
+
+def find_conflicts(
+    corridors: dict[str, Corridor], separation_m: float = SEPARATION_M
+) -> tuple[Conflict, ...]:
+    """Pairs whose corridors, or places of take-off, are too near each other."""
+    found = []
+    for (a, ours), (b, theirs) in itertools.combinations(corridors.items(), 2):
+        if (gap_m := ours.distance_m(theirs)) < separation_m:
+            found.append(Conflict(a, b, f"their corridors {_apart(gap_m)}"))
+            continue
+        for name, home_m, other, corridor in (
+            (a, ours.home_m, b, theirs),
+            (b, theirs.home_m, a, ours),
+        ):
+            if (gap_m := corridor.distance_to_m(home_m)) < START_SEPARATION_M:
+                why = f"{name} takes off {_from(gap_m, other)}"
+                found.append(Conflict(a, b, why))
+                break
+    return tuple(found)
+
+
+def find_precedences(corridors: dict[str, Corridor]) -> tuple[Precedence, ...]:
+    """Who must fly before whom, since it waits or hangs in the other's corridor."""
+    found = []
+    for (name, own), (other, corridor) in itertools.permutations(corridors.items(), 2):
+        waits_m, hangs_m = (corridor.distance_to_m(p) for p in (own.home_m, own.target_m))
+        if waits_m < OBSTACLE_M:
+            why = f"{name} waits on the floor {_from(waits_m, other)}"
+            found.append(Precedence(name, other, why))
+        if hangs_m < OBSTACLE_M:
+            found.append(Precedence(other, name, f"{name} hangs {_from(hangs_m, other)}"))
+    return tuple(found)
+
+
+def _apart(gap_m: float) -> str:
+    return f"overlap by {-gap_m:.2f} m" if gap_m < 0.0 else f"are {gap_m:.2f} m apart"
+
+
+def _from(gap_m: float, other: str) -> str:
+    if gap_m < 0.0:
+        return f"{-gap_m:.2f} m inside the corridor of {other}"
+    return f"{gap_m:.2f} m from the corridor of {other}"
+
+
+def _groups(
+    names: Sequence[str],
+    most: int,
+    conflicts: Sequence[Conflict],
+    precedences: Sequence[Precedence],
+) -> tuple[tuple[str, ...], ...]:
+    """The groups, each filled in the order of the names with whoever is free to fly."""
+    apart = {frozenset((c.first, c.second)) for c in conflicts}
+    flown: set[str] = set()
+    groups = []
+    while len(flown) < len(names):
+        group: list[str] = []
+        for name in names:
+            waits = any(p.then == name and p.first not in flown for p in precedences)
+            meets = any(frozenset((name, other)) in apart for other in group)
+            if name not in flown and not waits and not meets and len(group) < most:
+                group.append(name)
+        groups.append(tuple(group))
+        flown.update(group)
+    return tuple(groups)
+
+
+# --- Refusals ---
+
+
+def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corridor]) -> None:
+    """Raise InvalidValue if no order keeps all precedences; of several circles for two vehicles."""
+    by_pair: dict[tuple[str, str], Precedence] = {}
+    for each in precedences:
+        by_pair.setdefault((each.first, each.then), each)
+    for first, second in itertools.combinations(corridors, 2):
+        there, back = by_pair.get((first, second)), by_pair.get((second, first))
+        if there is not None and back is not None:
+            raise InvalidValue(
+                f"{first} and {second} cannot fly in any order: {there.why}, and {back.why}, of "
+                f"which {OBSTACLE_M:g} m are needed: {_advice(first, second, corridors)}"
+            )
+    sorter: TopologicalSorter[str] = TopologicalSorter()
+    for first, then in by_pair:
+        sorter.add(then, first)
+    try:
+        sorter.prepare()
+    except CycleError as error:
+        circle = error.args[1]  # each is needed by the one after it
+        each = by_pair[circle[0], circle[1]]
+        raise InvalidValue(
+            f"{each.first} and {each.then} cannot fly in any order, as {' before '.join(circle)} "
+            f"would be needed: {each.why}, of which {OBSTACLE_M:g} m are needed: "
+            f"{_advice(each.first, each.then, corridors)}"
+        ) from None
+
+
+def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
+    radius_m = max(corridors[first].radius_m, corridors[then].radius_m)
+    least_m = WANDER_M + ROOM_ERROR_M
+    more = (
+        f", or let a motion capture or Lighthouse measure the positions (frame: room), for which a "
+        f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
+    )
+    return f"move a home or target farther off{more if radius_m > least_m else ''}"
+
+
+def _check_fence(vehicle: FleetVehicle) -> None:
+    away_m = math.dist(vehicle.home_m, vehicle.target_m)
+    fence_m = vehicle.profile.safety.fence_radius_m
+    if away_m + WANDER_M > fence_m:
+        raise InvalidValue(
+            f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a draught carries "
+            f"it {WANDER_M:g} m beyond, but safety.fence_radius_m is {fence_m:g} m: move its home "
+            f"nearer, or set a larger fence"
+        )
+
+
+def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
+    """Refuse two targets that one vehicle could take for its own."""
+    apart_m = math.dist(first.target_m, second.target_m)
+    for one, other in ((first, second), (second, first)):
+        ours, theirs = one.profile.target, other.profile.target
+        alike = {_marker(ours.large), _marker(ours.small)} & {
+            _marker(theirs.large),
+            _marker(theirs.small),
+        }
+        within_m = ours.expected_within_m
+        if alike and apart_m <= within_m:
+            raise InvalidValue(
+                f"the targets of {one.name} and {other.name} have a marker id in common and are "
+                f"{apart_m:.2f} m apart, within target.expected_within_m ({within_m:g} m): print "
+                f"targets with other ids, or hang them farther apart"
+            )
+
+
+def _marker(marker: MarkerConfig) -> tuple[str, int]:
+    return marker.dictionary, marker.id
