@@ -42,6 +42,14 @@ README = TEXT[ROOT / "README.md"]
 
 MOST_LINES = 90
 
+ATRIUM = """name: atrium
+vehicles:
+  - {name: north, home_m: [0, 0], target_m: [0.2, 0.1]}
+  - {name: east, home_m: [2.4, 0], target_m: [2.2, 0]}
+"""
+CRAZYFLIES = """robots:
+  cf1: {enabled: true, uri: radio://0/80/2M/E7E7E7E701, initial_position: [0.0, 0.0, 0.0]}
+"""
 CAMCHAIN = """cam0:
   camera_model: pinhole
   distortion_model: radtan
@@ -141,10 +149,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     MountingRecording.write(folder / "hand.jsonl", [seen(hand("pivot"))])
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
+    (folder / "atrium.yaml").write_text(ATRIUM, encoding="utf-8")
+    (folder / "crazyflies.yaml").write_text(CRAZYFLIES, encoding="utf-8")
     made_up_log.write(folder / "short.jsonl", summary=made_up_log.SUMMARY)
     (folder / "last.jsonl").write_bytes(b"".join(decided_here("searched-out")))
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
-    for name in ("my_vehicle", "left", "right", "large"):
+    for name in ("my_vehicle", "north", "east", "large"):
         shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / f"{name}.yaml")
     return folder
 

@@ -15,10 +15,12 @@ connected, opened or armed. For those who fly, simulate or show a fleet:
     estimate_corridor(vehicle)          # the same in the axes of its own estimate: its fence,
                                         # estimate_corridor(vehicle).contains(x_m, y_m, z_m)
     plan.dongles                        # DongleLoad: which vehicles share a Crazyradio
+    draw_text(fleet, groups), draw_svg(fleet, groups)
 
 load: the file, and refusals of what two vehicles must not share. fleet: the frozen values.
 assignment: interchangeable targets. radio: dongles and the radio budget. schedule: corridors, and
-who flies when. plan: all of it in one call.
+who flies when. plan: all of it in one call. drawing: the room from above. convert: lists of
+Crazyflies from other programs.
 """
 
 import lazy_loader

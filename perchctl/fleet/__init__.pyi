@@ -1,3 +1,7 @@
+from .convert import ConvertedFleet as ConvertedFleet
+from .convert import convert_fleet as convert_fleet
+from .drawing import draw_svg as draw_svg
+from .drawing import draw_text as draw_text
 from .fleet import Fleet as Fleet
 from .fleet import FleetVehicle as FleetVehicle
 from .load import EXAMPLE as EXAMPLE

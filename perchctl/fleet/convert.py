@@ -1,0 +1,176 @@
+"""Fleet files from lists of Crazyflies that other programs keep.
+
+Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config) and
+the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither knows
+targets or cameras, and cfcli's knows no places: `missing` says what you have to add, and perchctl
+refuses the file until it is there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from perchctl.errors import InvalidValue
+from perchctl.plain_yaml import clip_text
+from perchctl.profile import read_yaml, yaml_scalar
+
+_CAPTURE = (
+    "# Name system and host of your motion capture in defaults. Each vehicle needs a rigid",
+    "# body of its own there; Crazyswarm2 can do with single markers, perchctl cannot.",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertedVehicle:
+    """A vehicle of another program's list: name, URI, and what else is known of it."""
+
+    name: str
+    uri: str
+    home_m: tuple[float, float] | None = None
+    body: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertedFleet:
+    """Another program's list. `skipped`: vehicles that it has switched off. `in_room_axes`: it says
+    that a Lighthouse measures the positions."""
+
+    name: str
+    vehicles: tuple[ConvertedVehicle, ...]
+    skipped: tuple[str, ...] = ()
+    in_room_axes: bool = False
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What the list does not know and a fleet file needs."""
+        homes = any(vehicle.home_m is None for vehicle in self.vehicles)
+        return (*(("home_m",) if homes else ()), "target_m", "source")
+
+    def text(self) -> str:
+        """The fleet file."""
+        mocap = any(vehicle.body is not None for vehicle in self.vehicles)
+        frame = ", frame: room" if self.in_room_axes and not mocap else ""
+        positioning = ", positioning: {by: mocap}" if mocap else ""
+        lines = [
+            "# Made by perchctl fleet convert. Add to each vehicle what is missing:",
+            f"# {', '.join(self.missing)}; then run perchctl fleet check on this file.",
+            *(_CAPTURE if mocap else ()),
+            f"name: {yaml_scalar(self.name)}",
+            f"defaults: {{profile: crazyflie{frame}{positioning}}}",
+            "order: one-at-a-time",
+            "on_failure: continue",
+            "vehicles:",
+        ]
+        for vehicle in self.vehicles:
+            body = f", body: {yaml_scalar(vehicle.body)}" if vehicle.body is not None else ""
+            home = f", home_m: {list(vehicle.home_m)}" if vehicle.home_m is not None else ""
+            lines.append(
+                f"  - {{name: {yaml_scalar(vehicle.name)}, uri: {json.dumps(vehicle.uri)}{body}"
+                f"{home}}}"
+            )
+        return "\n".join([*lines, ""])
+
+
+def convert_fleet(path: Path) -> ConvertedFleet:
+    """The vehicles in a file of Crazyswarm2, cfcli or Swarmkeeper.
+
+    Errors: NotFound, InvalidValue.
+    """
+    values = read_yaml(path)
+    robots, units = values.get("robots"), values.get("units")
+    if isinstance(robots, dict):
+        found = _from_crazyswarm2(path, robots, values.get("robot_types"))
+    elif isinstance(units, list):
+        found = _from_cfcli(path, units, values)
+    else:
+        raise InvalidValue(
+            f"{path}: has neither robots, as Crazyswarm2's crazyflies.yaml has, nor a list of "
+            f"units, as a swarm of cfcli or Swarmkeeper has"
+        )
+    if not found.vehicles:
+        raise InvalidValue(f"{path}: has no vehicle that is switched on")
+    names = [vehicle.name.lower() for vehicle in found.vehicles]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InvalidValue(f"{path}: two vehicles would be called {twice}: rename one")
+    return found
+
+
+def _from_crazyswarm2(path: Path, robots: Mapping[Any, Any], types: Any) -> ConvertedFleet:
+    vehicles, skipped = list[ConvertedVehicle](), list[str]()
+    for name, robot in robots.items():
+        where = f"{path}: robots.{clip_text(str(name))}"
+        entry = _mapping(where, robot)
+        if entry.get("enabled") is not True:
+            skipped.append(str(name))
+            continue
+        kind = types.get(entry.get("type")) if isinstance(types, dict) else None
+        capture = kind.get("motion_capture") if isinstance(kind, dict) else None
+        # `enabled` up to version 2 of the file, `tracking` from version 3 on.
+        tracked = isinstance(capture, dict) and (
+            capture.get("enabled") is True or capture.get("tracking") is not None
+        )
+        vehicles.append(
+            ConvertedVehicle(
+                name=_file_name(str(name)),
+                uri=_uri(where, entry),
+                home_m=_place(f"{where}.initial_position", entry.get("initial_position")),
+                body=str(name) if tracked else None,  # Crazyswarm2 calls the body so, too
+            )
+        )
+    return ConvertedFleet(name=path.stem, vehicles=tuple(vehicles), skipped=tuple(skipped))
+
+
+def _from_cfcli(path: Path, units: Sequence[Any], values: Mapping[str, Any]) -> ConvertedFleet:
+    vehicles = []
+    for number, unit in enumerate(units, 1):
+        where = f"{path}: units, number {number}"
+        entry = _mapping(where, unit)
+        vehicles.append(
+            ConvertedVehicle(
+                name=_file_name(str(entry.get("name", f"CF-{number:02d}"))), uri=_uri(where, entry)
+            )
+        )
+    return ConvertedFleet(
+        name=str(values.get("name", path.stem)),
+        vehicles=tuple(vehicles),
+        in_room_axes=values.get("lighthouse") is not None,
+    )
+
+
+def _mapping(where: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InvalidValue(f"{where}: must hold keys and values, found {type(value).__name__}")
+    return value
+
+
+def _uri(where: str, entry: Mapping[str, Any]) -> str:
+    uri = entry.get("uri")
+    if not isinstance(uri, str):
+        raise InvalidValue(f"{where}: has no uri")
+    return uri
+
+
+def _place(where: str, value: Any) -> tuple[float, float] | None:
+    """The first two of the numbers x, y, z; None if there are none."""
+    if value is None:
+        return None
+    numbers = value if isinstance(value, list) else []
+    if len(numbers) < 2 or not all(_is_number(number) for number in numbers[:2]):
+        raise InvalidValue(f"{where}: must be x, y and z in metres, found {clip_text(repr(value))}")
+    return float(numbers[0]), float(numbers[1])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _file_name(name: str) -> str:
+    """The name as a fleet file allows it."""
+    fit = re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-_.")[:32]
+    return fit or "vehicle"

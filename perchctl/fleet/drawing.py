@@ -1,0 +1,159 @@
+"""The room from above: homes, corridors, targets and order, as text and as SVG.
+
+Both show the room's axes, x to the right and y up. A plan that is refused is drawn as well, without
+its order: it shows what is in whose way.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping
+from html import escape
+
+from perchctl.corridor import Corridor, Point
+from perchctl.fleet.fleet import Fleet
+from perchctl.fleet.schedule import vehicle_corridor
+
+COLUMNS = 80
+MOST_ROWS = 34
+"""Of the map; with more of them it does not fit on a screen together with its legend."""
+CELL_ASPECT = 2.0
+"""Height of a character over its width, in usual terminals."""
+MARGIN_M = 0.2
+"""Around the corridors."""
+OVERLAP = "#"
+INSIDE = "."
+
+_SVG_WIDTH_PX = 800
+_LEGEND_ROW_PX = 22
+_PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's colours, which colour-blind people can tell apart, as in perchctl's plots."""
+
+
+def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
+    """The room in at most 80 columns: a map, and a line for each vehicle.
+
+    On the map, ``N`` is the home of vehicle number N and ``N*`` its target; ``.`` is in one
+    corridor, ``#`` in several.
+    """
+    corridors = _corridors(fleet)
+    low, high = _bounds(corridors)
+    width_m, height_m = high[0] - low[0], high[1] - low[1]
+    cell_m = max(width_m / COLUMNS, height_m / (MOST_ROWS * CELL_ASPECT))
+    columns = min(COLUMNS, math.ceil(width_m / cell_m))
+    rows = min(MOST_ROWS, math.ceil(height_m / (cell_m * CELL_ASPECT)))
+    cells = [
+        [
+            _cell(
+                (low[0] + (c + 0.5) * cell_m, high[1] - (r + 0.5) * cell_m * CELL_ASPECT),
+                corridors,
+            )
+            for c in range(columns)
+        ]
+        for r in range(rows)
+    ]
+
+    def write(place: Point, text: str) -> None:
+        row = min(rows - 1, int((high[1] - place[1]) / (cell_m * CELL_ASPECT)))
+        column = min(columns - len(text), int((place[0] - low[0]) / cell_m))
+        cells[row][column : column + len(text)] = text
+
+    for number, vehicle in enumerate(fleet.vehicles, 1):
+        write(vehicle.target_m, f"{number}*")
+        write(vehicle.home_m, f"{number}")
+    lines = ["".join(row).rstrip() for row in cells]
+    lines += [f"{width_m:.1f} by {height_m:.1f} m; x to the right, y up", ""]
+    for line in _legend(fleet, corridors, groups):
+        lines += textwrap.wrap(line, COLUMNS, subsequent_indent="   ", drop_whitespace=True)
+    return "\n".join(lines)
+
+
+def _cell(place: Point, corridors: Mapping[str, Corridor]) -> str:
+    inside = sum(corridor.distance_to_m(place) <= 0.0 for corridor in corridors.values())
+    return " " if inside == 0 else INSIDE if inside == 1 else OVERLAP
+
+
+def _legend(
+    fleet: Fleet, corridors: Mapping[str, Corridor], groups: tuple[tuple[str, ...], ...]
+) -> list[str]:
+    lines = []
+    for number, vehicle in enumerate(fleet.vehicles, 1):
+        turn = next((n for n, group in enumerate(groups, 1) if vehicle.name in group), None)
+        order = f", flies {_ordinal(turn)}" if turn is not None else ""
+        lines.append(
+            f"{number:>2} {vehicle.name}: home {_place(vehicle.home_m)}, {number}* target "
+            f"{_place(vehicle.target_m)}, radius {corridors[vehicle.name].radius_m:.2f} m{order}"
+        )
+    return lines
+
+
+def _place(place: Point) -> str:
+    return f"{place[0]:.2f} {place[1]:.2f}"
+
+
+def _ordinal(number: int) -> str:
+    teens = 10 <= number % 100 < 20
+    return f"{number}{'th' if teens else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
+
+
+def draw_svg(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
+    """The room as an SVG picture; corridors as wide lines with round ends, homes as squares,
+    targets as crosses."""
+    corridors = _corridors(fleet)
+    low, high = _bounds(corridors)
+    scale = _SVG_WIDTH_PX / (high[0] - low[0])
+    map_px = (high[1] - low[1]) * scale
+    legend = _legend(fleet, corridors, groups)
+    height_px = map_px + _LEGEND_ROW_PX * (len(legend) + 1)
+
+    def at(place: Point) -> Point:
+        return (place[0] - low[0]) * scale, (high[1] - place[1]) * scale
+
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_SVG_WIDTH_PX} {height_px:.0f}" '
+        f'font-family="sans-serif" font-size="15">',
+        f"<title>{escape(fleet.name)}: the room from above, x to the right, y up</title>",
+        '<rect width="100%" height="100%" fill="white"/>',
+    ]
+    for number, vehicle in enumerate(fleet.vehicles):
+        corridor, colour = corridors[vehicle.name], _PALETTE[number % len(_PALETTE)]
+        (x, y), (u, v) = at(vehicle.home_m), at(vehicle.target_m)
+        line = f'x1="{x:.1f}" y1="{y:.1f}" x2="{u:.1f}" y2="{v:.1f}" stroke="{colour}"'
+        parts += [
+            f'<line {line} stroke-opacity="0.2" stroke-linecap="round" '
+            f'stroke-width="{2 * corridor.radius_m * scale:.1f}"/>',
+            f'<line {line} stroke-width="1.5" stroke-dasharray="5 4"/>',
+            f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" fill="{colour}"/>',
+            f'<path d="M{u - 6:.1f} {v - 6:.1f}l12 12m0 -12l-12 12" stroke="{colour}" '
+            f'stroke-width="2.5"/>',
+            f'<text x="{x + 9:.1f}" y="{y + 5:.1f}">{number + 1} {escape(vehicle.name)}</text>',
+        ]
+    metre_y = map_px - 12
+    parts.append(
+        f'<path d="M12 {metre_y:.1f}h{scale:.1f}" stroke="black" stroke-width="2"/>'
+        f'<text x="12" y="{metre_y - 6:.1f}">1 m</text>'
+    )
+    parts += [
+        f'<text x="12" y="{map_px + _LEGEND_ROW_PX * (row + 1):.1f}" '
+        f'fill="{_PALETTE[row % len(_PALETTE)]}">{escape(text.strip())}</text>'
+        for row, text in enumerate(legend)
+    ]
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def _corridors(fleet: Fleet) -> dict[str, Corridor]:
+    return {vehicle.name: vehicle_corridor(vehicle) for vehicle in fleet.vehicles}
+
+
+def _bounds(corridors: Mapping[str, Corridor]) -> tuple[Point, Point]:
+    """The lower left and the upper right corner of what is drawn."""
+    edges = [
+        (place[0] + sign * reach, place[1] + sign * reach)
+        for corridor in corridors.values()
+        for reach in [corridor.radius_m + MARGIN_M]
+        for place in (corridor.home_m, corridor.target_m)
+        for sign in (-1.0, 1.0)
+    ]
+    xs, ys = [x for x, _ in edges], [y for _, y in edges]
+    return (min(xs), min(ys)), (max(xs), max(ys))

@@ -1,0 +1,96 @@
+"""`perchctl fleet`: what it prints and draws, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from perchctl.fleet import draw_svg, draw_text, load_fleet
+from tests.fleet.rig import fleet
+from tests.helpers.commands import run
+
+CLASH = """\
+name: clash
+vehicles:
+  - {name: north, home_m: [0, 0], target_m: [1.2, 0]}
+  - {name: east, home_m: [2.4, 0], target_m: [1.2, 0.1]}
+"""
+
+
+@pytest.fixture
+def clash(tmp_path: Path) -> Path:
+    path = tmp_path / "clash.yaml"
+    path.write_text(CLASH, encoding="utf-8")
+    return path
+
+
+def test_the_shipped_fleet_is_planned_in_80_columns() -> None:
+    done = run("fleet")
+    assert done.code == 0
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    assert "group 1: north, east" in done.stdout
+    assert "1 north: home 0.00 1.20, 1* target -0.10 1.50, radius 0.64 m, flies 1st" in done.stdout
+
+
+def test_json_has_the_plan() -> None:
+    plan = json.loads(run("fleet", "check", "--json").stdout)
+    assert plan["groups"] == [["north", "east"], ["south", "west"]]
+    assert [vehicle["group"] for vehicle in plan["vehicles"]] == [1, 1, 2, 2]
+    assert plan["dongles"] == []
+
+
+def test_a_refused_plan_is_drawn_and_refused_in_one_sentence(clash: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "clash.svg"
+    done = run("fleet", "check", str(clash), "-o", str(picture))
+    assert done.code == 30
+    assert not done.stdout
+    assert done.stderr.splitlines()[-1].startswith(f"perchctl: {clash}: the targets of north and")
+    assert "##" in done.stderr
+    assert picture.exists()
+    failed = json.loads(run("fleet", "check", str(clash), "--json").stdout)
+    assert failed["exit_code"] == 30
+
+
+def test_one_bad_uri_of_many_is_one_sentence(clash: Path) -> None:
+    clash.write_text(CLASH.replace("name: east", "name: east, uri: 'radio://x'"), encoding="utf-8")
+    done = run("fleet", str(clash))
+    assert (done.code, done.stdout) == (30, "")
+    assert done.complaint.startswith(f"{clash}: vehicle east: URI 'radio://x' is not one of a")
+
+
+def test_convert_writes_a_file_that_says_what_it_lacks(tmp_path: Path) -> None:
+    listed, written = tmp_path / "lab.yaml", tmp_path / "fleet.yaml"
+    listed.write_text("units: [{name: CF-01, uri: 'radio:///80/2M/E7E7E7E701'}]\n")
+    done = run("fleet", "convert", str(listed), "-o", str(written))
+    assert done.code == 0
+    assert "add home_m, target_m, source to each vehicle" in done.stdout
+    again = run("fleet", "convert", str(listed), "-o", str(written))
+    assert (again.code, "add --force" in again.stderr) == (30, True)
+
+
+def test_the_map_has_each_home_and_target_where_it_is() -> None:
+    text = draw_text(load_fleet())
+    rows = text.splitlines()
+    at = {
+        label: next((r, row.index(label)) for r, row in enumerate(rows) if label in row)
+        for label in ("1*", "2*", "3*", "4*")
+    }
+    assert at["1*"][0] < at["2*"][0] < at["3*"][0], "y is up"
+    assert at["4*"][1] < at["1*"][1] < at["2*"][1], "x is to the right"
+
+
+def test_many_vehicles_on_one_spot_can_be_drawn() -> None:
+    crowd = fleet([((0.0, 0.0), (0.0, 0.0))] * 12)
+    assert max(map(len, draw_text(crowd).splitlines())) <= 80
+    assert "12" in draw_text(crowd)
+
+
+def test_the_picture_is_an_svg_of_all_vehicles() -> None:
+    planned = load_fleet()
+    root = ElementTree.fromstring(draw_svg(planned, (("north",), ("east",))))
+    words = " ".join(node.text or "" for node in root.iter() if node.tag.endswith("text"))
+    assert all(vehicle.name in words for vehicle in planned.vehicles)
+    assert "flies 2nd" in words
