@@ -251,8 +251,8 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
         there, back = by_pair.get((first, second)), by_pair.get((second, first))
         if there is not None and back is not None:
             raise InvalidValue(
-                f"{first} and {second} cannot fly in any order: {there.why}, and {back.why}, of "
-                f"which {OBSTACLE_M:g} m are needed: {_advice(first, second, corridors)}"
+                f"{first} and {second} cannot fly in any order: {there.why}, and {back.why}; "
+                f"{_advice(first, second, corridors)}"
             )
     sorter: TopologicalSorter[str] = TopologicalSorter()
     for first, then in by_pair:
@@ -264,8 +264,7 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
         each = by_pair[circle[0], circle[1]]
         raise InvalidValue(
             f"{each.first} and {each.then} cannot fly in any order, as {' before '.join(circle)} "
-            f"would be needed: {each.why}, of which {OBSTACLE_M:g} m are needed: "
-            f"{_advice(each.first, each.then, corridors)}"
+            f"would be needed: {each.why}; {_advice(each.first, each.then, corridors)}"
         ) from None
 
 
@@ -276,7 +275,10 @@ def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
         f", or let a motion capture or Lighthouse measure the positions (frame: room), for which a "
         f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
     )
-    return f"move a home or target farther off{more if radius_m > least_m else ''}"
+    return (
+        f"a vehicle that waits or hangs must be {OBSTACLE_M:g} m away from it: move a home or "
+        f"target farther off{more if radius_m > least_m else ''}"
+    )
 
 
 def _check_fence(vehicle: FleetVehicle) -> None:

@@ -183,8 +183,8 @@ def test_who_waits_in_another_s_corridor_flies_first() -> None:
 def test_who_would_hang_in_each_other_s_corridor_is_refused_with_both_names() -> None:
     assert refusal(fleet([((0, 0), (1, 0)), ((2, 0), (1.2, 0))])) == (
         "v0 and v1 cannot fly in any order: v1 hangs 0.15 m inside the corridor of v0, and v0 "
-        "hangs 0.15 m inside the corridor of v1, of which 0.24 m are needed: move a home or "
-        "target farther off"
+        "hangs 0.15 m inside the corridor of v1; a vehicle that waits or hangs must be 0.24 m away "
+        "from it: move a home or target farther off"
     )
 
 
