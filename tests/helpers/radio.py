@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -23,12 +22,12 @@ from cflib.drivers.crazyradio import Crazyradio, _radio_ack
 from perchctl.link import Packet, Port
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import CrtpServer
+from tests.helpers.chip import Chip
 
 URI = "radio://0/80/2M/E7E7E7E7E7"
 FORGETS_LOGS_S = 1.0
 """docs/firmware.md, "Radio silence"."""
 _ANSWERED_S, _UNANSWERED_S = 0.0005, 0.002  # of a packet; unanswered it is repeated three times
-_NULL, _SAFELINK = 0xF3, 0x05
 _LOG_SETTINGS, _LOG_RESET = 1, bytes((5,))
 
 
@@ -47,9 +46,7 @@ class Air:
         self._began_s = self._heard_s = time.monotonic()
         self._vehicle = SimulatedVehicle(scenario)
         self._server = CrtpServer(self._vehicle.firmware)
-        self._safelink, self._up, self._down = False, 1, 1
-        self._waiting: deque[bytes] = deque()
-        self._last = b""
+        self._chip = Chip(self._take)
 
     def hears(self, what: Callable[[Packet], bool], since_s: float, limit_s: float) -> float | None:
         """When the first such packet since then reached the vehicle; None where none does."""
@@ -70,33 +67,17 @@ class Air:
                 return None
             if now_s - self._heard_s > FORGETS_LOGS_S:
                 self._server.handle(Packet(Port.LOG, _LOG_SETTINGS, _LOG_RESET))
-                self._waiting.clear()
+                self._chip.waiting.clear()
             self._heard_s = now_s
-            self._waiting.extend(packet.encode() for packet in self._server.due_packets())
-            return self._acknowledge(data)
-
-    def _acknowledge(self, data: bytes) -> bytes:
-        head = data[0]
-        if len(data) == 3 and head & _NULL == _NULL and data[1] == _SAFELINK:
-            self._safelink, self._up, self._down = bool(data[2]), 1, 1
-            self._last = data
-            return data
-        if not self._safelink or head & 0x08 != self._up << 3:
-            self._up = 1 - self._up
-            self._take(data)
-        if not self._safelink or head & 0x04 != self._down << 2:
-            self._down = 1 - self._down
-            self._last = self._waiting.popleft() if self._waiting else bytes((_NULL,))
-            if self._safelink:
-                self._last = bytes((self._last[0] & _NULL | self._down << 2,)) + self._last[1:]
-        return self._last
+            self._chip.waiting.extend(packet.encode() for packet in self._server.due_packets())
+            return self._chip.acknowledge(data)
 
     def _take(self, data: bytes) -> None:
         packet = Packet.decode(data)
-        if packet is None or data[0] & _NULL == _NULL:
+        if packet is None:
             return
         self.heard.append((self._heard_s, packet))
-        self._waiting.extend(answer.encode() for answer in self._server.handle(packet))
+        self._chip.waiting.extend(answer.encode() for answer in self._server.handle(packet))
         self._changed.notify_all()
 
 
