@@ -9,13 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
 from perchctl.errors import unfit_cflib
+
+CLOSE_STEP_S = 0.01
+"""Time between two looks at a driver that is being closed, s. Longer: a dead dongle is opened again
+later. Shorter: the look costs processor time while a slow dongle closes."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,18 @@ def _radio_thread() -> Any:
     return radiodriver._RadioDriverThread(*[None] * 7)  # the thread is not started
 
 
+def _dongle_share() -> Any:
+    from cflib.crtp.radiodriver import _SharedRadioInstance
+
+    return _SharedRadioInstance(*[None] * 4)
+
+
+def _dongle_thread() -> Any:
+    from cflib.crtp.radiodriver import _SharedRadio
+
+    return _Named(_SharedRadio.open_instance)  # making one would open a dongle
+
+
 def _radio_manager() -> Any:
     from cflib.crtp.radiodriver import RadioManager
 
@@ -81,7 +99,7 @@ def _radio_module() -> Any:
 
 
 class _Named:
-    """An object whose attributes are the names that a function looks up."""
+    """An object whose attributes are the names that a function looks up or sets."""
 
     def __init__(self, function: Any) -> None:
         vars(self).update(dict.fromkeys(function.__code__.co_names))
@@ -98,7 +116,12 @@ INTERNALS = (
     Internal("needs_resending", _radio_driver, "false once a radio has agreed on safelink"),
     Internal("out_queue", _radio_driver, "asked for room: `send_packet` would wait for 2 s"),
     Internal("_thread", _radio_driver, "asked whether the driver is alive"),
+    Internal("_radio", _radio_driver, "its share of the dongle, for the two below"),
+    Internal("send_packet", _dongle_share, "wrapped: the hub counts what the dongle answers"),
+    Internal("_rsp_queue", _dongle_share, "wakes a thread that waits for a dongle that is gone"),
     Internal("_retry_before_disconnect", _radio_thread, "counts lost packets; a dead dongle stops"),
+    Internal("rate_limit", _radio_thread, "set: the hub slows down the polls of an idle vehicle"),
+    Internal("_radio", _dongle_thread, "None once the dongle is closed; it may never open again"),
     Internal("_radios", _radio_manager, "a dongle's thread that has ended is removed"),
     Internal("_lock", _radio_manager, "held while it is"),
     Internal("set_retries_before_disconnect", _radio_module, "a radio is waited for, not given up"),
@@ -183,7 +206,12 @@ def retries_left(thread: threading.Thread | None) -> int | None:
 
 
 def forget_dead_dongle(uri: str) -> None:
-    """Remove a dongle's thread that has ended; cflib would keep it forever.
+    """Remove a dongle's thread that has ended, or whose dongle is closed; cflib would keep it
+    forever.
+
+    cflib counts the links of a closed dongle wrongly once an attempt to open it has failed, and
+    then never closes it again: after being unplugged twice, it would stay dead (docs/firmware.md,
+    "Dongle unplugged twice").
 
     The check and the removal hold cflib's own lock because a second link over the same dongle may
     have reopened it meanwhile.
@@ -197,7 +225,7 @@ def forget_dead_dongle(uri: str) -> None:
     with RadioManager._lock:
         radios = RadioManager._radios
         radio = radios[number] if number < len(radios) else None
-        if radio is not None and not radio.is_alive():
+        if radio is not None and (not radio.is_alive() or radio._radio is None):
             radios[number] = None
 
 
@@ -213,3 +241,80 @@ def log_prints(logger: logging.Logger) -> None:
     from cflib.crtp import radiodriver
 
     vars(radiodriver)["print"] = lambda *words: logger.info("%s", words)
+
+
+# --- What the radio hub needs of a driver that it runs without a `Crazyflie` ---
+
+
+def count_answers(driver: Any, on_answer: Callable[[bool | None], None]) -> None:
+    """Call `on_answer` after each packet of a radio's driver, in the driver's thread: with True if
+    the vehicle acknowledged it, False if it was lost, None if the dongle failed.
+
+    cflib's statistics are made of acknowledged packets only.
+    """
+    share = driver._radio
+    send_packet = share.send_packet
+
+    def counted(data: Any) -> Any:
+        answer = send_packet(data)
+        on_answer(None if answer is None else bool(answer.ack))
+        return answer
+
+    share.send_packet = counted
+
+
+def put_packet(driver: Any, packet: Any, wait_s: float) -> bool:
+    """Hand a packet to a radio's driver if it has room within `wait_s`; return True if it had.
+
+    cflib's `send_packet` would wait for 2 s, and then report an error.
+    """
+    try:
+        driver.out_queue.put(packet, True, wait_s)
+    except queue.Full:
+        return False
+    return True
+
+
+def limit_rate(driver: Any, packets_per_s: int | None) -> None:
+    """Limit how often a radio's driver polls its vehicle from the next poll on; None: no limit.
+
+    cflib reads the attribute before each poll, though it sets it only as the link is opened.
+    """
+    driver._thread.rate_limit = packets_per_s
+
+
+def dongle_thread(uri: str) -> threading.Thread:
+    """Return the thread of an open URI's dongle.
+
+    It ends at the first setting that the dongle does not take, which with several vehicles is the
+    next packet. The drivers wait for its answers forever then, and report nothing.
+    """
+    from cflib.crtp.radiodriver import RadioDriver, RadioManager
+
+    thread: threading.Thread = RadioManager._radios[RadioDriver.parse_uri(uri)[0]]
+    return thread
+
+
+def forget_dongle(thread: threading.Thread) -> None:
+    """Let the next driver open the dongle anew, also if its thread hangs in a call of USB. Only for
+    a process whose drivers of this dongle have all been closed."""
+    from cflib.crtp.radiodriver import RadioManager
+
+    with RadioManager._lock:
+        RadioManager._radios[:] = [r if r is not thread else None for r in RadioManager._radios]
+
+
+def close_radio(driver: Any, dongle: threading.Thread, timeout_s: float) -> None:
+    """Close a radio's driver, also if its dongle's thread has ended; bounded. Sends nothing.
+
+    cflib's `close` joins the driver's thread, which may wait forever for an answer. An answer of
+    None makes it look whether it is to end.
+    """
+    share = driver._radio
+    closer = threading.Thread(target=driver.close, name="perchctl-close", daemon=True)
+    closer.start()
+    end_s = time.monotonic() + timeout_s
+    while closer.is_alive() and time.monotonic() < end_s:
+        if not dongle.is_alive():
+            share._rsp_queue.put(None)
+        closer.join(CLOSE_STEP_S)
