@@ -1,6 +1,8 @@
 from .cflib_link import CflibLink as CflibLink
 from .crtp import Packet as Packet
 from .crtp import Port as Port
+from .hub import RadioHub as RadioHub
+from .hub_driver import HubReport as HubReport
 from .listening import AttitudeLink as AttitudeLink
 from .listening import ProbeLink as ProbeLink
 from .listening import find_uris_and_problem as find_uris_and_problem

@@ -16,6 +16,7 @@ from typing import Any
 from perchctl.errors import ConnectionFailed
 from perchctl.link import internals
 from perchctl.link.crtp import Packet
+from perchctl.link.hub_driver import HubDriver
 from perchctl.link.protocol import UDEV_HELP, vehicle_uri
 from perchctl.places import user_folder
 
@@ -277,6 +278,8 @@ def init_cflib() -> None:
     internals.keep_retrying(RADIO_RETRIES)
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()
+    if HubDriver not in cflib.crtp.CLASSES:
+        cflib.crtp.CLASSES.append(HubDriver)
 
 
 def send_packets(cf: Any, packets: Iterable[Packet]) -> None:

@@ -126,8 +126,10 @@ FORMS = {
     "radio": rf"([0-9]+|[0-9A-Fa-f]{{10}})(/{_CHANNEL}(/{_RATE}(/{_ADDRESS})?)?)?(\?.+)?",
     "usb": r"\d+",
     "udp": r"[^/:\s]+:0*[1-9]\d{0,4}",
+    "hub": rf"127\.0\.0\.1:[1-9]\d{{0,4}}/{_CHANNEL}/{_RATE}/{_ADDRESS}",
 }
-"""Regular expressions of the URIs, by scheme."""
+"""Regular expressions of the URIs, by scheme. `hub` is a radio's vehicle behind a `RadioHub`, which
+gives out these URIs; nobody types one."""
 EXAMPLES = (
     "sim://, radio://0/80/2M/E7E7E7E7E7 (channel 0 to 125; 250K, 1M or 2M; an address of at "
     "most ten hex digits), usb://0, udp://127.0.0.1:19850 (port 1 to 65535)"

@@ -1,0 +1,133 @@
+"""The radio hub: a process that owns a Crazyradio and shares it between several flight processes.
+
+cflib shares a dongle only within one process (docs/firmware.md, "Shared dongle"). A vehicle's
+flight is a process of its own, so that a hang or a crash in one never delays another; their packets
+meet here. `RadioHub` is the handle of the process that starts the flights; `perchctl.link.sharing`
+is what runs in the hub.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Sequence
+
+from perchctl.children import last_line, spawn, wait_or_kill
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
+from perchctl.link.hub_driver import HubReport
+from perchctl.link.protocol import check_uri, vehicle_uri
+
+START_TIMEOUT_S = 20.0
+"""Longest wait for a hub to start and open its dongle, s: loading takes 1 s on an idle computer,
+and each of a dongle's settings at most 1 s. Longer: a hub that hangs is noticed later. Shorter: a
+busy computer fails to start."""
+END_TIMEOUT_S = 5.0
+"""Longest wait for a hub to end, s, after which it is killed. Longer: a hub that hangs delays the
+end. Shorter: its dongle may stay claimed until the system has cleaned up."""
+SILENT_S = 1.0
+"""Time without a report after which the hub counts as hanging, s; it reports five times a second.
+Longer: noticed later. Shorter: a busy computer is taken for a hang."""
+PROGRAM = "from perchctl.link.sharing import serve_parent; serve_parent()"
+
+
+class RadioHub:
+    """Handle of a hub for the vehicles at `uris`, radio URIs of one dongle; a context manager.
+
+    Raises InvalidValue for URIs that one dongle cannot serve, ConnectionFailed if the dongle cannot
+    be opened or a vehicle is in use by another program, and TimedOut. Then no packet was sent to
+    any vehicle. A vehicle that does not answer is no error here: its flight fails to connect.
+
+    The hub survives its parent until the flights have ended, because they land by its packets.
+
+    Attributes:
+        uris: for each given URI, the `hub://` URI for the flight's `CflibLink`.
+        reports: for each given URI, the newest report that `update` has read.
+    """
+
+    def __init__(self, uris: Sequence[str]) -> None:
+        check_uris(uris)
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115
+        self._child, self._channel = spawn(PROGRAM, self._output)
+        self._heard_s = time.monotonic()
+        self.reports: dict[str, HubReport] = {}
+        try:
+            self._channel.receive(START_TIMEOUT_S)
+            self._channel.send(list(uris))
+            answer = self._channel.receive(START_TIMEOUT_S)
+            if isinstance(answer, PerchError):
+                raise answer
+            self.uris: dict[str, str] = answer
+        except TimeoutError:
+            self.stop()
+            raise ConnectionFailed("the radio hub did not start in time") from None
+        except (EOFError, OSError):
+            why = last_line(self._output)
+            self.stop()
+            raise ConnectionFailed(f"the radio hub has ended at its start{why}") from None
+        except BaseException:
+            self.stop()
+            raise
+        self._heard_s = time.monotonic()
+
+    def update(self) -> str | None:
+        """Read the hub's newest reports. Return None, or a sentence on why the hub itself is of no
+        use any more. Never blocks."""
+        try:
+            while self._channel.poll():
+                self.reports = self._channel.recv()
+                self._heard_s = time.monotonic()
+        except (EOFError, OSError):
+            return f"the radio hub has ended{last_line(self._output)}"
+        silent_s = time.monotonic() - self._heard_s
+        return (
+            f"the radio hub has not reported for {silent_s:.1f} s" if silent_s > SILENT_S else None
+        )
+
+    def limit(self, uri: str, packets_per_s: int | None) -> None:
+        """Limit the packets for an idle vehicle, so that the others get its share; None: no limit.
+
+        Takes effect after the vehicle's next packet. It limits telemetry too: a flight that asks
+        for more telemetry than fits gets it late.
+        """
+        with contextlib.suppress(OSError):  # the hub has ended, as `update` says
+            self._channel.send((uri, packets_per_s))
+
+    def stop(self) -> None:
+        """End the hub, which sends no packet any more. May be called twice."""
+        self._channel.close()
+        if self._child.poll() is None:
+            with contextlib.suppress(OSError):
+                self._child.terminate()
+            wait_or_kill(self._child, END_TIMEOUT_S)
+        self._output.close()
+
+    def __enter__(self) -> RadioHub:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+def check_uris(uris: Sequence[str]) -> None:
+    """Raise InvalidValue unless these are radio URIs of different vehicles on one dongle."""
+    for uri in uris:
+        if check_uri(uri) != "radio":
+            raise InvalidValue(f"{uri} is not a radio's URI: only a Crazyradio is shared by a hub")
+    dongles = {dongle_of(uri): uri for uri in uris}
+    if len(dongles) != 1:
+        raise InvalidValue(
+            f"a radio hub serves the vehicles of one dongle, found {' and '.join(dongles.values())}"
+        )
+    vehicles: dict[str, str] = {}
+    for uri in uris:
+        other = vehicles.setdefault(vehicle_uri(uri), uri)
+        if other is not uri:
+            raise InvalidValue(
+                f"{other} and {uri} are one vehicle: give each vehicle an address of its own"
+            )
+
+
+def dongle_of(uri: str) -> str:
+    """Return the number or serial number of a radio URI's dongle."""
+    return uri.removeprefix("radio://").partition("?")[0].partition("/")[0].upper()

@@ -1,0 +1,258 @@
+"""The flight's end of the radio hub: a driver for cflib's `hub://` URIs, and the messages between
+both ends.
+
+```
+flight process                            hub process (perchctl/link/hub.py)
+CflibLink -> Crazyflie -> HubDriver  <--- UDP on loopback --->  RadioDriver -> dongle
+```
+
+One datagram carries one CRTP packet, as with cflib's `udp://`. The two reserved bits of a CRTP
+header are always set (`perchctl.link.crtp.Packet`); a datagram without them is a message:
+
+- `HELLO` and the vehicle: the flight asks for this vehicle's packets, first to connect and then
+  once a second. The answer is a `REPORT`.
+- `BYE`: the flight has closed its link.
+- `ROOM` and a byte: how many of the flight's packets wait in the hub for the radio.
+- `REPORT` and a `HubReport` as JSON.
+
+cflib's own `udp://` driver would not do. It accepts any number of packets, and a stop would go out
+behind the setpoints that had piled up while the radio was silent. And it has no way to report that
+the dongle is dead.
+
+Nothing here waits for the hub, except `connect`, which cflib calls in a thread of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from perchctl.errors import ConnectionFailed
+from perchctl.link.crtp import MAX_DATA
+
+SCHEME = "hub://"
+HELLO, BYE, ROOM, REPORT = (bytes((kind,)) for kind in (0x00, 0x10, 0x20, 0x30))
+_RESERVED_BITS = 0x0C
+MOST_BYTES = 2048
+"""Largest datagram, bytes: a report is shorter than 500. Larger: memory only. Smaller: a report
+would be cut off, and ignored."""
+WINDOW = 1
+"""Packets that may wait in the hub before the flight's sender holds the next one back; cflib's
+radio driver has the same queue of one. Larger: a stop waits behind as many more packets. At 0,
+nothing could be sent."""
+HELLO_TIMEOUT_S = 1.0
+"""Longest wait for a hub's first answer, s; it takes 1 ms on an idle computer. Longer: a dead hub
+is reported later. Shorter: a busy computer fails to connect."""
+HELLO_PERIOD_S = 0.1
+"""Time between two requests for it, s, should one get lost. Longer: such a loss delays the
+connection. Shorter: no gain."""
+SIGN_OF_LIFE_S = 1.0
+"""Time between two requests of an open link, s, by which the hub knows that the flight is there. If
+the hub's process is gone, the system refuses them: that is noticed even if nothing is sent. Longer:
+noticed later. Shorter: more packets."""
+STOP_PERIOD_S = 0.2
+"""Longest time until the driver's thread notices that it is closed, or that a sign of life is due,
+s. Longer: its socket is freed later. Shorter: it wakes up more often in vain."""
+HUB_ENDED = "the radio hub of this vehicle has ended"
+
+
+@dataclass(frozen=True)
+class HubReport:
+    """State of one vehicle's radio link, as the hub sees it.
+
+    `problem` is None, or the sentence on why the dongle carries nothing, which ends the links of
+    all its vehicles. `answered` and `lost` count the packets since the hub's start that the vehicle
+    acknowledged, or did not in spite of the radio's own repetitions. `quality` is cflib's link
+    quality, %: 100 if no packet had to be repeated, None before the first answer. `waiting` is the
+    number of the flight's packets that wait for the radio.
+    """
+
+    problem: str | None = None
+    answered: int = 0
+    lost: int = 0
+    quality: float | None = None
+    waiting: int = 0
+
+    def encode(self) -> bytes:
+        """Return the message."""
+        return REPORT + json.dumps(dataclasses.asdict(self)).encode()
+
+    @staticmethod
+    def decode(message: bytes) -> HubReport | None:
+        """Return a message's report; None for another message."""
+        if message[:1] != REPORT:
+            return None
+        try:
+            return HubReport(**json.loads(message[1:]))
+        except (ValueError, TypeError):  # cut off, or from another release
+            return None
+
+
+def is_packet(datagram: bytes) -> bool:
+    """True for a CRTP packet, False for a message."""
+    return 1 <= len(datagram) <= 1 + MAX_DATA and bool(datagram[0] & _RESERVED_BITS)
+
+
+class Window:
+    """Stands for the queue of a radio's driver, which `internals.has_room` asks for room."""
+
+    def __init__(self) -> None:
+        self.waiting = 0
+
+    def full(self) -> bool:
+        """True if the next packet should be held back."""
+        return self.waiting >= WINDOW
+
+
+class HubDriver:
+    """A driver for cflib (`cflib.crtp.CLASSES`) that reaches a vehicle through the radio hub.
+
+    A dead dongle and a hub that has ended are reported once through cflib's error callback, which
+    ends the link as an error of any driver does. A hub that hangs reports nothing: the flight's
+    sender finds no room, and its telemetry grows old.
+    """
+
+    needs_resending = False  # the hub's radio driver has safelink
+    """Read by cflib: True would make it repeat its requests."""
+
+    def __init__(self) -> None:
+        self.uri = ""
+        self.report = HubReport()
+        self.in_queue: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.out_queue = Window()
+        self._hello = b""
+        self._socket: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self._closed = threading.Event()
+        self._once = threading.Lock()  # held for good by the first report of an error
+        self._on_error: Callable[[str], None] = lambda message: None
+        self._on_statistics: Callable[[dict[str, float]], None] | None = None
+
+    def connect(
+        self,
+        uri: str,
+        on_statistics: Callable[[dict[str, float]], None] | None,
+        on_error: Callable[[str], None],
+    ) -> None:
+        """Ask the hub for the vehicle's packets; wait at most `HELLO_TIMEOUT_S`. Raises
+        ConnectionFailed if no hub answers or its dongle is dead, and cflib's WrongUriType for
+        another driver's URI."""
+        from cflib.crtp.exceptions import WrongUriType
+
+        if not uri.startswith(SCHEME):
+            raise WrongUriType("not a URI of the radio hub")
+        self.uri, self._on_statistics = uri, on_statistics
+        address, _, vehicle = uri.removeprefix(SCHEME).partition("/")
+        host, _, port = address.partition(":")
+        self._hello = HELLO + vehicle.encode()
+        wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            wire.connect((host, int(port)))
+            self._await_report(wire)
+            if self.report.problem is not None:
+                raise ConnectionFailed(self.report.problem)
+        except OSError:  # nobody has the port any more
+            wire.close()
+            raise ConnectionFailed(HUB_ENDED) from None
+        except BaseException:
+            wire.close()
+            raise
+        self._on_error, self._socket = on_error, wire
+        self._thread = threading.Thread(target=self._listen, name="perchctl-hub", daemon=True)
+        self._thread.start()
+
+    def send_packet(self, packet: Any) -> bool:
+        """Send a packet at once. Never waits: whoever can wait asks `out_queue` for room."""
+        if self._socket is None or self._closed.is_set():
+            return False
+        self.out_queue.waiting += 1
+        try:
+            self._socket.send(bytes((packet.header,)) + bytes(packet.data))
+        except OSError:
+            self._fail(HUB_ENDED)
+            return False
+        return True
+
+    def receive_packet(self, wait: float = 0) -> Any:
+        """Return the next packet; None after `wait` seconds without one. Negative: wait forever."""
+        try:
+            return self.in_queue.get(wait != 0, wait if wait > 0 else None)
+        except queue.Empty:
+            return None
+
+    def close(self) -> None:
+        """Take leave of the hub. The vehicle's radio link stays open, and nothing is sent to it."""
+        if self._socket is not None and not self._closed.is_set():
+            self._closed.set()  # the thread frees the socket
+            with contextlib.suppress(OSError):
+                self._socket.send(BYE)
+
+    def scan_interface(self, address: int | None = None) -> list[list[str]]:
+        """Find nothing: a fleet's flights are told their URIs."""
+        return []
+
+    def get_name(self) -> str:
+        return "hub"
+
+    def get_status(self) -> str:
+        return "No information available"
+
+    def _await_report(self, wire: socket.socket) -> None:
+        wire.settimeout(HELLO_PERIOD_S)
+        end_s = time.monotonic() + HELLO_TIMEOUT_S
+        wire.send(self._hello)
+        while time.monotonic() < end_s:
+            try:
+                datagram = wire.recv(MOST_BYTES)
+            except TimeoutError:
+                wire.send(self._hello)
+                continue
+            self._take(datagram)
+            if datagram[:1] == REPORT:
+                return
+        raise ConnectionFailed("the radio hub of this vehicle does not answer")
+
+    def _listen(self) -> None:
+        assert self._socket is not None
+        asked_s = time.monotonic()
+        with self._socket as wire:
+            wire.settimeout(STOP_PERIOD_S)
+            while not self._closed.is_set():
+                try:
+                    if time.monotonic() - asked_s > SIGN_OF_LIFE_S:
+                        asked_s = time.monotonic()
+                        wire.send(self._hello)
+                    self._take(wire.recv(MOST_BYTES))
+                except TimeoutError:
+                    continue
+                except OSError:  # refused, since nobody has the hub's port any more
+                    self._fail(HUB_ENDED)
+                    return
+                if self.report.problem is not None:
+                    self._fail(self.report.problem)
+                    return
+
+    def _take(self, datagram: bytes) -> None:
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        if is_packet(datagram):
+            self.in_queue.put(CRTPPacket(datagram[0], datagram[1:]))
+        elif datagram[:1] == ROOM and len(datagram) > 1:
+            self.out_queue.waiting = datagram[1]
+        elif (report := HubReport.decode(datagram)) is not None:
+            self.report = report
+            self.out_queue.waiting = report.waiting
+            if self._on_statistics is not None and report.quality is not None:
+                self._on_statistics({"link_quality": report.quality})
+
+    def _fail(self, message: str) -> None:
+        if not self._closed.is_set() and self._once.acquire(blocking=False):
+            self._on_error(message)

@@ -1,0 +1,427 @@
+"""What runs in the radio hub: cflib's radio drivers, and the packets between each and its flight.
+
+```
+flight  <-- UDP -->  Carrier  <-->  cflib: RadioDriver + thread  <-->  thread of the dongle  --> USB
+flight  <-- UDP -->  Carrier  <-->  cflib: RadioDriver + thread  <-->        |
+```
+
+The hub carries packets and knows nothing of flying. It uses drivers without a `Crazyflie`, whose
+`close_link` would send a zero setpoint and drop a flying vehicle; `RadioDriver.close` sends
+nothing.
+
+Threads: two for each vehicle, up and down; one that opens drivers, which may block in USB; and the
+main one, which looks at the dongle, reports, and never calls anything that blocks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from perchctl.children import Channel, connect_to_parent
+from perchctl.errors import ConnectionFailed, PerchError
+from perchctl.link import internals
+from perchctl.link.connection import init_cflib, lock_vehicle, readable_cause, start_thread
+from perchctl.link.hub_driver import BYE, HELLO, HUB_ENDED, ROOM, SCHEME, HubReport, is_packet
+from perchctl.link.protocol import vehicle_uri
+
+TICK_S = 0.02
+"""Time between two looks at the dongle, s. Longer: a dead dongle is reported later. Shorter: more
+processor time."""
+REPORT_PERIOD_S = 0.2
+"""Time between two reports, s. Longer: what a lost datagram has hidden stays hidden. Shorter: more
+processor time in each flight."""
+REFUSALS = 10
+"""Successive packets for one vehicle without any answer of the dongle, after which it is dead. An
+unplugged one refuses each at once; a vehicle out of reach is an answer. More: reported later.
+Fewer: a passing error of USB ends the flights."""
+STUCK_TICKS = 25
+"""Ticks without any answer of the dongle after which it is dead: 0.5 s, while even a lost packet is
+reported within 2 ms. Counted in ticks, so that a computer that was suspended is no dead dongle.
+More: reported later. Fewer: a call of USB that is late ends the flights."""
+REOPEN_PERIOD_S = 0.1
+"""Time between two attempts to open a dead dongle, s. Longer: it is back later. Shorter: the
+computer searches its USB ports all the time."""
+SAFELINK_PACKETS = 10
+"""Packets in which cflib's driver offers safelink to the vehicle (docs/firmware.md, "Safelink")."""
+SAFELINK_PERIOD_S = 1.0
+"""Time between two offers to a vehicle that has not answered yet, s. Longer: a vehicle that is
+switched on is found later. Shorter: it takes more of the dongle's time from the others, 20 ms
+each."""
+LEAST_RATE = 10
+"""Lowest limit on a vehicle's packets, 1/s. Higher: an idle vehicle takes more from the others.
+Lower: a dongle whose vehicles are all idle seems dead (`STUCK_TICKS`), and commands wait longer."""
+ROOM_WAIT_S = 0.005
+"""Time for which a packet waits for the radio before its carrier looks at the socket again, s.
+Longer: a flight's new link is answered later. Shorter: more processor time."""
+IDLE_S = 0.1
+"""Time for which a thread waits for a packet before it looks whether it is to end, s. Longer: ends
+later. Shorter: more processor time."""
+CLOSE_TIMEOUT_S = 3.0
+"""Longest wait for a driver to close, s: a call of USB may take 2. Longer: a dongle that hangs is
+opened anew later. Shorter: it is opened while the old driver still uses it."""
+LINGER_S = 5.0
+"""Time without a word of a flight after which a hub without parent ends, s; an open link speaks at
+least once a second. Longer: the dongle stays claimed after a crash. Shorter: a flight on a busy
+computer loses its radio while it lands."""
+MOST_WAITING = 64
+"""Largest number of a flight's packets that wait for the radio; then the oldest is dropped. A
+flight waits after each, but cflib's own requests do not. Larger: more packets are out of date.
+Smaller: such requests get lost."""
+NULL_PACKET = 0xF3
+"""Header of what a vehicle sends if it has nothing to send; the radio's signal strength may follow,
+which cflib's statistics have read."""
+
+logger = logging.getLogger(__name__)
+
+DEAD = "the Crazyradio does not answer any more (it may be unplugged): all its vehicles are lost"
+
+
+class Carrier:
+    """One vehicle's radio driver, and the socket for its flight."""
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        self.vehicle = vehicle_uri(uri).removeprefix("radio/")
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.hub_uri = f"{SCHEME}127.0.0.1:{self.socket.getsockname()[1]}/{self.vehicle}"
+        self.driver: Any = None
+        self.opened_s = 0.0  # when the driver was opened, or closed for want of safelink
+        self.heard_s = time.monotonic()  # when the flight's last datagram came
+        self.problem: str | None = None
+        self.answered = self.lost = 0
+        self.refused = 0  # in a row
+        self._offered = 0  # packets of the present driver
+        self._quality: float | None = None
+        self._limit: int | None = None
+        self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
+        self._flight: tuple[str, int] | None = None
+        self._closed = threading.Event()
+
+    @property
+    def has_flight(self) -> bool:
+        """True while a flight's link is open, as far as the hub knows."""
+        return self._flight is not None
+
+    @property
+    def lacks_safelink(self) -> bool:
+        """True if the driver has no safelink and will not get one. A vehicle that was not in reach
+        as the driver opened would accept at most one packet of it."""
+        driver = self.driver
+        offered = self._offered > SAFELINK_PACKETS
+        return driver is not None and offered and not internals.has_safelink(driver)
+
+    def open(self) -> None:
+        """Open a driver. Raises any error of cflib's and of USB's."""
+        from cflib.crtp.radiodriver import RadioDriver
+
+        driver = RadioDriver()
+        self._offered = self.refused = 0
+        # cflib reports errors and goes on; the hub counts what the dongle answers instead.
+        driver.connect(self.uri, self._take_statistics, lambda message: None)
+        internals.count_answers(driver, self._count)
+        self.opened_s, self.driver = time.monotonic(), driver
+        self.limit(self._limit or driver.rate_limit)
+
+    def limit(self, packets_per_s: int | None) -> None:
+        """Limit the vehicle's packets per second; None: no limit."""
+        self._limit = packets_per_s and max(LEAST_RATE, packets_per_s)
+        if self.driver is not None:
+            internals.limit_rate(self.driver, self._limit)
+
+    def start(self) -> None:
+        """Start to carry packets."""
+        start_thread("perchctl-hub-up", self._carry_up)
+        start_thread("perchctl-hub-down", self._carry_down)
+
+    def report(self) -> HubReport:
+        """Return the link's state."""
+        return HubReport(
+            problem=self.problem,
+            answered=self.answered,
+            lost=self.lost,
+            quality=self._quality,
+            waiting=min(len(self._waiting), 255),
+        )
+
+    def send_report(self) -> None:
+        """Send the link's state to the flight."""
+        self._send(self.report().encode())
+
+    def close(self) -> None:
+        """Carry nothing any more."""
+        self._closed.set()
+
+    def _count(self, answer: bool | None) -> None:
+        """Count the dongle's answer to a packet, in the driver's thread."""
+        if answer is None:
+            self.refused += 1
+            return
+        self.refused = 0
+        self._offered += 1
+        if answer:
+            self.answered += 1
+        else:
+            self.lost += 1
+
+    def _take_statistics(self, statistics: dict[str, float]) -> None:
+        self._quality = statistics.get("link_quality", self._quality)
+
+    def _carry_up(self) -> None:
+        while not self._closed.is_set():
+            wait_s = 0.0 if self._waiting else IDLE_S
+            while select.select([self.socket], [], [], wait_s)[0]:
+                self._take_datagram()
+                wait_s = 0.0
+            driver = self.driver
+            if driver is None:
+                self._closed.wait(ROOM_WAIT_S if self._waiting else 0.0)
+            elif self._waiting and self._put(driver, self._waiting[0]):
+                self._waiting.popleft()
+                self._send(ROOM + bytes((min(len(self._waiting), 255),)))
+        self.socket.close()
+
+    def _take_datagram(self) -> None:
+        try:
+            datagram, sender = self.socket.recvfrom(64)
+        except OSError:  # an earlier datagram could not be delivered
+            return
+        if datagram[:1] == HELLO:
+            # An old flight may still ask at a port that is another vehicle's by now.
+            if datagram[1:].decode("ascii", "replace") != self.vehicle:
+                return
+            if sender != self._flight:
+                self._waiting.clear()  # what an earlier link wanted to send is out of date
+            self._flight = sender
+            self.send_report()
+        elif sender != self._flight:
+            return
+        elif datagram[:1] == BYE:
+            self._flight = None
+        elif is_packet(datagram):
+            self._waiting.append(datagram)
+        self.heard_s = time.monotonic()
+
+    def _put(self, driver: Any, datagram: bytes) -> bool:
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        packet = CRTPPacket(datagram[0], datagram[1:])
+        return internals.put_packet(driver, packet, ROOM_WAIT_S)
+
+    def _carry_down(self) -> None:
+        while not self._closed.is_set():
+            driver = self.driver
+            if driver is None:
+                self._closed.wait(TICK_S)
+                continue
+            packet = driver.receive_packet(IDLE_S)
+            if packet is not None and packet.header & NULL_PACKET != NULL_PACKET:
+                self._send(bytes((packet.header,)) + bytes(packet.data))
+
+    def _send(self, datagram: bytes) -> None:
+        flight = self._flight
+        if flight is not None:
+            with contextlib.suppress(OSError):  # lost like over the air
+                self.socket.sendto(datagram, flight)
+
+
+class Hub:
+    """The carriers of one dongle's vehicles, and the dongle's life.
+
+    `problem` is None, or the sentence on why the dongle carries nothing. A dead dongle is opened
+    again until it answers; the flights' links end at once, and open again by themselves.
+    """
+
+    def __init__(self, uris: Sequence[str]) -> None:
+        self.problem: str | None = None
+        self._dongle: threading.Thread | None = None
+        self._wake, self._closed = threading.Event(), threading.Event()
+        self._counted, self._stuck_ticks = -1, 0
+        self._reported_s = 0.0
+        init_cflib()
+        with contextlib.ExitStack() as claim:
+            for uri in uris:
+                claim.enter_context(lock_vehicle(uri))
+            self.carriers = [Carrier(uri) for uri in uris]
+            try:
+                self._open_dongle()
+            except Exception as error:  # any error of cflib's and of USB's
+                for carrier in self.carriers:
+                    carrier.socket.close()
+                cause = readable_cause(str(error) or type(error).__name__)
+                raise ConnectionFailed(f"the Crazyradio cannot be opened: {cause}") from None
+            self._claim = claim.pop_all()
+        for carrier in self.carriers:
+            carrier.start()
+        self._opener = start_thread("perchctl-hub-open", self._keep_open)
+
+    @property
+    def uris(self) -> dict[str, str]:
+        """The flights' URIs by the vehicles'."""
+        return {carrier.uri: carrier.hub_uri for carrier in self.carriers}
+
+    def tick(self) -> bool:
+        """Look at the dongle, and report what is due. Call every `TICK_S`. Return True if reports
+        were sent to the flights."""
+        cause = None if self.problem is not None else self._find_problem()
+        if cause is not None:
+            self._set_problem(cause)
+            self._wake.set()
+        now_s = time.monotonic()
+        if cause is None and now_s - self._reported_s < REPORT_PERIOD_S:
+            return False
+        self._reported_s = now_s
+        for carrier in self.carriers:
+            carrier.send_report()
+        return True
+
+    def reports(self) -> dict[str, HubReport]:
+        """Return the state of each link by the vehicle's URI."""
+        return {carrier.uri: carrier.report() for carrier in self.carriers}
+
+    def limit(self, uri: str, packets_per_s: int | None) -> None:
+        """Limit the packets per second of the vehicle at `uri`; None: no limit."""
+        for carrier in self.carriers:
+            if carrier.uri == uri:
+                carrier.limit(packets_per_s)
+
+    def has_flights(self) -> bool:
+        """True while a flight's link is open that was heard lately."""
+        heard_s = time.monotonic() - LINGER_S
+        return any(carrier.has_flight and carrier.heard_s > heard_s for carrier in self.carriers)
+
+    def close(self) -> None:
+        """End the flights' links and close all drivers, without a packet; bounded."""
+        self._set_problem(HUB_ENDED)
+        for carrier in self.carriers:
+            carrier.send_report()
+        self._closed.set()
+        self._wake.set()
+        self._opener.join(CLOSE_TIMEOUT_S)
+        for carrier in self.carriers:
+            carrier.close()
+        self._close_dongle()
+        self._claim.close()
+
+    def _find_problem(self) -> str | None:
+        """Return why the dongle is dead, or None."""
+        drivers = sum(carrier.driver is not None for carrier in self.carriers)
+        counted = sum(carrier.answered + carrier.lost for carrier in self.carriers)
+        is_stuck = drivers > 0 and counted == self._counted
+        self._counted, self._stuck_ticks = counted, self._stuck_ticks + 1 if is_stuck else 0
+        refuses = any(carrier.refused >= REFUSALS for carrier in self.carriers)
+        ended = self._dongle is not None and not self._dongle.is_alive()
+        return DEAD if ended or refuses or self._stuck_ticks >= STUCK_TICKS else None
+
+    def _set_problem(self, problem: str | None) -> None:
+        self.problem = problem
+        for carrier in self.carriers:
+            carrier.problem = problem
+
+    def _keep_open(self) -> None:
+        """Open a dead dongle again, and drivers whose vehicle was out of reach."""
+        while not self._closed.is_set():
+            self._wake.wait(REOPEN_PERIOD_S)
+            self._wake.clear()
+            if self._closed.is_set():
+                return
+            if self.problem is None:
+                self._offer_safelink()
+                continue
+            self._close_dongle()
+            if self._closed.is_set():  # meanwhile
+                return
+            try:
+                self._open_dongle()
+            except Exception as error:  # any error of cflib's and of USB's: not plugged in yet
+                logger.info("the dongle does not open: %s", error)
+                continue
+            self._stuck_ticks = 0
+            self._set_problem(None)
+
+    def _offer_safelink(self) -> None:
+        for carrier in self.carriers:
+            if carrier.lacks_safelink:
+                self._close_driver(carrier)
+                carrier.opened_s = time.monotonic()
+            elif carrier.driver is None and time.monotonic() - carrier.opened_s > SAFELINK_PERIOD_S:
+                try:
+                    carrier.open()
+                except Exception:  # any error of cflib's and of USB's
+                    self._set_problem(DEAD)
+
+    def _open_dongle(self) -> None:
+        try:
+            for carrier in self.carriers:
+                carrier.open()
+                self._dongle = internals.dongle_thread(carrier.uri)
+        except BaseException:
+            self._close_dongle()
+            raise
+
+    def _close_dongle(self) -> None:
+        for carrier in self.carriers:
+            self._close_driver(carrier)
+        dongle, self._dongle = self._dongle, None
+        if dongle is not None:
+            internals.forget_dongle(dongle)
+
+    def _close_driver(self, carrier: Carrier) -> None:
+        driver, carrier.driver = carrier.driver, None
+        if driver is not None and self._dongle is not None:
+            internals.close_radio(driver, self._dongle, CLOSE_TIMEOUT_S)
+
+
+# --- The process ---
+
+
+def serve_parent() -> None:
+    """Run the hub for the parent that `perchctl.link.hub.RadioHub` is the handle of, until it is
+    stopped, or the parent is gone and no flight is left."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    # cflib lets its dongle's thread end by an error, which the hub finds and reports.
+    threading.excepthook = lambda arguments: logger.info("a thread has ended: %s", arguments)
+    channel = connect_to_parent()
+    try:
+        hub = Hub(channel.recv())
+    except (EOFError, OSError):  # the parent is gone already
+        return
+    except PerchError as error:
+        channel.send(error)
+        return
+    try:
+        with contextlib.closing(hub):
+            channel.send(hub.uris)
+            run(hub, channel)
+    finally:
+        os._exit(0)  # a driver that hangs in USB must not keep the process
+
+
+def run(hub: Hub, channel: Channel) -> None:
+    """Serve a hub and its parent; return once both the parent and the flights are gone."""
+    parent = True
+    while parent or hub.has_flights():
+        try:
+            if parent and channel.poll(TICK_S):
+                hub.limit(*channel.recv())
+        except (EOFError, OSError):
+            parent = False
+        if not parent:
+            time.sleep(TICK_S)
+        # A parent that hangs reads nothing, and must not stop the hub.
+        if hub.tick() and parent and select.select([], [channel], [], 0.0)[1]:
+            with contextlib.suppress(OSError):
+                channel.send(hub.reports())
