@@ -49,13 +49,13 @@ def no_simulator(missing: str | None = "mujoco") -> UsageError:
 
 def no_motion_capture(needed_by: str = "positioning by motion capture") -> UsageError:
     """The error for a missing extra ``mocap``."""
-    return UsageError(f"{needed_by} needs the library motioncapture; {_install('mocap')}")
+    return UsageError(f"{needed_by} needs the motioncapture library; {_install('mocap')}")
 
 
 def broken_motion_capture(why: str) -> UsageError:
     """The error for an extra ``mocap`` that is installed, and cannot be loaded."""
     return UsageError(
-        f"the library motioncapture cannot be loaded: {why}; reinstall it with: "
+        f"the motioncapture library cannot be loaded: {why}; reinstall it with: "
         f"{sys.executable} -m pip install --force-reinstall 'perchctl[mocap]'"
     )
 
@@ -63,14 +63,14 @@ def broken_motion_capture(why: str) -> UsageError:
 def unfit_cflib(part: str, version: str) -> UsageError:
     """The error for a cflib that lacks `part`, which perchctl reads or replaces."""
     return UsageError(
-        f"cflib {version} has no {part}, which perchctl needs; install another one with: "
-        f"{sys.executable} -m pip install 'cflib>=0.1.34,<0.2'"
+        f"cflib {version} has no {part}, which perchctl needs; install a supported "
+        f"version with: {sys.executable} -m pip install 'cflib>=0.1.34,<0.2'"
     )
 
 
 def no_cluster(why: str = "it is missing") -> UsageError:
     """The error for an extra ``cluster`` that is missing, or cannot be loaded."""
-    return UsageError(f"--cluster needs the library distributed ({why}); {_install('cluster')}")
+    return UsageError(f"--cluster needs the distributed library ({why}); {_install('cluster')}")
 
 
 class ConnectionFailed(PerchError):
@@ -90,7 +90,7 @@ class InvalidValue(PerchError):
 
 class TimedOut(PerchError):
     exit_code = 40
-    meaning = "time-out before the flight"
+    meaning = "timeout before the flight"
 
 
 class TargetNotFound(PerchError):
@@ -100,7 +100,7 @@ class TargetNotFound(PerchError):
 
 class AttemptsUsedUp(PerchError):
     exit_code = 51
-    meaning = "attempts or perching time used up, landed or left hanging"
+    meaning = "out of attempts or perching time, landed or left hanging"
 
 
 class SafetyAbort(PerchError):
@@ -125,7 +125,7 @@ class ReplayDiffers(PerchError):
 
 class Interrupted(PerchError):
     exit_code = 130
-    meaning = "Ctrl-C, landed (in the air) or left (on the ground, at the ceiling)"
+    meaning = "interrupted by Ctrl-C, landed or left where it stood or hung"
 
 
 def require_type(name: str, value: object, *kinds: type) -> None:

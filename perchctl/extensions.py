@@ -51,7 +51,7 @@ def load_extension(text: str, key: str) -> Any:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing and f"{module_name}.".startswith(f"{missing}."):
             raise NotFound(
-                f"{key}: there is no module {missing}: install it, or start in its folder "
+                f"{key}: no module named {missing}: install it, or run perchctl from its folder "
                 f"(now {Path.cwd()})"
             ) from None
         raise InvalidValue(f"{key}: importing {module_name} raised {error_at(error)}") from error
@@ -81,7 +81,7 @@ def make_extension(
         raise InvalidValue(f"{key}: {what}") from error
     lacks = [name for name in vars(protocol) if name[0] != "_" and not hasattr(made, name)]
     if lacks:
-        needs = f"which a perchctl.{protocol.__name__} has"
+        needs = f"which a perchctl.{protocol.__name__} must have"
         raise InvalidValue(f"{key}: {text} lacks {', '.join(sorted(lacks))}, {needs}")
     return made
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from perchctl.errors import InvalidValue
 
-FORMAT = "the format that is written"
+FORMAT = "the output file"
 _BEGINNINGS = (
     (b"\x89PNG", "a picture"),
     (b"\xff\xd8\xff", "a picture"),
@@ -56,9 +56,11 @@ def file_kind(path: Path) -> str:
 
 def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
     """Raise InvalidValue if the name ends in none of `suffixes` (in upper or lower case), or if
-    `check_writable` does. `content` is what the message calls such a file's content."""
+    `check_writable` does. `content` is what the message calls such a file, as in: a plot."""
     if path.suffix.lower() not in suffixes:
-        raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
+        raise InvalidValue(
+            f"the name of {content} must end in {' or '.join(suffixes)}, found {path}"
+        )
     check_writable(path, force)
 
 
@@ -76,12 +78,14 @@ def check_writable(path: Path, force: bool) -> None:
     if os.path.isdir(path):
         raise InvalidValue(f"{path} is a folder: name a file in it")
     if os.path.exists(path) and not force:
-        raise InvalidValue(f"{path} exists already; add --force to replace it, or name another")
+        raise InvalidValue(
+            f"{path} already exists; add --force to replace it, or name another file"
+        )
     folder = next(folder for folder in path.absolute().parents if os.path.exists(folder))
     if not os.path.isdir(folder):
         raise InvalidValue(f"{path} cannot be written: {folder} is a file, not a folder")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise InvalidValue(f"{path} cannot be written: no right to write in {folder}")
+        raise InvalidValue(f"{path} cannot be written: no permission to write in {folder}")
 
 
 def same_file(path: Path, other: Path) -> bool:

@@ -19,7 +19,7 @@ class _Loader(yaml.SafeLoader):
             line = int(key.start_mark.line) + 1
             if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in first:
                 raise ValueError(
-                    f"line {line}: key {clip_text(key.value)} is there twice, first in line "
+                    f"line {line}: key {clip_text(key.value)} appears twice, first in line "
                     f"{first[key.tag, key.value]}: keep one"
                 )
             if isinstance(key, yaml.ScalarNode):
@@ -65,16 +65,16 @@ def _errors_in_one_sentence() -> Iterator[None]:
     except yaml.constructor.ConstructorError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise ValueError(
-            f"line {line}: only plain numbers, texts, lists and keys are read "
+            f"line {line}: only plain numbers, strings, lists and mappings are supported "
             f"({clip_text(str(error.problem))})"
         ) from None
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise ValueError(f"line {line}: not YAML: {clip_text(str(error.problem))}") from None
     except yaml.YAMLError as error:
-        raise ValueError(f"not a text file in YAML ({error.__class__.__name__})") from None
+        raise ValueError(f"not a YAML text file ({error.__class__.__name__})") from None
     except RecursionError:
-        raise ValueError("values are nested too deeply to be read") from None
+        raise ValueError("values are nested too deeply") from None
     except OverflowError as error:
         raise ValueError(str(error)) from None
 

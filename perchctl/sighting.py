@@ -52,7 +52,7 @@ FRAME_TIMEOUT_S = 2.0
 """A live source without a frame for longer is lost. Smaller: a short pause ends the tracking."""
 INTERLACED = "interlaced: each field of a frame is measured separately"
 _NO_POSE = "no pose fits the marker's corners"
-_DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
+_DISAGREE = "the two markers contradict each other: check the printed sizes and the calibration"
 AttitudeAt = Callable[[float], Attitude | None]
 Named = tuple[Frame, str | None]
 """A frame, and its file's name if it has one."""
@@ -116,7 +116,7 @@ def track(
     if calibration is None:
         calibration = find_calibration(profile.camera.calibration)
         if is_shipped_example(calibration) and source != "sim:":
-            what = f"{calibration.name} is the example calibration: give yours"
+            what = f"{calibration.name} is the example calibration: pass your own camera's"
             warnings.warn(what, Note, stacklevel=2)
     require_type("calibration", calibration, CameraModel, Path, str)
     camera = calibration if isinstance(calibration, CameraModel) else load_calibration(calibration)
@@ -130,7 +130,7 @@ def track(
         stills = False
     elif not isinstance(source, Iterable) or isinstance(source, np.ndarray):
         raise InvalidValue(
-            f"a source is a text such as camera:0, a FrameSource, or pictures, as in "
+            "a source must be a string such as camera:0, a FrameSource, or pictures as in "
             f"track([picture]); found {type(source).__name__}"
         )
     at = None if attitude is None else partial(_attitude_at, attitude)

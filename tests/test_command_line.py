@@ -116,7 +116,7 @@ def test_what_nobody_foresaw_is_one_sentence_too(
     with pytest.raises(typer.Exit) as left:
         fail()
     assert left.value.exit_code == 1
-    assert "unforeseen ZeroDivisionError: oh" in capsys.readouterr().err
+    assert "unexpected ZeroDivisionError: oh" in capsys.readouterr().err
     monkeypatch.setenv("PERCHCTL_DEBUG", "1")
     with pytest.raises(ZeroDivisionError):
         fail()
@@ -146,7 +146,7 @@ def test_each_note_is_one_sentence_once_and_before_a_failure(
     ("line", "words"),
     [
         ("simulate --resume", ["--resume", "--out"]),
-        ("calibrate pictures --view", ["no live camera", "--view"]),
+        ("calibrate pictures --view", ["not a live camera", "--view"]),
     ],
 )
 def test_options_that_would_not_be_heeded_are_refused(line: str, words: list[str]) -> None:
@@ -206,9 +206,9 @@ def test_one_rule_for_what_is_there_already(line: str) -> None:
     Path(name).write_text("mine")
     said = run(*words, name)
     assert said.code == InvalidValue.exit_code
-    assert f"{name} exists already; add --force" in said.complaint
+    assert f"{name} already exists; add --force" in said.complaint
     assert Path(name).read_text() == "mine"
-    assert "exists already" not in run(*words, name, "--force").stderr
+    assert "already exists" not in run(*words, name, "--force").stderr
     Path(name).write_text("mine")
     assert "is a file, not a folder" in run(*words, f"{name}/inside/{name}").complaint
     assert [path.name for path in Path().iterdir()] == [name]
@@ -324,8 +324,8 @@ def test_what_is_like_no_command_is_the_main_ones_argument(tmp_path: Path) -> No
 
 def test_what_a_device_refuses_is_not_the_disk_s(capsys: pytest.CaptureFixture[str]) -> None:
     for error, said in (
-        (PermissionError(errno.EACCES, "Permission denied"), "unforeseen PermissionError"),
-        (PermissionError(errno.EACCES, "Permission denied", "/x"), "/x cannot be used"),
+        (PermissionError(errno.EACCES, "no permission"), "unexpected PermissionError"),
+        (PermissionError(errno.EACCES, "no permission", "/x"), "/x cannot be used"),
         (OSError(errno.ENOSPC, "No space left", "/x"), "/x cannot be written"),
     ):
         with pytest.raises(typer.Exit), report_failures():

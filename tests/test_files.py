@@ -34,14 +34,14 @@ def test_what_stands_in_the_way_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     check_output(tmp_path / "a.YML", (".yaml", ".yml"), force=False)
     monkeypatch.setattr("os.access", lambda place, mode: Path(place) != tmp_path)
     for place, force, said in (
-        (path, False, "exists already; add --force"),
+        (path, False, "already exists; add --force"),
         (tmp_path, True, "is a folder"),
         (path / "new" / "b.txt", True, r"camera\.yaml is a file, not a folder"),
-        (tmp_path / "new" / "a.txt", True, rf"no right to write in {tmp_path}$"),
+        (tmp_path / "new" / "a.txt", True, rf"no permission to write in {tmp_path}$"),
     ):
         with pytest.raises(InvalidValue, match=said):
             check_writable(place, force)
-    with pytest.raises(InvalidValue, match=r"a\.png must end in \.yaml or \.yml, which is text"):
+    with pytest.raises(InvalidValue, match=r"must end in \.yaml or \.yml, found .*a\.png"):
         check_output(tmp_path / "a.png", (".yaml", ".yml"), force=True, content="text")
 
 
@@ -128,8 +128,11 @@ def test_a_file_is_named_by_its_content(content: bytes, kind: str, tmp_path: Pat
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("fly", "--dry-run", "-p", "cal.yaml"), "cal.yaml is a camera calibration, no profile"),
-        (("track", "pic.png", "--calibration", "pic.png"), "is a picture, no camera calibration"),
+        (("fly", "--dry-run", "-p", "cal.yaml"), "cal.yaml is a camera calibration, not a profile"),
+        (
+            ("track", "pic.png", "--calibration", "pic.png"),
+            "is a picture, not a camera calibration",
+        ),
         (("track", "pic.png", "--calibration", "mine.yaml"), "(it is a profile)"),
         (("log", "show", "cal.yaml"), "is a camera calibration"),
         (("fly", "--dry-run", "-p", "mine.yaml"), "did you mean planner?"),

@@ -39,7 +39,7 @@ def test_what_never_took_off_was_not_killed_in_the_air(tmp_path: Path) -> None:
     log = synthetic.write(tmp_path / "flight_refused.jsonl", most=0)
     said = run("log", "show", str(log)).stdout
     assert "UNKNOWN: the log holds no flight" in said
-    assert "it never took off" in " ".join(said.split())
+    assert "never took off" in " ".join(said.split())
     assert "positions by deck" in " ".join(said.split())
 
 
@@ -91,7 +91,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
         (["show", "none.jsonl"], 20, "does not exist"),
         (["show", "empty"], 20, "holds no flight log"),
         (["replay", "flight_1.jsonl", "-p", "smi"], 20, "'smi'"),
-        (["show", "a.csv"], 30, "not a flight log"),
+        (["show", "a.csv"], 30, "not a perchctl flight log"),
         (["plot", "bare.jsonl"], 30, "nothing to plot"),
         (["plot", "flight_1.jsonl", "-o", "x.gif"], 30, "must end in"),
         (["export", "bare.jsonl"], 30, "nothing to export"),

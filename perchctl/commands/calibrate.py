@@ -52,7 +52,7 @@ from perchctl.target import Board
 from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
-SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
+SUFFIXES, CONTENT = (".yaml", ".yml"), "a calibration"
 DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
 
 BoardOption = Annotated[
@@ -120,11 +120,11 @@ def camera(
 
     found = _find_views(pictures, size, layout, view, checked_file)
     file = checked_file(found.views[0].size_px)
-    without = f", {len(found.without_board)} without" if found.without_board else ""
+    without = f", {len(found.without_board)} pictures without it" if found.without_board else ""
     say(f"{len(found.views)} views of the board{without}")
     seen = found.layout_of(layout)
     if seen.legacy != layout.legacy:
-        say(f"the board has the layout {'before' if seen.legacy else 'since'} OpenCV 4.6")
+        say(f"the board has the layout used {'before' if seen.legacy else 'since'} OpenCV 4.6")
     result = calibrate_camera(found, seen.notation())
     if found.frames is not None:
         say(found.frames.text)
@@ -161,17 +161,20 @@ def mask(
 ) -> None:
     """Find the parts of the picture that the vehicle covers while you turn it in your hand."""
     pictures = _source(source)
-    check_output(output, (".png",), force, "a mask's format")
+    check_output(output, (".png",), force, "a mask")
     with contextlib.ExitStack() as stack:
         frames = open_camera(pictures, time.monotonic, size_px=size)
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().as_handler())
         if frames.live:
-            say("turn the vehicle about for 20 s (Ctrl-C ends and writes the mask)")
+            say("turn the vehicle around in your hand for 20 s (Ctrl-C stops and writes the mask)")
         covered = learn_gear_mask(frames, stop.requested.is_set)
     write_files({output: cv2.imencode(".png", 255 * covered.astype(np.uint8))[1].tobytes()})
     share = 100.0 * covered.mean()
-    say(f"wrote {output}: the vehicle covers {share:.1f} % of the picture; set camera.mask")
+    say(
+        f"wrote {output}: the vehicle covers {share:.1f} % of the picture; name this "
+        "file in camera.mask"
+    )
     print_result(output)
 
 
@@ -248,7 +251,7 @@ def _source(text: str, view: bool = False) -> str:
     """Return the source for `open_camera`. Raises NotFound, InvalidValue, UsageError."""
     source = parse_source(text)
     if view and not source.live:
-        raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
+        raise UsageError(f"{source} is not a live camera, so --view does not apply: leave it out")
     return source.spec
 
 
@@ -275,13 +278,16 @@ def _find_views(
             if frames.size_px is not None:
                 check(frames.size_px)
             return capture_live_views(frames, board, view)
-    with done_of_total_bar("searching the board") as progress:
+    with done_of_total_bar("looking for the board") as progress:
         pictures = image_files(str(Path(source.place).expanduser()))
         found = find_views(pictures, board, progress)
     if not found.views:
         first = found.without_board[0]
         seen = f"they show {found.other_board}"
-        why = f"{first.view}: {first.reason}; is it wholly in view, sharp, and --board its layout?"
+        why = (
+            f"{first.view}: {first.reason}; is the whole board in view and sharp, and does "
+            "--board match it?"
+        )
         raise InvalidValue(
             f"none of {len(found.without_board)} pictures of {source} shows the board "
             f"{board.notation()}: {seen if found.other_board else why}"
@@ -301,7 +307,10 @@ def capture_live_views(source: FrameSource, board: Board, view: bool) -> FoundVi
         page = stack.enter_context(live_page(any_camera, "perchctl calibrate", view, say))
         show = stack.enter_context(guidance_display(page))
         if source.live:
-            say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
+            say(
+                "show the board near and far, tilted, and in every corner of the picture "
+                "(Ctrl-C stops and calibrates)"
+            )
         found = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not found.views:
         raise InvalidValue(
@@ -316,6 +325,8 @@ def _no_view_text(found: FoundViews) -> str:
     if found.other_board:
         return f"it shows {found.other_board}"
     if found.frames is None:
-        return "no frame came"
-    advice = found.frames.advice or "is it wholly in view, sharp, and --board its layout?"
+        return "no frame arrived"
+    advice = (
+        found.frames.advice or "is the whole board in view and sharp, and does --board match it?"
+    )
     return f"{found.frames.text}; {advice}"

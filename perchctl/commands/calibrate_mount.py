@@ -60,12 +60,13 @@ Part = Literal["carry", "pivot"]
 Sensors = tuple[Callable[[], list[AttitudeSample]], Callable[[float], str | None]]
 """What a recording reads of the vehicle: its new samples, and what is wrong with it by a time."""
 HOW: dict[Part, str] = {
-    "carry": "carry: hold the vehicle under the target (or the target before its camera); turn it "
-    "about all its axes and move it, the target in view",
-    "pivot": "pivot: stand the tip of the gear on one point that does not move, the target in "
-    "view; tilt the vehicle around it in all directions",
+    "carry": "carry: hold the vehicle under the target (or the target in front of its "
+    "camera); turn it about every axis and move it around, keeping the target in "
+    "view",
+    "pivot": "pivot: rest the tip of the gear on a point that does not move; tilt the "
+    "vehicle around it in every direction, keeping the target in view",
 }
-_SIMULATED = "stands on the simulator's floor, where no hand moves it: name a real one"
+_SIMULATED = "is simulated, so nobody can move it by hand: name a real one"
 
 
 def mount(
@@ -115,19 +116,19 @@ def mount(
         print_lines(line)
     problem: PerchError | None = None
     if not logs:
-        problem = InvalidValue("the recording is not kept")  # why has been said
+        problem = InvalidValue("the recording was not kept")  # why has been said
     written, before = None, None
     if into is not None:
         try:
             _check_unchanged(profile, vehicle)
             before = write_profile_values(into, measured.new_profile_values())
             written = into
-            say(f"wrote these into {written}; as it was before it is {before}")
+            say(f"wrote these numbers to {written}; the old version is in {before}")
         except (InvalidValue, NotFound) as error:  # the numbers stand
             problem = error
             say(str(error))
     else:
-        say("--write puts these numbers into the profile")
+        say("add --write to write these numbers to the profile")
     record = measured.record() | {
         "recordings": [str(path) for path in logs],
         "profile": written and str(written),
@@ -154,8 +155,8 @@ def _live_sources(
         return name.spec, None
     if not name.live:
         raise UsageError(
-            f"{name} is a recording, and has not the vehicle's clock: the "
-            f"carry needs a live camera; --part pivot needs no vehicle"
+            f"{name} is a recording and does not share the vehicle's clock: the carry needs "
+            "a live camera; --part pivot needs no vehicle"
         )
     link_uri = profile.link.uri if uri is None else uri
     if check_uri(link_uri) == "sim":
@@ -181,8 +182,8 @@ def _read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecordin
     if not found:
         parts = " and ".join(dict.fromkeys(recording.part for recording in held))
         raise InvalidValue(
-            f"{', '.join(map(str, logs))} holds no {part}, but a {parts}: leave --part out, or "
-            f"name the other recording too"
+            f"{', '.join(map(str, logs))} holds no {part}, only {parts}: leave out --part, "
+            "or name the other recording too"
         )
     return list(found.values())
 
@@ -192,8 +193,9 @@ def _check_unchanged(name: str, then: Profile) -> None:
     now = load_profile(name)
     if (now.camera, now.vehicle) != (then.camera, then.vehicle):
         raise InvalidValue(
-            f"{find_profile(name)} was changed meanwhile, and nothing is written: these numbers "
-            f"rest on what it said before; measure again, with --from"
+            f"{find_profile(name)} has changed since it was read, so nothing was written: "
+            "these numbers depend on its old values; evaluate the recording again with "
+            "--from"
         )
 
 
@@ -235,7 +237,7 @@ def _record_live(
             say(HOW[part])
             if sys.stdin.isatty():  # Ctrl-C ends at once here
                 with contextlib.suppress(EOFError):  # Ctrl-D goes on as Enter does
-                    if ask("press Enter when it is held so:").strip().lower() in NO:
+                    if ask("press Enter when it is in place:").strip().lower() in NO:
                         raise UsageError("not confirmed: nothing was measured")
             recording = MountingRecording(part)
             recordings.append(recording)
@@ -263,14 +265,14 @@ def _vehicle(uri: str, profile: Profile) -> Iterator[Sensors]:
     """Yield a connected vehicle's samples and problems. Raises SafetyAbort if its motors
     turn or may turn."""
     link = AttitudeLink(uri, profile.link, time.monotonic)
-    say(f"connecting to {uri}, to read from it and nothing else")
+    say(f"connecting to {uri}, only to read from it")
     link.connect()
 
     def problem(now_s: float) -> str | None:
         if link.motors_running:
             raise SafetyAbort(
-                f"{uri} is armed, or its motors turn or did 2 s ago: nothing is measured by hand "
-                f"with them on; switch it off and on"
+                f"{uri} is armed, or its motors turned within the last 2 s: do not "
+                "move it by hand like that; switch it off and on again"
             )
         return link.problem(now_s)
 
@@ -288,6 +290,6 @@ def _keep(recordings: Sequence[MountingRecording], log: Path) -> None:
         with ignore_signals():
             MountingRecording.write(log, held)
     except InvalidValue as error:
-        say(f"the recording is not kept: {error}")
+        say(f"the recording was not kept: {error}")
         return
-    say(f"kept the recording: {log}; --from {log} measures from it again")
+    say(f"kept the recording: {log}; --from {log} evaluates it again")

@@ -108,7 +108,7 @@ def print_rows(rows: Iterable[Row], as_json: bool) -> int:
         elif found:
             print(format_rows(found, finished=not interrupted))
     if interrupted:
-        say("Ctrl-C: this is what was found until then")
+        say("stopped by Ctrl-C: these are the checks made so far")
         return Interrupted.exit_code
     return exit_code(found)
 
@@ -130,7 +130,7 @@ def format_rows(rows: Sequence[Row], finished: bool = True) -> str:
     failing = [row.name for row in rows if row.verdict is Verdict.FAIL]
     ends = [f"not fit to fly: {', '.join(failing)}"] if failing else []
     if not finished:
-        ends.append("not finished, the rest is not known")
+        ends.append("not finished, the other checks were not made")
     return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
 
 
@@ -163,7 +163,7 @@ def camera_rows() -> Iterator[Row]:
         source = f"camera:{camera.number}"
         found = ", ".join(part for part in (camera.name, camera.stable_path) if part)
         if camera.problem:
-            advice = "get the right to it, as by the group video"
+            advice = "get permission to open it, for example by joining the group video"
             yield Row(source, Verdict.WARN, f"{found}: {camera.problem}", advice)
         else:
             yield Row(source, Verdict.PASS, found)

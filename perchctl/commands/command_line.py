@@ -89,7 +89,7 @@ class Group(TyperGroup):
             word = args[0] if args and args[0].isalpha() and not os.path.exists(args[0]) else ""
             if meant := difflib.get_close_matches(word, self.commands, 1, _CLOSE):
                 raise UsageError(
-                    f"{ctx.command_path} {word} is no command; did you mean {meant[0]}? "
+                    f"{ctx.command_path} {word} is not a command; did you mean {meant[0]}? "
                     f"({ctx.command_path} --help lists all)"
                 )
             args = [next(iter(self.commands)), *args]
@@ -264,8 +264,8 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
             sentence = f"{place} cannot be {what}: {error.strerror}: {advice}"
             _leave(sentence, InvalidValue.exit_code, as_json)
         _leave(
-            f"unforeseen {type(error).__name__}: {error} "
-            f"(PERCHCTL_DEBUG=1 shows where; please report it)",
+            f"unexpected {type(error).__name__}: {error} (PERCHCTL_DEBUG=1 shows where; "
+            "please report it)",
             PerchError.exit_code,
             as_json,
         )

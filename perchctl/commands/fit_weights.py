@@ -78,7 +78,7 @@ def fit(
     """
     if output is not None:
         if same_file(output, data):
-            raise UsageError(f"{output} is the data itself; write the result to another file")
+            raise UsageError(f"{output} is the data file itself; write the result to another file")
         check_output(output, (".yaml", ".yml"), force)
     result = fit_weights(data, method, test)
     if not as_json:
@@ -89,11 +89,14 @@ def fit(
     elif any(result.is_proven_better) or anyway:
         date = datetime.now(UTC).isoformat(timespec="seconds")
         write_weights(output, result, date, anyway=anyway)
-        say(f"weights: {output}; they fly with merge.method: weights and merge.weights_file")
+        say(
+            f"weights: {output}; to fly with them, set merge.method: weights and merge.weights_file"
+        )
     else:
         problem = PerchError(
-            f"{output} not written: on no axis do the weights beat the better single marker beyond "
-            f"the interval; take more positions, or write them all the same with --anyway"
+            f"{output} was not written: on no axis are the weights better than the better "
+            "single marker by more than the interval; take more positions, or add --anyway "
+            "to write them regardless"
         )
         say(str(problem))
     if as_json:
@@ -153,7 +156,7 @@ def _open_session(path: Path, frames: int) -> SessionFile:
     if session.note:
         say(session.note)
     if session.done:
-        say(f"{session.path} holds {session.done} positions already")
+        say(f"{session.path} already holds {session.done} positions")
     return session
 
 
@@ -179,7 +182,7 @@ def _collect_with_person(
     spec = profile.camera.source if source is None else source
     if spec.startswith("sim:"):
         raise UsageError(
-            "the simulator has the truth itself: add --truth sim, or name a real camera "
+            "the simulator knows the ground truth: add --truth sim, or name a real camera "
             "with --source (camera:N, http://..., aideck://HOST)"
         )
     opened = open_camera(spec, time.monotonic, profile.camera, size_px=camera.size_px)

@@ -143,7 +143,10 @@ def fly(
     options.require_lift_check()
     asks = not (yes or options.simulated)
     if asks and not sys.stdin.isatty():
-        raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")
+        raise UsageError(
+            f"arming {options.uri} needs your confirmation, and the input is not a "
+            "terminal: add --yes"
+        )
     return fly_and_report(options, as_json, view, asks)
 
 
@@ -386,20 +389,25 @@ def plan_text(options: FlyOptions) -> str:
             "mounting",
             f"camera at {_mm(camera.mount.position_m)}, rpy {turn} deg"
             f"{', mirrored' if camera.mirrored else ''}"
-            + (f": picture's {edges[0]} is the front, {edges[1]} the left side" if edges else ""),
+            + (
+                f": the picture's {edges[0]} is the front, its {edges[1]} the left side"
+                if edges
+                else ""
+            ),
         ),
         ("latency", late if isinstance(late, str) else f"{late * 1e3:g} ms"),
         ("merge", f"{profile.merge.method} {profile.merge.weights_file or ''}".rstrip()),
         (
-            "way",
+            "path",
             f"take off to {planner.takeoff_height_m:g} m, search up to "
             f"{planner.search.max_height_m:g} m, ascend at {planner.ascend.speed_mps:g} m/s",
         ),
         (
             "limits",
-            f"{profile.safety.fence_radius_m:g} m around the place of take-off, "
+            f"{profile.safety.fence_radius_m:g} m around the take-off point, "
             f"{profile.safety.max_height_m:g} m above the ground; battery "
-            f"{profile.safety.min_rest_v:g} V at rest, {profile.safety.min_load_v:g} V in flight",
+            f"{profile.safety.min_rest_v:g} V at rest, {profile.safety.min_load_v:g} V in "
+            "flight",
         ),
         ("log", f"{resolved['log_directory']}{', with pictures' if options.record else ''}"),
     ]
@@ -424,7 +432,7 @@ def _positioning(options: FlyOptions) -> str:
     profile, config = options.profile, options.profile.positioning
     if config.source.is_target:
         view = overhead_text(profile.target, profile_camera(profile.camera), profile.camera.mount)
-        return f"the target itself, by the camera, from the ground on: {view}"
+        return f"the target, seen by the camera from the ground: {view}"
     if not config.source.is_mocap:
         return "the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"

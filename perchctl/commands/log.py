@@ -37,10 +37,10 @@ from perchctl.record import (
     wrap_log_errors,
 )
 
-PLOTS = ((".png", ".pdf", ".svg"), "what plots are drawn in")
-FILMS = ((".mp4", ".gif"), "what films are made in")
-EXPORTS = ((".csv",), "what a log is exported to")
-PAGES = ((".html", ".htm"), "a page for a browser")
+PLOTS = ((".png", ".pdf", ".svg"), "a plot")
+FILMS = ((".mp4", ".gif"), "a film")
+EXPORTS = ((".csv",), "an export")
+PAGES = ((".html", ".htm"), "a page")
 """The suffixes of what is written, the default first, and what they are."""
 
 LogArgument = Annotated[
@@ -215,7 +215,7 @@ def replay(
     is_recorded = pictures and path_beside(path, ".mcap").is_file()
     found = replay_flight(log, recorded_pictures(path) if is_recorded else None, wanted)
     if wanted is not None and not found.changed_keys:
-        say("nothing was changed: that is what was flown")
+        say("no key differs from the flown profile: this replays the flight as it was flown")
     if as_json:
         print_result(found.record())
     else:

@@ -73,11 +73,11 @@ def sheet(
     """
     config = load_profile(profile)
     magnet_m = parse_length(magnet, "--magnet")
-    check_output(output, (".pdf",), force, "what is printed")
+    check_output(output, (".pdf",), force, "a sheet to print")
     origin = f"profile {config.name}"
     write_files({output: target_pdf(config.target, page, magnet_m, origin, config.date)})
     print(f"wrote {output}")
-    print("print at 100 % and measure both rulers: 100 mm each")
+    print("print at 100 %, and check that both rulers measure 100 mm")
 
 
 @command(
@@ -103,11 +103,13 @@ def board(
     """Write a PDF of a calibration board, named as in calibrate --board."""
     printed = Board.parse(notation)
     if printed.scale != (1.0, 1.0):
-        raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
-    check_output(output, (".pdf",), force, "what is printed")
+        raise UsageError(
+            f"{notation}: a board is printed at its nominal size; leave out :measured="
+        )
+    check_output(output, (".pdf",), force, "a sheet to print")
     write_files({output: board_pdf(printed, page)})
     print(f"wrote {output}")
-    print("print at 100 %, glue it on something flat, and measure both rulers: 100 mm each")
+    print("print at 100 %, check that both rulers measure 100 mm, and glue it to something flat")
 
 
 @command(
@@ -150,7 +152,7 @@ def measured(
 ) -> None:
     """Write the marker sizes that you measured on the print to the profile."""
     if large is None and small is None:
-        raise UsageError("give --measured-large and --measured-small, in mm: nothing was measured")
+        raise UsageError("no size is given: add --measured-large, --measured-small or both, in mm")
     config, path = load_profile(profile), writable_profile(profile)
     sides_m = {
         name: parse_length(text, f"--measured-{name}", bare_unit="mm")
@@ -167,4 +169,4 @@ def measured(
     before = write_profile_values(path, values | {"target.size_sigma": found.size_sigma})
     for note in notes:
         print(note)
-    print(f"changed {path}; as it was before it is {before}")
+    print(f"changed {path}; the old version is in {before}")

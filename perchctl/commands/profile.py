@@ -103,18 +103,19 @@ WORDS: dict[str, str] = {
     "link.uri": "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://",
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
     "aideck://HOST",
-    "camera.calibration": "Its calibration file, of perchctl calibrate",
-    "camera.latency_s": "How late the picture is, from exposure to arrival (often 60 to 100 ms),\n"
-    "or measured: by each flight",
-    "front": "Hold a hand over the front of the vehicle. At which edge of the picture does it\n"
-    "come in: top, right, bottom or left?",
-    "left": "And a hand over its left side (a camera that mirrors has it at the other edge)?",
-    "camera.mount.position_m": "Where is the lens from the vehicle's centre: forward, left, up?",
-    "vehicle.gear_body_m": "Where is the tip of the magnet gear: forward, left, up?",
+    "camera.calibration": "The camera's calibration file, from perchctl calibrate",
+    "camera.latency_s": "Latency of the picture, from exposure to arrival (often 60 to 100 ms),\n"
+    "or measured, to have each flight measure it",
+    "front": "Move a hand over the front of the vehicle. At which edge of the picture does it\n"
+    "appear: top, right, bottom or left?",
+    "left": "Move a hand over its left side. At which edge does it appear? (A camera that\n"
+    "mirrors shows it at the opposite edge.)",
+    "camera.mount.position_m": "Position of the lens, from the vehicle's centre: forward, left, up",
+    "vehicle.gear_body_m": "Position of the magnet gear's tip: forward, left, up",
     "target.large.side_m": "Side of the target's large black square as printed",
     "target.small.side_m": "Side of the small black square",
-    "ceiling": "Height of the ceiling over the floor",
-    "safety.fence_radius_m": "Radius of the free space around the place of take-off",
+    "ceiling": "Height of the ceiling above the floor",
+    "safety.fence_radius_m": "Radius of the free space around the take-off point",
 }
 MEASURES: dict[str, tuple[str, float]] = {
     "camera.latency_s": ("ms", 1e-3),
@@ -146,9 +147,9 @@ SHOWN_KEYS = (
 )
 """Keys that are written with their defaults, since they are changed most often."""
 HEAD = """\
-# A profile of perchctl, made by perchctl profile new. Above each key stands what
-# it means (unit, what is allowed). Body axes: x forward, y left, z up, from the
-# vehicle's centre. A key that is not here has its default; all of them:
+# A perchctl profile, created by perchctl profile new. The comment above each key
+# gives its meaning (unit, allowed values). Body axes: x forward, y left, z up, from
+# the vehicle's centre. Keys that are not listed keep their defaults. List all keys:
 #   perchctl profile -p {name}
 
 """
@@ -187,7 +188,7 @@ def new(
     camera's mounting in words: hold a hand over the vehicle's front, then over its left side, and
     say at which edge of the picture it appears.
     """
-    check_output(output, (".yaml", ".yml"), force, "what a profile is")
+    check_output(output, (".yaml", ".yml"), force, "a profile")
     given = dict(setting.partition("=")[::2] for setting in settings or ())
     profile_and_keys(given, output.stem)  # before anything is asked
     answers = dict(given)
@@ -205,11 +206,12 @@ def new(
     if profile.camera.mirrored:
         say(
             f"camera: with the front at its {answers['front']} and the left side at its "
-            f"{answers['left']} edge the picture is mirrored: wrote camera.mirrored: true, which "
-            f"turns each picture right before use; if it is not mirrored, answer the two again"
+            f"{answers['left']} edge, the picture is mirrored: wrote camera.mirrored: true, "
+            "which flips each picture before use; if it is not mirrored, answer both "
+            "questions again"
         )
     _say_doubts(load_profile(str(output.absolute())))
-    print(f"wrote {output}\nlook at the plan: perchctl fly -p {shown} --dry-run")
+    print(f"wrote {output}\ncheck the plan: perchctl fly -p {shown} --dry-run")
 
 
 def default_answer(name: str, answers: Answers) -> str:
@@ -269,8 +271,8 @@ def _typed(question: str) -> str:
         return ask(question).strip()
     except EOFError:
         raise UsageError(
-            "there is nobody to ask, and nothing was written: answer by --set, or add "
-            "--defaults for what is not answered"
+            "the input ended before all questions were answered, so nothing was written: "
+            "answer with --set, or add --defaults to use the default answers"
         ) from None
 
 
@@ -285,9 +287,9 @@ def _read(name: str, typed: str) -> str:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        raise InvalidValue(f"found {typed!r}; numbers in {unit} are needed") from None
+        raise InvalidValue(f"found {typed!r}; enter numbers in {unit}") from None
     if size < 1.0 and any(numbers) and all(abs(number) < 1.0 for number in numbers):
-        raise InvalidValue(f"found {typed!r}: too small for {unit}, in which the question is")
+        raise InvalidValue(f"found {typed!r}, which is too small: enter numbers in {unit}")
     values = [f"{number * size:.12g}" for number in numbers]
     return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
 

@@ -120,10 +120,10 @@ def run(
         return _list_faults(as_json)
     if record and log_dir is None:
         raise UsageError(
-            "--record concerns the logs of the flights: name their folder with --log-dir"
+            "--record writes its files next to the flight logs: name their folder with --log-dir"
         )
     if resume and out is None:
-        raise UsageError("--resume goes on with a file of results: name it with --out")
+        raise UsageError("--resume continues a file of results: name it with --out")
     flown = with_positioning(load_profile(profile), positioning)
     if cluster is not None and log_dir is not None:
         log_dir = log_dir.absolute()  # workers are started in other folders
@@ -290,8 +290,8 @@ def make_executor(
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
         raise UsageError(
-            f"--cluster {cluster} flies as many at a time as it has workers: --jobs {jobs} does "
-            f"not apply; leave it out, or --cluster"
+            f"--cluster {cluster} runs as many flights at a time as it has workers, so "
+            f"--jobs {jobs} does not apply: leave out one of the two"
         )
     if find_spec("distributed") is None:
         raise no_cluster()

@@ -110,7 +110,7 @@ def track(
         count = None
         if isinstance(recording, RecordedSource):
             paths, count = recording.paths, recording.count
-        advice = ", the shipped example: give your camera's with --calibration"
+        advice = ", the shipped example: name your camera's with --calibration"
         say(f"calibration: {file.name}{advice if is_shipped_example(file) else ''}")
         # Files of pictures need not belong together.
         tracker = Tracker(flown, camera, live=opened.live, stills=source.startswith("images:"))
@@ -142,10 +142,10 @@ def track(
         took_s = time.monotonic() - start_s
         lost = opened.problem(-math.inf)
         if summary.frames == 0 and lost is None and not stop.requested.is_set():
-            raise NotFound(f"{opened.describe()} gave no frame at all")
+            raise NotFound(f"{opened.describe()} delivered no frame")
     say(summary.text(took_s))
     if stop.requested.is_set():
-        raise Interrupted("Ctrl-C: stopped; what was printed is complete")
+        raise Interrupted("stopped by Ctrl-C; everything printed so far is complete")
     if lost is not None:
         raise ConnectionFailed(lost)
 
@@ -170,7 +170,7 @@ def poll_until_stopped(
             return
         problem = source.problem(now_s)
         if problem is not None and not is_silent:
-            say(f"{problem}; waiting for it (Ctrl-C ends)")
+            say(f"{problem}; waiting for it (Ctrl-C stops)")
             is_silent = True
         stop.requested.wait(TRACK_POLL_S)
 

@@ -273,7 +273,7 @@ def test_a_mirrored_picture_is_named_and_can_be_turned(tmp_path: Path) -> None:
     assert right.lines[0]["stage"] == "both"
     assert "mirrored" not in right.stderr
     cv2.imwrite(str(tmp_path / "m.png"), image)
-    assert "take camera.mirrored out" in track(tmp_path / "m.png", "-p", turned).stderr
+    assert "remove camera.mirrored" in track(tmp_path / "m.png", "-p", turned).stderr
 
 
 def test_pictures_that_show_nothing_are_named_and_counted(tmp_path: Path) -> None:
@@ -287,12 +287,12 @@ def test_pictures_that_show_nothing_are_named_and_counted(tmp_path: Path) -> Non
         cv2.imwrite(str(tmp_path / f"{name}.png"), values.astype(np.uint8))
     tracked = track(tmp_path)
     assert [line["stage"] for line in tracked.lines] == ["none"] * 3
-    for words in ("dark.png: the picture is dark", "snow.png: snow", "uniform.png: an empty"):
+    for words in ("dark.png: the picture is dark", "snow.png: snow", "uniform.png: a blank"):
         assert words in tracked.stderr
     assert "snow in 1" in tracked.stderr.splitlines()[-1]
     still = track(write_video(tmp_path / "still.mp4", [np.full((480, 640), 90, np.uint8)] * 20))
     assert [line["frame"] for line in still.lines] == list(range(20))
-    assert still.stderr.count("the picture stands still") == 2  # and in the summary
+    assert still.stderr.count("the picture is frozen") == 2  # and in the summary
 
 
 def tracker(profile: Profile | None = None, live: bool = True, stills: bool = False) -> Tracker:
@@ -306,7 +306,7 @@ def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     assert first.stage.value == "both"
     assert list(live.process(Frame(1, 0.03, image))) == []
     assert [seen[1:] for seen in live.process(Frame(2, 1.0, image))] == [
-        (None, ["the picture stands still"])
+        (None, ["the picture is frozen"])
     ]
     noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)
     [(_, output, notes)] = live.process(Frame(3, 1.1, noise))
@@ -320,7 +320,7 @@ def test_markers_that_contradict_are_named() -> None:
     target = sim.target.model_copy(update={"small": small})
     doubting = tracker(sim.model_copy(update={"target": target}), live=False, stills=True)
     [(*_, notes)] = doubting.process(Frame(0, 0.0, picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))))
-    assert [note.partition(":")[0] for note in notes] == ["the two markers contradict"]
+    assert [note.partition(":")[0] for note in notes] == ["the two markers contradict each other"]
 
 
 def test_corners_without_a_pose_are_named() -> None:
@@ -343,7 +343,7 @@ def test_a_live_source_is_waited_for_until_it_has_ended(
     )
     assert [frame.index for frame in poll_until_stopped(source, lambda: 5.0, Stopper())] == [0]
     said = capsys.readouterr().err
-    assert said == "perchctl: silent for 2 s; waiting for it (Ctrl-C ends)\n"
+    assert said == "perchctl: silent for 2 s; waiting for it (Ctrl-C stops)\n"
     assert problems == []
 
 
@@ -416,7 +416,7 @@ def test_ctrl_c_leaves_whole_lines(video: Path, monkeypatch: pytest.MonkeyPatch)
     ("words", "code", "expected"),
     [
         (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
-        (["images:*.nothing"], 20, "names pictures"),
+        (["images:*.nothing"], 20, "matches pictures"),
         (["nonsense:1"], 30, "camera:N"),
         (["."], 20, "holds no pictures"),
         (["BROKEN"], 30, "cannot be read as a picture"),
