@@ -43,22 +43,25 @@ LEAST_RATED = 10
 """Pictures; of fewer no rate is known."""
 _AGAIN = {
     "camera": "plug the receiver or camera in again",
-    "aideck": "switch the Crazyflie off and on",
+    "aideck": "switch the Crazyflie off and on again",
     "sim": "start it again",
 }
 _NEARER = {
-    "camera": "if it is a receiver, bring it nearer, turn its antenna, choose another channel; "
-    "else use another cable",
-    "aideck": "bring this computer nearer to the deck, choose another Wi-Fi channel",
+    "camera": "for a receiver: move it closer, turn its antenna or choose another channel; "
+    "otherwise use another cable",
+    "aideck": "move this computer closer to the deck, or choose another Wi-Fi channel",
     "sim": "close other programs: the simulated camera runs on this computer",
 }
-_RESTART, _NETWORK = "switch the camera off and on", "look at the network to the camera"
+_RESTART, _NETWORK = (
+    "switch the camera off and on again",
+    "check the network between this computer and the camera",
+)
 """For sources of any other kind."""
-_LIGHT = "more light, a longer exposure, or the lens cap off"
+_LIGHT = "add light, lengthen the exposure, or take off the lens cap"
 _ADVICE = {
     VERDICT_TEXTS["frozen"]: _RESTART,
-    VERDICT_TEXTS["snow"]: "set the receiver to the camera's channel, switch the camera on",
-    VERDICT_TEXTS["uniform"]: "uncover the lens, switch the camera on",
+    VERDICT_TEXTS["snow"]: "set the receiver to the camera's channel, and switch the camera on",
+    VERDICT_TEXTS["uniform"]: "uncover the lens, and switch the camera on",
     VERDICT_TEXTS["dark"]: _LIGHT,
 }
 
@@ -73,7 +76,7 @@ def failed_camera_rows(error: PerchError, profile: Profile) -> list[Row]:
         if found.startswith("camera:"):
             advice = "see docs/check.md; perchctl check --cameras lists the cameras"
     names = ("size", *picture_row_names(profile))
-    return [Row("camera", *failed(found, advice)), *skipped_rows(names, "no picture comes")]
+    return [Row("camera", *failed(found, advice)), *skipped_rows(names, "no picture arrives")]
 
 
 def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]) -> Finding:
@@ -82,13 +85,13 @@ def size_finding(size_px: tuple[int, int] | None, calibrated_px: tuple[int, int]
     if size_px == calibrated_px:
         return passed(f"{found} px, as calibrated")
     advice = "set the camera to that size, or calibrate it at this one"
-    return failed(f"{found} px, calibrated at {wanted} px", advice)
+    return failed(f"{found} px, but calibrated at {wanted} px", advice)
 
 
 def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> list[Row]:
     """The rows of `picture_row_names` for a rehearsal; the first failed if no picture came."""
     if not rehearsal.pictures:
-        why = rehearsal.problem or "no picture came in the rehearsal"
+        why = rehearsal.problem or "no picture arrived during the rehearsal"
         first, *rest = picture_row_names(profile)
         advice = _AGAIN.get(rehearsal.scheme, _RESTART)
         return [Row(first, *failed(why, advice)), *skipped_rows(rest, why)]
@@ -104,9 +107,11 @@ def picture_rows(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) ->
 def _rate(rehearsal: Rehearsal, profile: Profile) -> Finding:
     period_s = rehearsal.frame_period_s
     if period_s is None:
-        return skipped("too few pictures" if rehearsal.live else "a recording has none of its own")
+        return skipped(
+            "too few pictures" if rehearsal.live else "a recording has no frame rate of its own"
+        )
     hz = 1.0 / period_s
-    advice = "more light, a smaller picture, or a shorter cable"
+    advice = "add light, request smaller pictures, or use a shorter cable"
     return limits_finding(-hz, -RATE_WARN_HZ, -RATE_FAIL_HZ, f"{hz:.0f} Hz", advice)
 
 
@@ -122,17 +127,19 @@ def _gaps(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if len(gaps_s) < LEAST_RATED:
         return skipped("too few pictures")
     longest_s, limit_s = max(gaps_s), profile.safety.camera_hold_s
-    found = f"the longest gap is {1e3 * longest_s:.0f} ms"
+    found = f"longest gap {1e3 * longest_s:.0f} ms"
     advice = _NEARER.get(rehearsal.scheme, _NETWORK)
     return limits_finding(longest_s, GAP_WARN * limit_s, limit_s, found, advice)
 
 
 def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if not rehearsal.live or not rehearsal.ages_s:
-        return skipped("none was looked at" if rehearsal.live else "a recording")
+        return skipped("no picture was processed" if rehearsal.live else "a recording")
     age_s, limit_s = float(np.quantile(rehearsal.ages_s, 0.95)), profile.safety.max_frame_age_s
     latency_ms = 1e3 * profile.camera.start_latency_s
-    found = f"95 % within {1e3 * age_s:.0f} ms, {latency_ms:.0f} of them by camera.latency_s"
+    found = (
+        f"95 % within {1e3 * age_s:.0f} ms, which includes camera.latency_s of {latency_ms:.0f} ms"
+    )
     advice = "measure camera.latency_s; use a faster receiver or computer"
     return limits_finding(age_s, 0.6 * limit_s, limit_s, found, advice)
 
@@ -140,12 +147,12 @@ def _age(rehearsal: Rehearsal, profile: Profile) -> Finding:
 def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
     late = sum(t < t0 for (_, t0), (_, t) in pairwise(rehearsal.arrivals))
     if late:
-        found = f"{late} of {rehearsal.pictures} came after newer ones"
-        return failed(found, "use another stream or receiver: these hold pictures back")
+        found = f"{late} of {rehearsal.pictures} arrived after newer ones"
+        return failed(found, "use another stream or receiver: this one delays pictures")
     if not rehearsal.problems:
         again = rehearsal.repeats
         repeated = f"; {again} repetitions by the receiver are not counted" if again else ""
-        return passed(f"{rehearsal.pictures} good ones{repeated}")
+        return passed(f"{rehearsal.pictures} good pictures{repeated}")
     if (note := mirrored_note(profile.camera)) in rehearsal.problems:
         found, _, advice = note.partition(": ")
         return failed(found, advice)
@@ -158,15 +165,15 @@ def _pictures(rehearsal: Rehearsal, profile: Profile) -> Finding:
 def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
     blur_px = rehearsal.blur_px
     if blur_px is None:
-        why = "measured by the target's edges, and no target was seen"
+        why = "focus is measured on the target's edges, and no target was seen"
         return skipped(why, "put the camera under the target")
-    advice = "turn the lens until perchctl track --view shows the target sharp"
+    advice = "turn the lens until perchctl track --view shows a sharp target"
     return limits_finding(blur_px, 1.6, 2.5, f"blur sigma {blur_px:.1f} px", advice)
 
 
 def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if not rehearsal.target_pictures:
-        return skipped("not in view", "put the vehicle under it to check the rest")
+        return skipped("not in view", "put the vehicle under the target to check the other rows")
     found = f"in {100 * rehearsal.target_pictures // rehearsal.pictures} % of the pictures"
     target = rehearsal.target
     if target is not None:
@@ -176,14 +183,14 @@ def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
         if problem := GroundCriteria.target_too_near(target):
             return failed(problem.found, problem.advice)
     if rehearsal.target_pictures < SEEN_WARN * rehearsal.pictures:
-        return warned(found, "nearer, sharper, or more light: see focus")
+        return warned(found, "move closer, focus the lens (see focus), or add light")
     return passed(found)
 
 
 def _print(rehearsal: Rehearsal, profile: Profile) -> Finding:
     verdict = rehearsal.print_verdict
     if verdict is None:
-        return skipped("both markers must be in view", "hold it nearer to the target")
+        return skipped("both markers must be in view", "hold the vehicle closer to the target")
     wrong, text = verdict
     found, _, advice = text.partition("; ")
     return failed(found, advice) if wrong else passed(found)
@@ -207,9 +214,14 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     """Judge the view from where the vehicle stands, and on its way up: what `fly` refuses fails."""
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
-        return failed("no, and fly refuses", f"put the vehicle under the target: {where}")
+        return failed(
+            "not in view, so fly would refuse to take off",
+            f"put the vehicle under the target: {where}",
+        )
     if rehearsal.target is None:
-        return warned("not at the end", "see lost frames and target; once more")
+        return warned(
+            "no longer in view at the end", "see lost frames and target, then check again"
+        )
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
         return failed(problem.found, problem.advice)
     feet = (0.0, 0.0, profile.safety.ground_z_m)
@@ -219,7 +231,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     problem = view_problem(place, feet, 0.0, profile, camera)
     if problem is not None:
         return failed(problem.found, problem.advice)
-    return passed("now, and at take-off height")
+    return passed("in view now, and also from take-off height")
 
 
 IN_VIEW = "in view"
@@ -238,7 +250,7 @@ def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
     if rehearsal is None or len(rehearsal.processing_s) < LEAST_RATED:
         return skipped("no pictures to rehearse with")
     if not rehearsal.live:
-        return skipped("a recording comes as fast as it is read")
+        return skipped("a recording plays as fast as it is read")
     work_s = float(np.quantile(rehearsal.processing_s, 0.95))
     turn_s = 1.0 / profile.link.loop_hz
     period_s = rehearsal.frame_period_s or turn_s
@@ -247,10 +259,10 @@ def loop_finding(rehearsal: Rehearsal | None, profile: Profile) -> Finding:
     )
     latest_s = max(rehearsal.tick_delays_s)
     found = (
-        f"{1e3 * work_s:.0f} ms a picture of {1e3 * period_s:.0f}, "
-        f"{100.0 * late:.0f} % of the turns late, at most {1e3 * latest_s:.0f} ms"
+        f"{1e3 * work_s:.0f} of {1e3 * period_s:.0f} ms used for each picture; "
+        f"{100.0 * late:.0f} % of the ticks late, by at most {1e3 * latest_s:.0f} ms"
     )
-    advice = "close other programs, use a smaller picture, or a faster computer"
+    advice = "close other programs, request smaller pictures, or use a faster computer"
     if latest_s > profile.safety.loop_late_hold_s:
         return failed(found, advice)
     return worst_finding(

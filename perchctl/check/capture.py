@@ -105,7 +105,10 @@ def failed_capture_rows(why: str, config: PositioningConfig) -> list[Row]:
     """The rows of a motion capture that cannot be opened or sends nothing; `why` is shown."""
     found, _, advice = why.rpartition("; ")
     if not found:
-        found, advice = why, "does it stream, is positioning.host right, does a firewall stop it?"
+        found, advice = (
+            why,
+            "check that it streams, that positioning.host is right, and that no firewall blocks it",
+        )
     return [Row("capture", *failed(found, advice)), *skipped_rows(BODY_ROWS, f"no {config.label}")]
 
 
@@ -113,14 +116,18 @@ def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
     """Judge the samples of a motion capture taken while the vehicle stood still."""
     config = profile.positioning
     if not samples.frames:
-        return failed_capture_rows(samples.problem or f"{config.label} sends no frame", config)
-    first = Row("capture", *passed(f"{config.label} sends"))
+        return failed_capture_rows(samples.problem or f"{config.label} sends no frames", config)
+    first = Row("capture", *passed(f"{config.label} sends frames"))
     places = samples.body_poses(config)
     if not places:
         others = sorted({name for frame in samples.frames for name in frame.bodies})
         found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
-        body = failed(found, "correct positioning.body, or show it to the cameras")
-        return [first, Row("body", *body), Row("body place", *skipped("the body is not seen"))]
+        body = failed(found, "correct positioning.body, or move the body into the cameras' view")
+        return [
+            first,
+            Row("body", *body),
+            Row("body place", *skipped("the motion capture does not see the body")),
+        ]
     body = _body(samples, places, profile)
     return [first, Row("body", *body), Row("body place", *_place(samples, places, profile))]
 
@@ -129,8 +136,8 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     config = profile.positioning
     at = np.array([place.position_m for place in places])
     if len(at) > 2 and not np.ptp(at, axis=0).any():
-        advice = "a measured pose has noise: is the capture paused, or the body hidden?"
-        return failed("frozen: all of its numbers repeat", advice)
+        advice = "a measured pose has noise: check whether the capture is paused or the body hidden"
+        return failed("frozen: all of its poses are identical", advice)
     sigma_m = float(np.max(1.4826 * np.median(np.abs(at - np.median(at, axis=0)), axis=0)))
     times = [place.t_s for place in places]
     span_s = times[-1] - times[0]
@@ -139,15 +146,16 @@ def _body(samples: CaptureSamples, places: list[VehiclePose], profile: Profile) 
     # `Capture.poll` prefers frames with the body, so a frame without is one more unseen.
     share = 1.0 - len(places) / len(samples.frames)
     found = (
-        f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, {rate_hz:.0f} Hz, "
-        f"the longest gap {1e3 * gap_s:.0f} ms, noise {1e3 * sigma_m:.1f} mm"
+        f"{config.body!r} seen in {100.0 * (1.0 - share):.0f} % of the frames, "
+        f"{rate_hz:.0f} Hz, longest gap {1e3 * gap_s:.0f} ms, noise {1e3 * sigma_m:.1f} "
+        "mm"
     )
-    hidden = "it is hidden at times, or has too few markers: look at it in the capture"
-    slow = "raise the capture's rate, use a cable, close what loads this computer"
+    hidden = "it may be hidden at times or have too few markers: look at it in the capture software"
+    slow = "raise the capture's rate, connect by cable, or close other programs on this computer"
     noisy = (
-        "let it stand still; calibrate the capture, or raise positioning.position_sigma_m"
+        "keep the vehicle still; calibrate the capture, or raise positioning.position_sigma_m"
         if sigma_m < WILD_M
-        else "these look like millimetres: set the unit of its stream to metres"
+        else "the positions look like millimetres: set the unit of the capture's stream to metres"
     )
     limit_m = config.position_sigma_m
     return worst_finding(
@@ -163,10 +171,10 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
     newest = samples.telemetry[-1] if samples.telemetry else None
     place = places[-1].to_external(attitude=True)
     if newest is None:
-        return skipped("it cannot be compared: no telemetry")
+        return skipped("no telemetry to compare it with")
     criteria = GroundCriteria(newest, profile)
     if not criteria.stands:
-        return skipped("the vehicle does not stand level and still")
+        return skipped("the vehicle is not level and at rest")
     problem = criteria.position_frame_problem(place)
     if problem is None and all(GroundCriteria(each, profile).stands for each in samples.telemetry):
         moved_m = float(np.linalg.norm(places[-1].position_m - places[0].position_m))
@@ -180,7 +188,7 @@ def _place(samples: CaptureSamples, places: list[VehiclePose], profile: Profile)
 # --- In a hand ---
 
 HOW_TO_TURN = (
-    "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and aside, put it back"
+    "lift it straight up by 30 cm, turn it by 90 deg, tilt it forward and sideways, and put it back"
 )
 POSE_PAIR_PERIOD_S = 0.1
 LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
@@ -317,27 +325,33 @@ def _turned_rad(attitudes: Rotation) -> Array:
 def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -> Finding:
     """Judge whether vehicle and capture agree on the motion; skipped for None."""
     if motion is None:
-        return skipped("no moments at which both vehicle and capture said something", HOW_TO_TURN)
+        return skipped(
+            "there is no time at which both the vehicle and the capture reported", HOW_TO_TURN
+        )
     own_rad, seen_rad = (float(_turned_rad(R).max()) for R in (motion.R_vehicle, motion.R_capture))
     way_m = float(np.linalg.norm(motion.displacements_m, axis=1).max())
     body = f"rigid body {config.body!r}"
-    others = "it is another body's: correct positioning.body"
+    others = "the name may belong to another body: correct positioning.body"
     if own_rad <= MOVED_RAD and motion.max_deviation_g <= MOVED_G:
         if way_m > MOVED_M or seen_rad > MOVED_RAD:
-            return failed(f"the {body} moves, and the vehicle stands still", others)
-        return skipped("it was not moved", HOW_TO_TURN)
+            return failed(f"the {body} moves while the vehicle stands still", others)
+        return skipped("the vehicle was not moved", HOW_TO_TURN)
     if seen_rad <= BODY_STILL_RAD and way_m <= BODY_STILL_M:
-        return failed(f"the vehicle moves, and the {body} stands still", others)
+        return failed(f"the vehicle moves while the {body} stands still", others)
     if way_m > HAND_REACH_M:
-        found = f"the {body} moved by {way_m:.0f} m: these look like millimetres"
+        found = f"the {body} moved by {way_m:.0f} m: the positions look like millimetres"
         return failed(found, "set the unit of the capture's stream to metres")
     turns = solve_alignment(motion)
     if turns is None:
         turned_deg = math.degrees(own_rad)
-        return warned(f"turned by {turned_deg:.0f} deg, about too few axes to tell", HOW_TO_TURN)
+        return warned(
+            f"turned by {turned_deg:.0f} deg, but about too few axes to compare", HOW_TO_TURN
+        )
     if turns.residual_share > STRANGER:
-        advice = "it is another body's, or its markers are too few or too symmetric"
-        return failed(f"the {body} does not turn as the vehicle does", advice)
+        advice = (
+            "the name may belong to another body, or the markers may be too few or too symmetric"
+        )
+        return failed(f"the rotation of the {body} does not match the vehicle's", advice)
     return _world_finding(turns, motion) or _body_finding(turns, motion, config)
 
 
@@ -362,7 +376,10 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
         )
         if axis is not None:
             found = f"swapped axes: up is {axis} in the motion capture"
-        advice = "set its world to z up, and define the rigid body anew with the vehicle level"
+        advice = (
+            "set the capture's world to z up, and define the rigid body again with the "
+            "vehicle level"
+        )
         return failed(found, advice)
     risen_m = _risen_m(turns, motion)
     way_m = float(np.linalg.norm(risen_m))
@@ -370,8 +387,10 @@ def _world_finding(turns: FrameAlignment, motion: PairedMotion) -> Finding | Non
         return None
     x, y, z = risen_m
     return failed(
-        f"swapped or mirrored axes: lifted, the body goes by x {x:.2f}, y {y:.2f}, z {z:.2f} m",
-        "set its world to z up, right-handed; if you carried it aside, once more, straight up",
+        f"swapped or mirrored axes: when lifted, the body moves by x {x:.2f}, y "
+        f"{y:.2f}, z {z:.2f} m",
+        "set the capture's world to z up, right-handed; if you moved the vehicle "
+        "sideways, lift it again, straight up",
     )
 
 
@@ -385,10 +404,10 @@ def _body_finding(
         wanted = ", ".join(f"{math.degrees(angle):.0f}" for angle in rpy)
         verdict = failed if off_deg > BODY_FAIL_DEG else warned
         return verdict(
-            f"the rigid body's axes are turned by {off_deg:.0f} deg against the vehicle's",
-            f"set positioning.body_rpy_deg: [{wanted}], or define the body anew",
+            f"the rigid body's axes are rotated by {off_deg:.0f} deg from the vehicle's",
+            f"set positioning.body_rpy_deg: [{wanted}], or define the body again",
         )
-    found = f"turns as the vehicle does, within {off_deg:.0f} deg"
+    found = f"rotation agrees with the vehicle's within {off_deg:.0f} deg"
     risen_m = float(_risen_m(turns, motion) @ turns.vertical)
     if risen_m < LEAST_RISE_M:
         return warned(f"{found}; it was not lifted along the capture's z", HOW_TO_TURN)
@@ -422,11 +441,14 @@ def save_comparison_row(
     if why is None:
         return _record_row(config, uri, now)
     if not passes and load_comparison(config, vehicle).objection_and_advice(now) is None:
-        found = f"what was found could not be written, and fly goes by an older pass: {why}"
-        advice = "free some space, or give back the right to write there; do not fly before"
+        found = f"this result could not be saved, so fly would rely on an older pass: {why}"
+        advice = "free some space or restore write permission, and do not fly before that"
         return Row(COMPARED, *failed(found, advice))
     return Row(
-        COMPARED, *warned(f"not written, so fly does not know of it: {why}", "then once more")
+        COMPARED,
+        *warned(
+            f"the result could not be saved, so fly does not know of it: {why}", "then check again"
+        ),
     )
 
 
@@ -436,4 +458,4 @@ def _record_row(config: PositioningConfig, uri: str, now: datetime) -> Row:
     if objection is None:
         return Row(COMPARED, *passed(record.text(now)))
     found, advice = objection
-    return Row(COMPARED, *warned(f"{found}; fly refuses", advice))
+    return Row(COMPARED, *warned(f"{found}, so fly refuses to start", advice))

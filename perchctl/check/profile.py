@@ -86,7 +86,7 @@ class _Plan:
         try:
             return profile_camera(self.profile.camera)
         except PerchError as error:
-            raise Unanswerable(f"no calibration to tell by: {error}") from None
+            raise Unanswerable(f"no calibration: {error}") from None
 
 
 def _calibration(plan: _Plan) -> Finding:
@@ -110,7 +110,7 @@ def _camera_turn(plan: _Plan) -> Finding:
         tilted_deg = math.degrees(math.acos(max(-1.0, up)))
         return failed(
             f"{found}: the camera looks {tilted_deg:.0f} deg away from straight up",
-            "camera.mount.rpy_deg: 0 0 0 looks up, the last angle turns the picture",
+            "correct camera.mount.rpy_deg: 0 0 0 looks up, and the last angle turns the picture",
         )
     return passed(found)
 
@@ -118,11 +118,11 @@ def _camera_turn(plan: _Plan) -> Finding:
 def _standoff(plan: _Plan) -> Finding:
     """Settled counts only what shows the small marker."""
     standoff_m = plan.profile.planner.ascend.standoff_m
-    shown = f"at {mm_text(standoff_m)} mm under the target the small marker is"
+    shown = f"at {mm_text(standoff_m)} mm below the target the small marker is"
     if sees_small_marker(plan.camera, plan.profile, standoff_m):
-        return passed(f"{shown} in the picture")
+        return passed(f"{shown} in view")
     return failed(
-        f"{shown} not whole in the picture, and no ascent could settle",
+        f"{shown} not wholly in view, so no ascent could settle",
         "measure camera.mount and vehicle.gear_body_m, or raise planner.ascend.standoff_m",
     )
 
@@ -140,7 +140,7 @@ def _limits(name: str, profile: Profile) -> Finding:
         limits = tuple(limit for limit in limits if "planner.perch.thrust" not in limit.keys)
     broken = [limit for limit in limits if not limit.holds(profile)]
     if not broken:
-        return passed(f"{len(limits)} fit each other")
+        return passed(f"consistent ({len(limits)} checked)")
     keys = dict.fromkeys(key for limit in broken for key in limit.keys)
     sentences = "; ".join(limit.violation_text(profile) for limit in broken)
     return warned(sentences, f"change {' or '.join(keys)}")
@@ -154,7 +154,8 @@ def _latency(plan: _Plan) -> Finding:
     if isinstance(latency_s, str):
         return passed("measured by each flight")
     return warned(
-        f"camera.latency_s is {1e3 * latency_s:g} ms; 30 ms wrong makes the vehicle swing",
+        f"camera.latency_s is {1e3 * latency_s:g} ms; an error of 30 ms makes the "
+        "vehicle oscillate",
         "set camera.latency_s: measured",
     )
 
@@ -169,12 +170,12 @@ def log_finding(folder: Path) -> Finding:
         check_writable(folder / "flight.jsonl", force=True)
         usage = shutil.disk_usage(next(p for p in (whole, *whole.parents) if p.exists()))
     except PerchError as error:
-        return failed(str(error), "name another with --log-dir, or set log.directory")
+        return failed(str(error), "name another folder with --log-dir, or set log.directory")
     except OSError as error:
-        return skipped(f"free space not known ({error.strerror or error})")
+        return skipped(f"free space unknown ({error.strerror or error})")
     if not usage.total:
-        return skipped(f"{folder} is on no disk")
+        return skipped(f"{folder} is not on a disk")
     found = f"{folder}, {usage.free / 1e6:,.0f} MB free"
     return limits_finding(
-        -usage.free, -500e6, -50e6, found, "free some space: a flight's log has some 5 MB a minute"
+        -usage.free, -500e6, -50e6, found, "free some space: a flight log takes about 5 MB a minute"
     )

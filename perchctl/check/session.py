@@ -53,7 +53,7 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     check_options(options)
     if options.has_own_link:
         raise UsageError(
-            f"check asks the vehicle through cflib, not through your own link "
+            "check talks to the vehicle through cflib, not through your own link "
             f"{options.uri}: name a vehicle with --uri"
         )
     calibrated = profile_camera(options.profile.camera)
@@ -85,7 +85,7 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
             yield from camera.failed_camera_rows(error, options.profile)
         else:
             stack.callback(source.close)
-            yield Row("camera", *passed(f"{shown} gives pictures"))
+            yield Row("camera", *passed(f"{shown} delivers pictures"))
             rehearsal = yield from _camera_rows(
                 take, source, pipeline, options.profile, scope, scheme
             )
@@ -183,14 +183,14 @@ class VehicleChecks:
                     )
                 ]
         else:
-            advice = "add --lift, and lift it by hand when told"
-            yield from skipped_rows([vehicle.LIFTED], "not asked for", advice)
+            advice = "add --lift, and lift the vehicle by hand when asked to"
+            yield from skipped_rows([vehicle.LIFTED], "not requested", advice)
         yield from compared
 
     def _lift_finding(self) -> Finding:
         config, mocap, within_s = self.profile.positioning, self.mocap, self.scope.lift_s
         if config.source.is_target:
-            return skipped("only in flight it gets its position, by the target")
+            return skipped("the vehicle gets its position from the target, and only in flight")
         if mocap is None:
             self.scope.announce(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
             return vehicle.lift_finding(vehicle.record_lift(self.probe, time.sleep, within_s))
@@ -216,7 +216,7 @@ def _camera_rows(
     size = camera.size_finding(source.size_px, pipeline.camera.size_px)
     yield Row("size", *size)
     if size.verdict != "pass":
-        why = "pictures of another size cannot be looked at"
+        why = "pictures of another size cannot be checked"
         yield from skipped_rows(camera.picture_row_names(profile), why)
         return None
     scope.announce(f"rehearsing on live pictures for {scope.rehearse_s:g} s")

@@ -39,24 +39,25 @@ MOVED_WARN_M = 0.05
 """At rest, while it is listened to: a flight's estimate drifts by a fifth of it."""
 KALMAN = 2
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
-BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
+BY_FLY = "fly sends the positions, and waits for the estimate to agree"
 """By a motion capture, or by the target."""
-ARMED_BY_FLY = "armed by fly after your yes"
-UNREPORTED = "by link.unreported this vehicle reports none"
+ARMED_BY_FLY = "fly arms it after you confirm"
+UNREPORTED = "link.unreported says that this vehicle reports none"
 
 Wait = Callable[[float], None]
 
 LINK_ADVICE = {
-    "radio": "bring the radio nearer, choose a channel above 80",
+    "radio": "move the radio closer, or choose a channel above 80",
     "usb": "use another cable or USB port",
-    "udp": "look at the network between this computer and the vehicle",
+    "udp": "check the network between this computer and the vehicle",
     "sim": "close other programs: the simulated vehicle runs on this computer",
 }
 """What helps against lost and slow packets, by the scheme of the vehicle's URI."""
 ADDRESS_ADVICE = {
-    "radio": "switch it on; perchctl check --scan shows what answers",
-    "usb": "plug it in and switch it on; perchctl check --scan shows what answers",
-    "udp": "switch it on, look at its address; perchctl check --scan shows what answers",
+    "radio": "switch it on; perchctl check --scan lists the vehicles that answer",
+    "usb": "plug it in and switch it on; perchctl check --scan lists the vehicles that answer",
+    "udp": "switch it on, and check its address; perchctl check --scan lists the vehicles "
+    "that answer",
     "sim": "start it again",
 }
 BUSY_ADVICE = "close other programs, or use a faster computer"
@@ -171,7 +172,7 @@ def _packets(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not back_s:
         return failed("no packet came back", f"restart the vehicle; {advice}")
     lost, p95_s = 1.0 - len(back_s) / sent, _quantile_95(back_s)
-    found = f"{100.0 * lost:.1f} % of {sent} lost, 95 % back in {1e3 * p95_s:.1f} ms"
+    found = f"{100.0 * lost:.1f} % of {sent} lost, 95 % returned within {1e3 * p95_s:.1f} ms"
     if quality is not None:
         found += f", link quality {quality:.0f} %"
     busy_s = _quantile_95(sorted(vehicle.wake_delays_s))
@@ -194,7 +195,7 @@ def _quantile_95(ordered_s: Sequence[float]) -> float:
 
 def _telemetry(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if vehicle.telemetry is None:
-        return failed("none comes", "see firmware and packets; restart the vehicle")
+        return failed("none arrives", "see firmware and packets; restart the vehicle")
     wanted_hz = 1.0 / profile.link.telemetry_period_s
     age_ms = 1e3 * vehicle.age_s
     found = f"{vehicle.samples_hz:.0f} Hz of {wanted_hz:.0f}, newest {age_ms:.0f} ms old"
@@ -212,17 +213,17 @@ def _firmware(vehicle: VehicleStatus, profile: Profile) -> Finding:
         advice = f"update it: protocol {needed} or later is needed (release 2026.08)"
         return failed(found, advice)
     if vehicle.missing_variables:
-        found = f"{found}, not logged: {', '.join(vehicle.missing_variables)}"
+        found = f"{found}, which lacks log variables {', '.join(vehicle.missing_variables)}"
         return failed(found, "update it to release 2026.08 or later")
     if vehicle.parameters.get(SELF_TEST) == 0:
         found = f"{found}, its self-test failed at boot"
-        return failed(found, "restart it level and at rest; read its console")
+        return failed(found, "restart it level and at rest, and read its console")
     return passed(found)
 
 
 def _airframe(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if vehicle.device_type is None:
-        return failed("the vehicle does not say what it is", "update its firmware")
+        return failed("the vehicle does not report its airframe", "update its firmware")
     if vehicle.device_type in AIRFRAMES:
         return passed(vehicle.device_type)
     return failed(vehicle.device_type, f"fly a {', '.join(AIRFRAMES[:-1])} or {AIRFRAMES[-1]}")
@@ -242,8 +243,8 @@ def _supervisor(vehicle: VehicleStatus, profile: Profile) -> Finding:
 def _positioning(vehicle: VehicleStatus, profile: Profile) -> Finding:
     decks = ", ".join(vehicle.position_decks(profile))
     found = {
-        "mocap": f"by {profile.positioning.label}, see its rows",
-        "target": "by the target, see in view",
+        "mocap": f"by {profile.positioning.label}, see the rows on it",
+        "target": "by the target, see the row in view",
         "deck": f"by {decks}",
     }
     problem = GroundCriteria.no_position_source(vehicle.decks, profile)
@@ -260,7 +261,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     criteria = GroundCriteria(t, judged, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:
-        return failed(problem.found, f"wait a little, then check again; {problem.advice}")
+        return failed(problem.found, f"wait a moment, then check again; {problem.advice}")
     set_by_fly = profile.link.parameters | ProbeLink.estimator_parameters(profile.positioning)
     kind = set_by_fly.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
     found = f"variance {', '.join(each.text for each in criteria.variances)}"
@@ -268,10 +269,10 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
         return failed(f"{found}, but {problem.found}", problem.advice)
     if kind is not None and kind < KALMAN:
         advice = f"set {ESTIMATOR}: 2 under link.parameters"
-        return warned(f"{ESTIMATOR} {kind:g} has no position", advice)
+        return warned(f"{ESTIMATOR} {kind:g} estimates no position", advice)
     if vehicle.displacement_m > MOVED_WARN_M:
         found += f", but its position moved by {1e2 * vehicle.displacement_m:.0f} cm at rest"
-        return warned(found, "let it stand still; if it did, check light and floor")
+        return warned(found, "keep it still; if it was, check the light and the floor")
     if all(each.value is None for each in criteria.variances):
         return skipped(UNREPORTED)
     return passed(found)
@@ -282,7 +283,7 @@ def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not profile.positioning.source.is_deck:
         return skipped(BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
-        return failed("the position is no number", "restart the vehicle")
+        return failed("the position is not a number", "restart the vehicle")
     return problem_finding(GroundCriteria(t, profile).off_ground, f"at {t.position_m[2]:.2f} m")
 
 
@@ -290,7 +291,7 @@ def _level(vehicle: VehicleStatus, profile: Profile) -> Finding:
     t, limit_deg = vehicle.known_telemetry, profile.safety.start_tilt_deg
     criteria = GroundCriteria(t, profile)
     found = f"roll {math.degrees(t.roll_rad):.1f}, pitch {math.degrees(t.pitch_rad):.1f} deg"
-    advice = "put it on level ground; if that is level, restart it there"
+    advice = "put it on level ground; if it is level already, restart it there"
     return worst_finding(
         limits_finding(criteria.tilt_deg, 3.0, limit_deg, found, advice),
         problem_finding(criteria.not_still, found),
@@ -309,7 +310,7 @@ def _battery(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if t.battery_state == LOW_POWER:
         return failed(f"{found}, but it reports low power", "charge it")
     if t.battery_v < profile.safety.min_rest_v + 0.1:
-        return warned(found, "enough for a short flight: charge it")
+        return warned(found, "enough only for a short flight: charge it")
     return passed(found)
 
 
@@ -332,7 +333,7 @@ VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
 
 LIFTED = "lifted"
 LIFT_S = 20.0
-HOW_TO_LIFT = "lift it by 30 cm, hold it level, put it back"
+HOW_TO_LIFT = "lift it by 30 cm, hold it level, and put it back"
 LIFT_CHECK_M = 0.15
 """Rise of the estimate from which on a lift is judged. Larger: a short lift is skipped."""
 FOLLOWED_M = 0.08
@@ -363,14 +364,14 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
     moved_g = max(abs(t.acc_z_g - 1.0) for t in samples)
     found = f"rose by {rise_m:.2f} m, then {back_m:+.2f} m"
     if rise_m < FOLLOWED_M and moved_g < MOVED_G:
-        return skipped("it was not moved", HOW_TO_LIFT)
+        return skipped("the vehicle was not moved", HOW_TO_LIFT)
     if rise_m < FOLLOWED_M:
-        advice = "the positioning does not see it: light, floor, base stations"
-        return failed(f"it moved, and the position {found}", advice)
+        advice = "the positioning does not follow: check the light, the floor and the base stations"
+        return failed(f"the vehicle moved, but the position only {found}", advice)
     if rise_m < LIFT_CHECK_M:
-        return skipped(f"{found}: not enough to tell", HOW_TO_LIFT)
+        return skipped(f"{found}: not enough to judge", HOW_TO_LIFT)
     if abs(back_m) > BACK_M:
-        return warned(found, "was it put back where it was? else the position drifts")
+        return warned(found, "if the vehicle was put back at the same place, its position drifts")
     return passed(found)
 
 
@@ -380,13 +381,13 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
 def radio_scan_rows(uris: Sequence[str], radio_problem: str) -> list[Row]:
     """A row for the radio, and one for each vehicle that answers, from the result of
     `find_uris_and_problem`."""
-    radio = passed("scanned: channels 0 to 125 at 250K, 1M, 2M")
+    radio = passed("scanned channels 0 to 125 at 250K, 1M and 2M")
     if radio_problem:
         cause, _, advice = radio_problem.partition("\n")
         radio = skipped(cause.rstrip("."), advice)
     found = [passed(f"{uri} answers") for uri in uris]
     nobody = failed(
-        "nothing answers",
-        "switch the vehicle on; a radio's address other than E7E7E7E7E7 goes with -u",
+        "no vehicle answers",
+        "switch the vehicle on; if its radio address is not E7E7E7E7E7, name its URI with -u",
     )
     return [Row("radio", *radio), *(Row("address", *each) for each in found or [nobody])]

@@ -126,7 +126,7 @@ def test_a_good_camera_fails_nothing() -> None:
 
 
 @pytest.mark.parametrize(("fault", "name", "verdict", "words"), [
-    ("frozen", "pictures", "fail", "stands still"),
+    ("frozen", "pictures", "fail", "is frozen"),
     ("mirrored", "pictures", "fail", "mirrored"),
     ("lossy, and a wrong print", "print", "fail", "print error"),
     ("bare", "target", "skipped", "not in view"),
@@ -136,7 +136,7 @@ def test_a_good_camera_fails_nothing() -> None:
         ("slow", "frame rate", "fail", "6 Hz"),
         ("out of focus", "focus", "fail", "blur sigma 3"),
         ("silent", "lost frames", "fail", "none for the last 0."),
-        ("out of order", "pictures", "fail", "came after newer ones"),
+        ("out of order", "pictures", "fail", "arrived after newer ones"),
     )),
 ])  # fmt: skip
 def test_a_fault_of_the_simulated_camera_makes_its_row(
@@ -241,8 +241,8 @@ def test_a_missing_camera_skips_the_rest(text: str, advice: str) -> None:
 
 
 @pytest.mark.parametrize(("scheme", "gone", "lossy"), [
-    ("camera", "plug", "receiver"), ("aideck", "switch the Crazyflie off and on", "the deck"),
-    ("http", "switch the camera off and on", "network"), ("sim", "start it again", "close other"),
+    ("camera", "plug", "receiver"), ("aideck", "switch the Crazyflie off", "the deck"),
+    ("http", "switch the camera off", "network"), ("sim", "start it again", "close other"),
 ])  # fmt: skip
 def test_the_advice_fits_the_kind_of_source(scheme: str, gone: str, lossy: str) -> None:
     """An AI-deck has no receiver, and a simulated camera no cable."""

@@ -53,8 +53,8 @@ def test_json_is_a_list_of_rows(quick: None) -> None:
 
 @pytest.mark.parametrize(("words", "code", "complaint"), [
     (("-p", "none"), 20, "profile 'none' not found"),
-    (("-u", "radio:/0"), 30, "is not one of a vehicle"),
-    (("--scan", "-u", "radio:/0"), 30, "is not one of a vehicle"),
+    (("-u", "radio:/0"), 30, "is not the URI of a vehicle"),
+    (("--scan", "-u", "radio:/0"), 30, "is not the URI of a vehicle"),
     (("--source", "nonsense:1"), 30, "camera source"),
     (("-u", NOWHERE), 2, "belongs to the simulated vehicle"),
     (("-u", NOWHERE, "--source", "video:old.mp4"), 2, "is a recording"),
@@ -104,7 +104,7 @@ ROWS = [
         "bring it nearer " * 8,
     ),
     Row("battery", Verdict.FAIL, "the battery rests at 3.50 V", "charge it"),
-    Row("print", Verdict.SKIPPED, "both markers must be in view", "hold it nearer"),
+    Row("print", Verdict.SKIPPED, "both markers must be in view", "hold the vehicle closer"),
     Row("level", Verdict.SKIPPED, "the vehicle does not answer"),
 ]
 

@@ -115,7 +115,7 @@ def test_each_of_the_axes_is_found_and_named(number: int) -> None:
         assert row.verdict is Verdict.FAIL
         assert f"swapped axes: up is {named_up(turn)} in" in row.found
     elif number:  # the first names them as they are
-        assert "the rigid body's axes are turned by" in row.found
+        assert "the rigid body's axes are rotated by" in row.found
 
 
 @pytest.mark.parametrize("turn", UPRIGHT)
@@ -126,7 +126,7 @@ def test_a_body_turned_about_the_vertical_is_told_by_how_much(turn: Array) -> No
         return
     off_deg = round(math.degrees(math.acos((np.trace(turn) - 1.0) / 2.0)))
     assert row.verdict is Verdict.FAIL
-    told = re.search(r"turned by (\d+) deg", row.found)
+    told = re.search(r"rotated by (\d+) deg", row.found)
     assert told is not None
     assert abs(int(told[1]) - off_deg) <= 3
     assert "set positioning.body_rpy_deg: [" in row.advice
@@ -152,10 +152,10 @@ def test_the_heading_of_the_capture_is_its_own_affair(turn: Array) -> None:
 
 
 @pytest.mark.parametrize(("own", "seen", "scale", "words"), [
-    ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 1.0, "the vehicle moves, and the rigid body 'cf2' stands"),
-    ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, "the rigid body 'cf2' moves, and the vehicle stands"),
-    ((1.0, 1.0, 1.0), (1.0, -1.0, 0.6), 1.0, "does not turn as the vehicle does"),
-    ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0), 1.0, "does not turn as the vehicle does"),
+    ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 1.0, "the vehicle moves while the rigid body 'cf2' stands"),
+    ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, "the rigid body 'cf2' moves while the vehicle stands"),
+    ((1.0, 1.0, 1.0), (1.0, -1.0, 0.6), 1.0, "does not match the vehicle's"),
+    ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0), 1.0, "does not match the vehicle's"),
     ((1.0, 1.0, 1.0), None, 1000.0, "millimetres"),
     ((1.7, 1.0, 1.0), None, 1000.0, "millimetres"),
 ])  # fmt: skip
@@ -210,7 +210,7 @@ def test_places_in_other_axes_fail_though_the_turns_are_right(
     """However far the hand drifts aside, which may rise along the capture's z."""
     row = recorded(7, mirror=places, way_m=way_m)
     assert row.verdict is Verdict.FAIL, row
-    assert "lifted, the body goes by x" in row.found
+    assert "lifted, the body moves by x" in row.found
     assert "straight up" in row.advice
 
 
@@ -279,8 +279,8 @@ class Scripted:
 @pytest.mark.parametrize(("heights_m", "moves_g", "verdict", "words"), [
     ([0.01, 0.3, 0.4, 0.01, *[0.0] * 20], 0.2, "pass", "rose by 0.39 m"),
     ([0.01] * 30, 0.0, "skipped", "not moved"),
-    ([0.01] * 30, 0.3, "fail", "it moved, and the position"),
-    ([0.01, 0.1, 0.01], 0.2, "skipped", "not enough to tell"),
+    ([0.01] * 30, 0.3, "fail", "moved, but the position"),
+    ([0.01, 0.1, 0.01], 0.2, "skipped", "not enough to judge"),
     ([0.0, 0.4, 0.25], 0.2, "warn", "then +0.25 m"),
     ([], 0.0, "skipped", "no telemetry"),
 ])  # fmt: skip

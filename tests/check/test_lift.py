@@ -112,12 +112,12 @@ def no_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProcess) -> None:
     it = lab(sim)
-    with pytest.raises(SafetyAbort, match="never compared"):
+    with pytest.raises(SafetyAbort, match="never been compared"):
         it.may_fly()
     rows = it.lift(Verdict.PASS)
     lifted = rows[LIFTED]
     assert lifted.verdict is Verdict.PASS, lifted
-    assert "turns as the vehicle does" in lifted.found
+    assert "rotation agrees with" in lifted.found
     assert rows["body place"].verdict is Verdict.PASS
     assert rows[COMPARED].verdict is Verdict.PASS
     it.may_fly()
@@ -126,7 +126,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
 @pytest.mark.parametrize(("fault", "body", "words"), [
     (CaptureFault(axes=Y_UP), "crazyflie", "swapped axes: up is y"),
     (CaptureFault(axes=SWAPPED_XY), "crazyflie", r"are turned by (8[5-9]|9.) deg"),
-    (CaptureFault(scale=1000.0), "crazyflie", "these look like millimetres"),
+    (CaptureFault(scale=1000.0), "crazyflie", "the positions look like millimetres"),
     (None, "wand", "the vehicle moves, and the rigid body 'wand' stands still"),
 ])  # fmt: skip
 def test_what_is_set_up_wrong_is_named_and_not_flown_by(

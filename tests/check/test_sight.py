@@ -51,14 +51,14 @@ def test_under_the_target_it_passes() -> None:
 
 
 @pytest.mark.parametrize(("verdict", "words", "advice", "done"), [
-    ("fail", "no, and fly refuses", "at most 3.2 m above the camera",
+    ("fail", "not in view, so fly would refuse to take off", "at most 3.2 m above the camera",
      rehearsed(target_pictures=0, target=None)),
     ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
-    ("warn", "not at the end", "lost frames", rehearsed(target=None)),
-    ("fail", "has moved by 0.12 m, and it stands still", "hang still",
+    ("warn", "no longer in view at the end", "lost frames", rehearsed(target=None)),
+    ("fail", "shows a motion of 0.12 m, but the vehicle stands", "keep the target still",
      rehearsed(target_places=wandering(0.05))),
-    ("pass", "now, and at", "", rehearsed(target_places=wandering(0.01))),
-    ("skipped", "no picture came", "", rehearsed(pictures=0)),
+    ("pass", "in view now, and", "", rehearsed(target_places=wandering(0.01))),
+    ("skipped", "no picture arrived", "", rehearsed(pictures=0)),
 ])  # fmt: skip
 def test_a_sight_makes_its_row(verdict: str, words: str, advice: str, done: Rehearsal) -> None:
     row = rows_of(done)["in view"]
@@ -78,7 +78,7 @@ def test_decks_and_an_estimate_are_not_asked_for() -> None:
     away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), velocity_variance_m2ps2=50.0)
     vehicle = VehicleStatus("radio://0/80/2M", telemetry=away)
     rows = {row.name: row for row in evaluate_rows(VEHICLE, vehicle, TARGET)}
-    assert rows["positioning"].found == "by the target, see in view"
+    assert rows["positioning"].found == "by the target, see the row in view"
     assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
     assert rows["estimator"].found == BY_FLY
 

@@ -105,7 +105,7 @@ FAULTS = [
     ("level", "bad", "fail", "pitch 20"),
     ("battery", "bad", "fail", "rests at 3.5"),
     ("firmware", "old", "fail", "protocol 11"),
-    ("telemetry", "old", "fail", "none comes"),
+    ("telemetry", "old", "fail", "none arrives"),
 ]
 
 
@@ -205,7 +205,7 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("uri", "words"), [
-    ("radio://0/80/2M/E7E7E7E7E7", "bring the radio nearer"), ("usb://0", "cable"),
+    ("radio://0/80/2M/E7E7E7E7E7", "move the radio closer"), ("usb://0", "cable"),
     ("udp://10.0.0.7:2390", "network"), ("sim://", "simulated vehicle runs on this computer"),
 ])  # fmt: skip
 def test_the_advice_fits_the_kind_of_link(uri: str, words: str) -> None:
@@ -229,7 +229,7 @@ def test_a_busy_computer_is_named_where_it_explains_the_late_packets() -> None:
     assert row.advice == BUSY_ADVICE
     # What is lost is not lost by being late.
     lost = replace(late, round_trips_s=[0.004] * 80 + [math.inf] * 20, wake_delays_s=[0.06] * 50)
-    assert "bring the radio nearer" in rows_of(lost)["packets"].advice
+    assert "move the radio closer" in rows_of(lost)["packets"].advice
 
 
 def test_how_late_this_computer_wakes_is_measured() -> None:
@@ -256,7 +256,7 @@ def test_a_healthy_brushless_fails_nothing(volts: float) -> None:
     vehicle = replace(GOOD, telemetry=at_rest, device_type="Crazyflie 2.1 Brushless")
     rows = rows_of(vehicle)
     assert {row.verdict for row in rows.values()} == {Verdict.PASS}
-    assert rows["supervisor"].found == "ready, armed by fly after your yes (0x0201)"
+    assert rows["supervisor"].found == "ready, fly arms it after you confirm (0x0201)"
     assert rows["airframe"].found == "Crazyflie 2.1 Brushless"
 
 
