@@ -60,17 +60,17 @@ class _Picture:
         shape, data = (self.height, self.width), bytes(self.data)
         if not self.is_jpeg:
             if len(data) != self.size:
-                return f"{len(data)} bytes came, and its header announces {self.size}"
+                return f"{len(data)} bytes arrived, but the header announces {self.size}"
             return np.frombuffer(data, np.uint8).reshape(shape), None
         extent = jpeg_end_and_size(data)
         if extent is None:
-            return "the JPEG is not whole, its end is missing"
+            return "the JPEG is incomplete: its end is missing"
         end, (width, height) = extent
         if not (width and height):
             return "the JPEG is damaged"
         if (width, height) != (self.width, self.height):
             announced = f"{self.width}x{self.height}"
-            return f"the JPEG has {width}x{height} px, and its header announces {announced}"
+            return f"the JPEG has {width}x{height} px, but the header announces {announced}"
         image = decode_grey(data[:end])
         if image is None or image.shape != shape:
             return "the JPEG cannot be decoded"
@@ -86,8 +86,10 @@ class AiDeckSource(LiveSource):
     source reconnects.
     """
 
-    unreached_advice = "is this computer in the deck's Wi-Fi network, and is the address right?"
-    silent_advice = "switch the Crazyflie off and on"
+    unreached_advice = (
+        "check that this computer is in the deck's Wi-Fi network and that the address is right"
+    )
+    silent_advice = "switch the Crazyflie off and on again"
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
@@ -115,13 +117,15 @@ class AiDeckSource(LiveSource):
             length, _, function = _PACKET.unpack(head)
             if not 2 <= length <= MAX_PACKET_BYTES or function not in _FUNCTIONS:
                 self._note(
-                    "what it sends is not of Bitcraze's wifi-img-streamer",
-                    "is that the program in the deck?",
+                    "it does not send the packets of Bitcraze's wifi-img-streamer",
+                    "check that the deck runs wifi-img-streamer",
                 )
-                return "no packet of the streamer"
+                return "a packet is not one of wifi-img-streamer"
             data = stream.read(length - 2)
             if self._picture is None and self._arrived == 0:
-                self._note("it sends, but no picture", "does wifi-img-streamer run in the deck?")
+                self._note(
+                    "it sends data, but no picture", "check that the deck runs wifi-img-streamer"
+                )
             if function == _APP:
                 self._take(data, came_s)
         return "closed"
@@ -140,7 +144,7 @@ class AiDeckSource(LiveSource):
         self._picture = None
         took_s = self._clock() - picture.began_s
         if took_s > STALLED_S:
-            self._drop(f"it took {took_s:.1f} s from its first byte to its last")
+            self._drop(f"the transfer took {took_s:.1f} s")
             return
         decoded = picture.decode()
         if isinstance(decoded, str):

@@ -34,8 +34,8 @@ def open_video_capture(
     if not capture.isOpened():
         capture.release()
         raise NotFound(
-            f"camera:{number} exists but cannot be opened; close other programs that use it "
-            f"and check that you may read /dev/video{number}"
+            f"camera:{number} exists but cannot be opened; close other programs that use "
+            f"it, and check your permission to open /dev/video{number}"
         )
     configure_capture(capture, size_px, config)
     return capture
@@ -62,7 +62,9 @@ class DeviceSource(LiveSource):
     released, and opened again once it is back. `opener` returns a cv2.VideoCapture.
     """
 
-    silent_advice = "if it is a receiver: is the camera powered, and the receiver on its channel?"
+    silent_advice = (
+        "for a receiver: check that the camera has power and that the receiver is on its channel"
+    )
     unreached_advice = ""
     reconnect_wait_s = REOPEN_EVERY_S
     max_failures = math.inf
@@ -87,7 +89,7 @@ class DeviceSource(LiveSource):
                         failures = 0
                         continue
                 except Exception as error:  # whatever a damaged picture does to OpenCV
-                    why = f"gives pictures that cannot be decoded ({describe_error(error)})"
+                    why = f"delivers pictures that cannot be decoded ({describe_error(error)})"
                     self._drop(f"they cannot be decoded ({describe_error(error)})")
                 failures += 1
                 if failures >= LOST_AFTER_FAILURES:
@@ -135,7 +137,7 @@ def find_cameras(devices: Path = DEVICES, names: Path = NAMES) -> list[Connected
     for number in sorted(_video_numbers(devices.glob("video*"))):
         if _of_system(number, "index", names) in ("", "0"):
             may = os.access(devices / f"video{number}", os.R_OK | os.W_OK)
-            problem = "" if may else "you may not open it: Permission denied"
+            problem = "" if may else "no permission to open it"
             name = _of_system(number, "name", names)
             found.append(ConnectedCamera(number, name, stable.get(number, ""), problem))
     return found
@@ -172,8 +174,9 @@ def camera_number(text: str, devices: Path = DEVICES, names: Path = NAMES) -> in
         return fitting[0].number
     if fitting:
         raise InvalidValue(
-            f"camera:{wanted} fits {len(fitting)} cameras: {', '.join(map(str, fitting))}; give "
-            f"more of the name, the path, or the number"
+            f"camera:{wanted} matches {len(fitting)} cameras: "
+            f"{', '.join(map(str, fitting))}; write more of the name, the path, or the "
+            "number"
         )
     raise NotFound(f"camera:{wanted} was not found; {_there(known)}")
 

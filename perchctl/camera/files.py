@@ -37,7 +37,9 @@ class RecordedSource:
         self._index = 0
         self._ahead = self._read()  # one picture ahead, so that size and end are known in time
         if self._ahead is None:
-            raise InvalidValue(f"{name} holds no readable frame; is it a picture or video file?")
+            raise InvalidValue(
+                f"{name} holds no readable frame; check that it is a picture or video file"
+            )
         image = self._ahead[0]
         self.size_px = (image.shape[1], image.shape[0])
 
@@ -141,7 +143,7 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
     png_ends = not data.startswith(b"\x89PNG") or b"IEND" in data
     jpeg_ends = not data.startswith(b"\xff\xd8") or jpeg_end_and_size(data) is not None
     if not (png_ends and jpeg_ends):
-        raise ValueError("is cut off")
+        raise ValueError("is truncated")
     image = decode_grey(data)
     if image is None:
         raise ValueError("cannot be read as a picture")
@@ -162,7 +164,7 @@ def image_files(where: str | Sequence[Path]) -> list[Path]:
         found = [p for p in names if p.is_file() and p.suffix.lower() in IMAGE_SUFFIXES]
         if not found:
             shown = without_password(where)
-            raise NotFound(f"{shown} is neither a folder nor a pattern that names pictures")
+            raise NotFound(f"{shown} is neither a folder nor a pattern that matches pictures")
     if not found:
         allowed = " ".join(sorted(IMAGE_SUFFIXES))
         raise NotFound(f"folder {where} holds no pictures ({allowed})")

@@ -15,9 +15,9 @@ FrameKind = Literal["ok", "repeated", "frozen", "snow", "uniform", "dark"]
 VERDICT_TEXTS: dict[FrameKind, str] = {
     "ok": "the picture is usable",
     "repeated": "the same picture as before",
-    "frozen": "the picture stands still",
+    "frozen": "the picture is frozen",
     "snow": "snow: the receiver has no signal",
-    "uniform": "an empty screen: the receiver has no signal, or the lens is covered",
+    "uniform": "a blank picture: the receiver has no signal, or the lens is covered",
     "dark": "the picture is dark",
 }
 

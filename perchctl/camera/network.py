@@ -47,7 +47,7 @@ class MjpegSource(LiveSource):
     settings are ignored.
     """
 
-    silent_advice = "does another program use it? many cameras serve one at a time"
+    silent_advice = "close other programs that use it: many cameras serve only one at a time"
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
@@ -62,9 +62,11 @@ class MjpegSource(LiveSource):
                 self._read(response)
         except HTTPError as refused:
             refused.close()
-            reason = f"the server answers {refused.code} {refused.reason}"
+            reason = f"the server answered {refused.code} {refused.reason}"
             if refused.code == 401:
-                reason += ", so write its name and password as in http://NAME:PASSWORD@HOST/PATH"
+                reason += (
+                    ", so add the user name and password, as in http://NAME:PASSWORD@HOST/PATH"
+                )
             if refused.code in _NOT_MENDED:
                 raise NotFound(f"{self._name}: {reason}") from None
             self._connected()
@@ -110,12 +112,17 @@ class MjpegSource(LiveSource):
             if not data:
                 return
             if self._arrived == 0:
-                kind = response.headers.get("Content-Type", "no type")
-                self._note(f"it sends {kind}, and no whole JPEG", "is it the stream's own address?")
+                kind = response.headers.get("Content-Type", "no content type")
+                self._note(
+                    f"it sends {kind}, but no complete JPEG",
+                    "check that the address is that of the stream itself",
+                )
             # If the network delivered several at once only the newest is worth decoding.
             for picture, (width, height) in reversed(splitter.feed(data)):
                 if width * height > MOST_STREAM_PX:
-                    self._drop(f"they have {width}x{height} px, the most are {MOST_STREAM_PX} px")
+                    self._drop(
+                        f"they have {width}x{height} px, and at most {MOST_STREAM_PX} px are read"
+                    )
                     continue
                 image = decode_grey(picture)
                 if image is not None:
@@ -182,8 +189,10 @@ class RtspSource(LiveSource):
     """
 
     connect_timeout_s = 5.0
-    silent_advice = "does another program use it? many cameras serve one at a time"
-    unreached_advice = "is the address right, is the camera on, and does no other program use it?"
+    silent_advice = "close other programs that use it: many cameras serve only one at a time"
+    unreached_advice = (
+        "check that the address is right, that the camera is on, and that no other program uses it"
+    )
 
     def __init__(self, url: str, latency_s: float, clock: Clock) -> None:
         super().__init__(url, latency_s, clock)
@@ -211,8 +220,10 @@ class RtspSource(LiveSource):
 
         if not stream.streams.video:
             self._is_connected = True
-            self._note("the stream has no picture in it", "is it the address of the video?")
-            return "the stream has no picture in it"
+            self._note(
+                "the stream carries no video", "check that the address is that of the video stream"
+            )
+            return "the stream carries no video"
         self._connected()
         video = stream.streams.video[0]
         # A thread for each frame would hold back as many frames as there are threads.
@@ -245,10 +256,10 @@ _FINAL = (
 )
 """PyAV's errors that another attempt would not mend, by name."""
 _REASONS = {
-    "HTTPUnauthorizedError": "it wants another name or password (401), as in "
+    "HTTPUnauthorizedError": "it rejects this user name and password (401); write them as in "
     "rtsp://NAME:PASSWORD@HOST/PATH",
-    "OSError": "the host cannot be reached, or its name is unknown",
-    "ExitError": "no answer in time, or no picture in it",
-    "InvalidDataError": "no answer in time, or none of RTSP",
+    "OSError": "the host cannot be reached, or its name cannot be resolved",
+    "ExitError": "no answer in time, or no video in the stream",
+    "InvalidDataError": "no answer in time, or not an RTSP answer",
 }
 """In the place of FFmpeg's own, which say less."""

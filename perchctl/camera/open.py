@@ -93,8 +93,8 @@ def parse_source(text: str) -> SourceName:
             f"with my_module in {Path.cwd()}"
         )
     raise NotFound(
-        f"{shown} does not exist; a source is a video, picture or folder of pictures, or one of "
-        f"{REAL}"
+        f"{shown} does not exist; a source is a video, a picture, a folder of pictures, "
+        f"or one of {REAL}"
     )
 
 
@@ -107,9 +107,9 @@ def _check_address(name: SourceName) -> None:
         is_right = False
     if not is_right:
         raise InvalidValue(
-            f"camera source {str(name)!r} has no host or no port that can be read, as in "
-            f"{name.scheme}://192.168.1.20:5000/stream; a port is 1 to 65535; in a name or "
-            f"password @ is %40, : is %3A, / is %2F"
+            f"camera source {str(name)!r} has no valid host and port, as in "
+            f"{name.scheme}://192.168.1.20:5000/stream; a port is 1 to 65535; in a user "
+            "name or password write @ as %40, : as %3A and / as %2F"
         )
 
 
@@ -180,8 +180,8 @@ def _live(
     if name.scheme in STREAMS:
         return STREAMS[name.scheme](name.spec, latency_s, clock)
     raise InvalidValue(
-        f"camera source {str(name)!r} names no camera or file; allowed are {REAL}, and sim: with a "
-        f"link of sim://"
+        f"camera source {str(name)!r} is not a camera or file; allowed are {REAL}, and "
+        "sim: with the link sim://"
     )
 
 

@@ -56,7 +56,7 @@ SILENT_AFTER_S = 1.0
 """A live source without a new frame for so long counts as gone."""
 CLOSE_WITHIN_S = 3.0
 _FRAME_POLL_S = 0.002
-_SILENT = "connected, but it sends nothing"
+_SILENT = "connected, but it sends no data"
 
 
 @runtime_checkable
@@ -140,9 +140,9 @@ class LiveSource:
     read_timeout_s = 2.0
     reconnect_wait_s = 0.3
     max_failures = 5.0
-    unreached_advice = "is the address right, and is the camera on?"
+    unreached_advice = "check that the address is right and that the camera is on"
     """What to do if no connection is made."""
-    silent_advice = "switch the camera off and on"
+    silent_advice = "switch the camera off and on again"
     """What to do if a connection is made, and nothing comes."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
@@ -192,7 +192,7 @@ class LiveSource:
         """What has been seen since the last picture, and what to do about it."""
         if self._dropped:
             count = f"{self._dropped} so far"
-            return f"pictures come and are dropped ({count}): {self._why_dropped}", ""
+            return f"pictures arrive but are dropped ({count}): {self._why_dropped}", ""
         return self._found if self._found[0] else (self._why_silent, "")
 
     def describe(self) -> str:
@@ -227,7 +227,7 @@ class LiveSource:
                 reason = self._connection()
                 if self._found[0] == _SILENT:
                     self._note(
-                        "connected, but the stream ends without a picture", self.silent_advice
+                        "connected, but the stream ended without a picture", self.silent_advice
                     )
             except PerchError as error:
                 if self._arrived == 0:
@@ -244,7 +244,9 @@ class LiveSource:
             failed = 0 if self._arrived > before else failed + 1
             if failed >= self.max_failures:
                 why = ": ".join(filter(None, self._finding_and_advice()))
-                self._fail(TimedOut(f"{self._name} gave no picture in {failed} attempts: {why}"))
+                self._fail(
+                    TimedOut(f"{self._name} delivered no picture in {failed} attempts: {why}")
+                )
                 return
             self._stop.wait(self.reconnect_wait_s)
 
@@ -393,7 +395,7 @@ class GuardedSource:
         except Exception as error:
             self._fail(error)
         silent_s = 0.0 if since_s is None or not self.live else now_s - since_s
-        silent = f"{self._name} has given no frame for {silent_s:.1f} s"
+        silent = f"{self._name} has delivered no frame for {silent_s:.1f} s"
         return self._failure or problem or (silent if silent_s > SILENT_AFTER_S else None)
 
     def _fail(self, error: Exception) -> None:
@@ -408,9 +410,9 @@ class GuardedSource:
 
 def mirrored_note(config: CameraConfig) -> str:
     """A sentence: the picture is mirrored, and how to correct the profile with `config`."""
-    advice = "switch that off in the camera, or set camera.mirrored in the profile"
+    advice = "turn mirroring off in the camera, or set camera.mirrored in the profile"
     if config.mirrored:
-        advice = "the camera does not mirror, so take camera.mirrored out of the profile"
+        advice = "the camera does not mirror it, so remove camera.mirrored from the profile"
     return f"the picture is mirrored: {advice}"
 
 

@@ -156,21 +156,21 @@ def test_it_connects_anew(end: list[bytes | threading.Event], deck: AiDeck, read
 
 # --- What it says when no picture comes -------------------------------------------------------
 
-OFF_AND_ON = "switch the Crazyflie off and on"
+OFF_AND_ON = "switch the Crazyflie off and on again"
 TRUNCATED = header(324, 244, len(WHOLE_JPEG) - 2, 1) + b"".join(chunks(WHOLE_JPEG[:-2]))
 DAMAGED = header(324, 244, 500, 1) + packet(b"\xff\xd8\xff\xe0" + bytes(496))
 NEVER_WHOLE = [
-    ([NEVER], f"connected, but it sends nothing: {OFF_AND_ON}"),
-    ([], f"connected, but the stream ends without a picture: {OFF_AND_ON}"),
-    ([b"HTTP/1.1 200 OK\r\n", NEVER], "is not of Bitcraze's wifi-img-streamer: is that the"),
-    ([TRUNCATED * 3, NEVER], "pictures come and are dropped (3 so far)"),
+    ([NEVER], f"connected, but it sends no data: {OFF_AND_ON}"),
+    ([], f"connected, but the stream ended without a picture: {OFF_AND_ON}"),
+    ([b"HTTP/1.1 200 OK\r\n", NEVER], "packets of Bitcraze's wifi-img-streamer: check"),
+    ([TRUNCATED * 3, NEVER], "pictures arrive but are dropped (3 so far)"),
 ]  # fmt: skip
 NEVER_WHOLE_LIKEWISE = [
-    ([console(), NEVER], "it sends, but no picture: does wifi-img-streamer run in the deck?"),
-    ([TRUNCATED, NEVER], "pictures come and are dropped (1 so far): the JPEG is not whole, its e"),
-    ([DAMAGED, NEVER], "pictures come and are dropped (1 so far): the JPEG is damaged"),
-    ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "has 162x122 px, and its header"),
-    ([b"".join(WHOLE[:-1]) + packet(bytes(1020)), NEVER], "its header announces 79056"),
+    ([console(), NEVER], "it sends data, but no picture: check that the deck runs wifi"),
+    ([TRUNCATED, NEVER], "pictures arrive but are dropped (1 so far): the JPEG is incomplete"),
+    ([DAMAGED, NEVER], "pictures arrive but are dropped (1 so far): the JPEG is damaged"),
+    ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "has 162x122 px, but the header"),
+    ([b"".join(WHOLE[:-1]) + packet(bytes(1020)), NEVER], "the header announces 79056"),
 ]  # fmt: skip
 
 
@@ -197,7 +197,9 @@ def test_a_deck_without_a_whole_picture_is_not_called_a_receiver(
 
 def test_a_deck_that_is_not_there_is_not_told_to_be_switched(deck: AiDeck) -> None:
     deck.close()
-    with pytest.raises(TimedOut, match="connection refused: is this computer in the deck's Wi-Fi"):
+    with pytest.raises(
+        TimedOut, match="connection refused: check that this computer is in the deck's Wi-Fi"
+    ):
         open_camera(deck.url, Clock(), timeout_s=0.3)
 
 

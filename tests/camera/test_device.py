@@ -62,7 +62,7 @@ def test_a_camera_is_named_by_number_name_part_of_it_or_path(plugged: Callable[.
     assert number("usb_grabber") == number(f"{devices}/v4l/by-id/usb_grabber") == 2
     assert number(f"{devices}/video10") == 10
     for text, count in (("usb", 3), ("USB Video", 2), ("", 3)):
-        with pytest.raises(InvalidValue, match=rf"camera:{text} fits {count} cameras: .*deluxe"):
+        with pytest.raises(InvalidValue, match=rf"camera:{text} matches {count} cameras: .*deluxe"):
             number(text)
     with pytest.raises(NotFound, match=r"camera:nix was not found; there are camera:0 \(HD W"):
         number("nix")
@@ -189,8 +189,8 @@ def test_a_device_that_comes_back_is_opened_again(opened: list[LiveSource]) -> N
 
 
 @pytest.mark.parametrize(("read", "words"), [
-    (lambda: (False, None), "connected, but it sends nothing: if it is a receiver: is the camera"),
-    (lambda: (True, "torn"), r"pictures come and are dropped \(\d+ so far\): they cannot be dec"),
+    (lambda: (False, None), "connected, but it sends no data: for a receiver: check"),
+    (lambda: (True, "torn"), r"pictures arrive but are dropped \(\d+ so far\): they cannot be dec"),
 ])  # fmt: skip
 def test_a_camera_without_a_picture_says_what_came(
     read: Callable[[], Any], words: str, monkeypatch: pytest.MonkeyPatch

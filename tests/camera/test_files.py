@@ -80,7 +80,7 @@ def test_images_by_pattern_and_single_and_those_that_are_none(tmp_path: Path) ->
     assert len(drain(open_camera(f"images:{tmp_path}/shot_5.png", CLOCK))) == 1
     for data in (b"not a picture", b"", b"\xff\xd8", b"\xff\xd8no"):
         (tmp_path / "shot_1.png").write_bytes(data)
-        with pytest.raises(InvalidValue, match=r"shot_1\.png .*(cannot be read|is cut off)"):
+        with pytest.raises(InvalidValue, match=r"shot_1\.png .*(cannot be read|is truncated)"):
             drain(open_camera(f"images:{tmp_path}", CLOCK))
 
 
@@ -157,7 +157,7 @@ def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
     *((spec, r"allowed are camera:N, .*video:FILE, images:DIR.*aideck") for spec in (
         "rtmp://host/live", "webcam:0", "ftp://x", "video:", "images:", "sim:",
     )),
-    *((url, r"no host or no port .*(rtsp|http|aideck)://192.* 1 to 65535") for url in (
+    *((url, r"no valid host and port.*(rtsp|http|aideck)://192.* 1 to 65535") for url in (
         "rtsp://me:sec/ret@host", "http://:80", "rtsp:host", "rtsp://lab:99999", "rtsp://lab:0",
         "http://lab:abc", "http://me:sec:ret@lab:abc", "http://", "aideck:", "aideck://[::1",
     )),
@@ -191,6 +191,6 @@ def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(
         assert open_camera(f"images:{path}", CLOCK).size_px == (120, 90)
         for kept in (len(data) // 2, len(data) - 6 if name == "b.png" else len(data) - 1, 300):
             path.write_bytes(data[:kept])
-            with pytest.raises(InvalidValue, match=rf"{name} .*is cut off.*remove or replace it"):
+            with pytest.raises(InvalidValue, match=rf"{name} .*is truncated.*remove or replace it"):
                 open_camera(f"images:{path}", CLOCK)
     assert capfd.readouterr().err == ""

@@ -143,8 +143,9 @@ def test_it_reconnects_when_the_stream_ends_and_gives_up_after_five_in_vain(
     gate.set()
     until(lambda: source.problem(100.0) is not None)
     assert source.connections == 2 + source.max_failures
-    assert "gave no picture in 5 attempts: connected, but the stream ends without a picture" in str(
-        source.problem(100.0)
+    assert (
+        "delivered no picture in 5 attempts: connected, but the stream ended without a "
+        "picture" in str(source.problem(100.0))
     )
 
 
@@ -152,14 +153,14 @@ HTML = b"<html>the camera's page</html>"
 
 
 @pytest.mark.parametrize(("script", "words"), [
-    ([threading.Event()], "connected, but it sends nothing: does another program use it?"),
-    ([HTML, threading.Event()], "it sends no type, and no whole JPEG: is it the stream's own addr"),
+    ([threading.Event()], "connected, but it sends no data: close other programs"),
+    ([HTML, threading.Event()], "it sends no content type, but no complete JPEG: check"),
     pytest.param([part(jpeg(60)[:300]), threading.Event()], "it sends no type, and no whole JPEG",
                  marks=pytest.mark.long),
     pytest.param([part(resized(jpeg(60), 5000, 4000)), threading.Event()],
-                 "pictures come and are dropped (1 so far): they have 5000x4000 px",
+                 "pictures arrive but are dropped (1 so far): they have 5000x4000 px",
                  marks=pytest.mark.long),
-    ([part(NO_PIXELS), threading.Event()], "pictures come and are dropped (1 so far): the "
+    ([part(NO_PIXELS), threading.Event()], "pictures arrive but are dropped (1 so far): the "
      "JPEG cannot be decoded"),
 ])  # fmt: skip
 def test_a_stream_without_a_picture_says_what_came(
@@ -175,7 +176,7 @@ def test_a_stream_without_a_picture_says_what_came(
 
 def test_nobody_listens(server: MjpegServer) -> None:
     server.close()
-    with pytest.raises(TimedOut, match="connection refused: is the address right, and is the cam"):
+    with pytest.raises(TimedOut, match="connection refused: check that the address is right"):
         open_camera(server.url, Clock(), timeout_s=0.4)
 
 

@@ -73,7 +73,7 @@ def test_the_first_frame_is_waited_for_and_given_first(opened: Any) -> None:
     assert [each and each.t_s for each in newer] == [None, None, 9.5]
     assert source.problem(20.0) is None
     assert source.poll(20.0) is None
-    assert source.problem(21.1) == "my_camera:Camera has given no frame for 1.1 s"
+    assert source.problem(21.1) == "my_camera:Camera has delivered no frame for 1.1 s"
     assert source.problem(-math.inf) is None
     with pytest.raises(TimedOut, match=r"my_camera:Camera: no first frame within 0\.05 s"):
         opened()

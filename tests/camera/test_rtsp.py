@@ -115,7 +115,7 @@ def test_name_and_password_are_answered_by_digest_and_not_shown(
 
 
 @pytest.mark.parametrize(("who", "path", "sentence"), [
-    ("me:hushhush@", "/live", "(401), as in rtsp://NAME:PASSWORD@HOST/PATH"),
+    ("me:hushhush@", "/live", "(401); write them as in rtsp://NAME:PASSWORD@HOST/PATH"),
     ("me:secret@", "/nowhere", "404"),
 ])  # fmt: skip
 def test_what_trying_again_would_not_mend_is_told_at_once(
@@ -131,8 +131,8 @@ def test_what_trying_again_would_not_mend_is_told_at_once(
 
 
 @pytest.mark.parametrize(("host", "words"), [
-    ("", "gave no picture in 5 attempts: Connection refused"),
-    ("a..b", "the host cannot be reached, or its name is unknown"),
+    ("", "delivered no picture in 5 attempts: Connection refused"),
+    ("a..b", "the host cannot be reached, or its name cannot be resolved"),
 ])  # fmt: skip
 def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
     server.close()
@@ -149,7 +149,7 @@ def test_a_stream_without_a_picture_says_so(server: RtspServer, opened: list[Liv
     times_s = {"connect_timeout_s": 0.2, "read_timeout_s": 0.2}
     source = begun(RtspSource(server.url(), 0.0, Clock()), opened, **times_s)
     until(lambda: "first frame within 1 s: connected, but" in str(source.no_first_frame(1.0)))
-    assert "does another program use it?" in str(source.no_first_frame(1.0))
+    assert "close other programs that use it" in str(source.no_first_frame(1.0))
     never.set()
 
 
